@@ -20,7 +20,7 @@ from .records import Outcome as Outcome
 from .reference.agreement import validate as validate
 from .reference.rows import import_published as import_published
 from .replay.animation import animate as animate
-from .replay.comparison import Comparison as Comparison, compare_with_original as compare_with_original
+from .replay.comparison import Comparison as Comparison, comparison_of as comparison_of
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
 from .report import report as report

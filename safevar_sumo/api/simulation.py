@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,12 +25,12 @@ from safevar_sumo.records import (
     finite_or_none,
 )
 from safevar_sumo.results import record
-from safevar_sumo.scenarios import distance_in_words
+from safevar_sumo.scenarios import Point, distance_in_words
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study as read_study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import system_at_worst_point
+from safevar_sumo.sumo.matrix import worst_point
 from safevar_sumo.sumo.models import create_shipped_models
 from safevar_sumo.sumo.system import System, assemble
 
@@ -47,8 +47,8 @@ OBSERVATION_HEADS = {
 }
 
 
-def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd.DataFrame:
-    """One row for each step of a simulation of one vehicle, until its end.
+def trace_frame(runs: SimulationRuns, observations: Sequence[Observation], row: int = 0) -> pd.DataFrame:
+    """One row for each step of a simulation of one vehicle, until its end; it is in this row of the observations.
 
     The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true
     position; the columns that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the
@@ -78,12 +78,25 @@ def trace_frame(runs: SimulationRuns, observations: Sequence[Observation]) -> pd
         [
             {
                 "time [s]": round(float(observation.time), TIME_DECIMALS),
-                **{head: float(getattr(observation, name)[0]) for name, head in OBSERVATION_HEADS.items()},
+                **{head: float(getattr(observation, name)[row]) for name, head in OBSERVATION_HEADS.items()},
             }
             for observation in observations
         ]
     )
     return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
+
+
+class Pair(NamedTuple):
+    """The original vehicle (row 0) and a changed one (row 1, if it differs), which `system` drove together at a point.
+
+    `observations` hold what the driving systems observed at every sample, arrays of shape (1,) or (2,).
+    """
+
+    point: Point
+    system: System
+    runs: SimulationRuns
+    evaluations: Evaluations
+    observations: Sequence[Observation]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,10 +117,13 @@ class Simulation:
         The trajectory and outcome of the only vehicle.
     scoring
         The metrics, and the objectives that a search of the study minimises.
+    pair
+        The original vehicle and this one on the road.
     no_verdict
         Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
     original
-        The simulation of the original vehicle in the same encounter; for the original vehicle, the simulation itself.
+        The simulation of the original vehicle in the same encounter, at the same point of a matrix; for the original
+        vehicle, the simulation itself.
     """
 
     study: Study
@@ -115,7 +131,7 @@ class Simulation:
     evaluation: Evaluations
     runs: SimulationRuns
     scoring: Scoring
-    _observations: Sequence[Observation]
+    pair: Pair
     no_verdict: str
     reset_values: Mapping[str, float] = field(default_factory=dict)
     _original: Simulation | None = None
@@ -165,7 +181,7 @@ class Simulation:
     @cached_property
     def trace(self) -> pd.DataFrame:
         """One row per step, units in the columns' names; NaN where a value does not exist."""
-        return trace_frame(self.runs, self._observations)
+        return trace_frame(self.runs, self.pair.observations, 0 if self._original is None else 1)
 
     @property
     def gap(self) -> float:
@@ -270,20 +286,30 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
 
 
 def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
-    """Simulate a setting, shape (n,), which is filtered first if `filtered`, and the original vehicle beside it."""
+    """Simulate a setting, shape (n,), which is filtered first if `filtered`, beside the original vehicle; in a matrix,
+    both at the setting's worst point.
+    """
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
-    no_verdict = why_no_verdict(system)
-    beside = characteristics.with_original_vehicle(setting)
-    original = _simulate_one(study, system, beside, no_verdict)
-    is_changed = not np.array_equal(setting, beside)
-    simulation = _simulate_one(study, system, setting, no_verdict) if is_changed else original
-    values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
-    return replace(
-        simulation,
-        _original=original if is_changed else None,
-        reset_values={name: value for name, value, simulated in values if value != simulated},
+    pair = _drive_pair(system, setting)
+    names = characteristics.names
+    original, *changed = (
+        Simulation(
+            study=study,
+            setting=dict(zip(names, values, strict=True)),
+            evaluation=pair.evaluations.take([row]),
+            runs=pair.runs.of(slice(row, row + 1)),
+            scoring=system.measuring.scoring,
+            pair=pair,
+            no_verdict=why_no_verdict(system),
+        )
+        for row, values in enumerate(pair.evaluations.settings.tolist())
     )
+    values = zip(names, requested.tolist(), setting.tolist(), strict=True)
+    reset_values = {name: value for name, value, simulated in values if value != simulated}
+    if not changed:
+        return replace(original, reset_values=reset_values)
+    return replace(changed[0], _original=original, reset_values=reset_values)
 
 
 def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
@@ -292,22 +318,17 @@ def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
     return loaded_study, assemble(loaded_study)
 
 
-def _simulate_one(study: Study, system: System, setting: FloatArray, no_verdict: str) -> Simulation:
-    settings = setting[np.newaxis]
-    observations = []
-    system_at_point = system_at_worst_point(system, settings)
+def _drive_pair(system: System, setting: FloatArray) -> Pair:
+    """Drive a setting, shape (n,), at its worst point beside the original vehicle, unless it is that one."""
+    original = system.characteristics.with_original_vehicle(setting)
+    settings = np.stack([original] if np.array_equal(original, setting) else [original, setting])
+    point = worst_point(system, setting)
+    at_point = system.at(point)
+    observations = list[Observation]()
     runs = drive_all(
-        system_at_point,
+        at_point,
         settings,
         Engine.LIBSUMO,
         listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
     )
-    return Simulation(
-        study=study,
-        setting=dict(zip(system.characteristics.names, setting.tolist(), strict=True)),
-        evaluation=score(system, settings, runs),
-        runs=runs,
-        scoring=system.measuring.scoring,
-        no_verdict=no_verdict,
-        _observations=observations,
-    )
+    return Pair(point, at_point, runs, score(at_point, settings, runs), observations)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
@@ -12,20 +11,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.api.simulation import changed_setting, load_and_assemble
+from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Measure
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.study import Study, StudyLike, unit_text
-from safevar_sumo.sumo.batch import score
+from safevar_sumo.scenarios import Point
+from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.bodies import Film
-from safevar_sumo.sumo.matrix import simulate, system_at_worst_point
 from safevar_sumo.sumo.network import Network, built_network, stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.verification import drive_again
-from safevar_sumo.vehicles import CharacteristicSet
 
 
 class LaneLine(NamedTuple):
@@ -67,22 +64,16 @@ COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 class Comparison:
     """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
 
-    `title` is the study's title and the `point` of its matrix, `network` the scenario's network with the lanes that the
-    scenario's parameters define, `road` the lanes; `evaluations` and `runs` have one row for each vehicle. `tracks`
-    holds the tracks of actors by name: their samples after the end of a run are meaningless, as SUMO continues with the
-    other run. `objectives` are metrics that the study optimises besides the paper's metrics.
+    `title` is the study's title and the name of `point`, at which `system` drove; `evaluations` and `runs` have one row
+    for each vehicle. `objectives` are metrics that the study optimises besides the paper's metrics.
     """
 
     title: str
-    characteristics: CharacteristicSet
-    ttc_threshold: float
-    network: Network
-    road: tuple[LaneLine, ...]
+    system: System
+    point: Point
     evaluations: Evaluations
     runs: SimulationRuns
-    tracks: Mapping[str, Film]
     objectives: tuple[Measure, ...] = ()
-    point: str = ""
 
     @property
     def rows(self) -> range:
@@ -100,14 +91,38 @@ class Comparison:
             for row in self.rows
         ]
 
+    @property
+    def network(self) -> Network:
+        """The scenario's network, with the lanes that the scenario's parameters define."""
+        return stage_network(self.point.scenario)
+
+    @cached_property
+    def road(self) -> tuple[LaneLine, ...]:
+        """The lanes of the network."""
+        return read_road(self.network)
+
+    @cached_property
+    def tracks(self) -> dict[str, Film]:
+        """How all actors move in SUMO, by name in alphabetical order, at the samples of `runs`.
+
+        Samples after the end of a run are meaningless: SUMO continues with the other run.
+        """
+        tracks = dict[str, Film]()
+        samples = count()
+        length = len(self.runs.trace.time)
+        settings = self.evaluations.settings
+        drive_again(self.system, settings, self.runs, lambda world: world.film(tracks, next(samples), length))
+        return dict(sorted(tracks.items()))
+
     def name(self, row: int) -> str:
         return "original" if row == ORIGINAL else "changed"
 
     @property
     def changes(self) -> list[str]:
         """Every change in words, with its unit and share."""
+        characteristics = self.system.characteristics
         setting = self.evaluations.settings[-1].tolist()
-        return change_texts(self.characteristics, dict(zip(self.characteristics.names, setting, strict=True)))
+        return change_texts(characteristics, dict(zip(characteristics.names, setting, strict=True)))
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
@@ -125,74 +140,21 @@ class Comparison:
         return ", ".join([ending, *texts])
 
 
-def compare_with_original(
-    study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
-) -> Comparison:
-    """Simulate one setting beside the original vehicle, in this process; in a matrix, at the setting's worst point.
-
-    Parameters
-    ----------
-    study
-        A study, or anything that `load_study` accepts.
-    changes
-        Values by characteristic, in their table units; all other characteristics keep the original's value.
-    filtered
-        Put changes that are smaller than their thresholds back to the original, as every search does.
-    beyond
-        Also accept values outside the domains, and a setting that violates the study's constraints.
-
-    Raises
-    ------
-    InputError
-        If the study or a change cannot be used.
-    SimulationError
-        If SUMO fails.
-    """
-    loaded_study, system = load_and_assemble(study)
-    setting = changed_setting(system, changes, filtered, beyond)
-    return compare_setting(loaded_study, system, system.characteristics.filter(setting) if filtered else setting)
-
-
-def compare_setting(study: Study, system: System, setting: FloatArray) -> Comparison:
-    """Simulate a filtered setting, shape (n,), beside the original vehicle; in a matrix, at the setting's worst point.
-
-    Raises
-    ------
-    SimulationError, InputError
-        If `simulate` raises it.
-    """
-    original = system.characteristics.with_original_vehicle(setting)
-    settings = np.stack([original]) if np.array_equal(original, setting) else np.stack([original, setting])
-    worst_system = system_at_worst_point(system, settings)
-    worst = worst_system.scenario, worst_system.weather
-    point = next((point.name for point in system.matrix if (point.scenario, point.weather) == worst), "")
-    network = stage_network(worst_system.scenario)
-    scoring = worst_system.measuring.scoring
-    runs, tracks = _film(worst_system, settings)
+def comparison_of(simulation: Simulation) -> Comparison:
+    """What a simulation and that of the original vehicle beside it look like, at the same point of a matrix."""
+    pair = simulation.pair
+    scoring = simulation.scoring
+    title = simulation.study.title
     objectives = {objective.name for objective in scoring.objectives} - {*METRICS, RATING_POINTS.name}
     return Comparison(
-        title=f"{study.title} ({point})" if point else study.title,
-        point=point,
-        characteristics=system.characteristics,
-        ttc_threshold=system.metrics_table.ttc_threshold,
-        network=network,
-        road=read_road(network),
-        evaluations=score(worst_system, settings, runs),
-        runs=_with_pedals_before_impacts(runs),
-        tracks=tracks,
+        title=f"{title} ({pair.point.name})" if pair.point.name else title,
+        system=pair.system,
+        point=pair.point,
+        evaluations=pair.evaluations,
+        runs=_with_pedals_before_impacts(pair.runs),
         # The points of a rating belong to all cells together.
         objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
     )
-
-
-def _film(system: System, settings: FloatArray) -> tuple[SimulationRuns, dict[str, Film]]:
-    """Simulate N settings, shape (N, n), and record in SUMO how all actors move, by name in alphabetical order."""
-    runs = simulate(system, settings)
-    tracks = dict[str, Film]()
-    samples = count()
-    length = len(runs.trace.time)
-    drive_again(system, settings, runs, lambda world: world.film(tracks, next(samples), length))
-    return runs, dict(sorted(tracks.items()))
 
 
 def read_road(network: Network) -> tuple[LaneLine, ...]:

@@ -11,11 +11,12 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import EnvironmentFault, InputError, about
 from safevar_sumo.questions.ask import PointName
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
-from safevar_sumo.replay.comparison import Comparison, compare_setting
+from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
@@ -229,7 +230,7 @@ def export(
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
-    comparison = compare_setting(target.study, system, setting)
+    comparison = comparison_of(simulate_with_original(target.study, system, setting, filtered=False))
     write_files(comparison, to, out, solution, physics)
     if to == "openscenario" and comparison.runs.trace.speed[0, -1] <= 0:
         return f"{to}: {out}\nnote: Ego starts from standstill, so no study can name {out / SCENARIO}"

@@ -70,7 +70,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     pedal_axis.set(ylim=(-1.08, 1.08), xlabel="time [s]")
     pedal_axis.set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
     ttc_axis.set(ylim=(0, None), xlim=(None, _end_time(comparison) * 1.25), xlabel="time [s]")
-    ttc_axis.axhline(comparison.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
+    ttc_axis.axhline(comparison.system.metrics_table.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
     figure.suptitle(_heading(comparison).replace("$", r"\$"), fontsize=FONT_SIZE + 1)
     _draw_legend(figure, comparison, divergence_time)
     return figure
@@ -127,7 +127,7 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     entries |= {label: {"marker": mark, "linestyle": "", "markersize": 7} for label, mark in marks.items()}
     if divergence_time is not None:
         entries["speeds diverge (by 0.1 m/s)"] = {"linestyle": "-.", "linewidth": 0.9}
-    threshold = f"TTC* = {comparison.ttc_threshold:g} s: critical below"
+    threshold = f"TTC* = {comparison.system.metrics_table.ttc_threshold:g} s: critical below"
     entries[threshold] = {"color": "0.4", "linestyle": ":", "linewidth": 0.9}
     handles = [Line2D([], [], label=label, **{"color": "0.35", **style}) for label, style in entries.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)

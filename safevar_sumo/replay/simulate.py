@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -25,7 +24,7 @@ from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import number_of, points_in_words
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay import animation
-from safevar_sumo.replay.comparison import compare_setting, list_differences, why_different
+from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
@@ -142,7 +141,7 @@ def simulate(
     animate
         Animate both simulations, seen from above, in this gif or html file.
     gui
-        Show both simulations in sumo-gui, each on its own road.
+        Show both simulations in sumo-gui, one upon the other: the original blue, the changed one orange.
     slower
         How many times slower than real time sumo-gui plays.
     spread
@@ -175,13 +174,13 @@ def simulate(
     if trace is not None:
         with whole_file(trace, "trace") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
-    compare = cache(partial(compare_setting, target.study, system, simulation.evaluation.settings[0]))
+    comparison = comparison_of(simulation)
     if animate is not None:
-        animation.animate(compare(), animate)
+        animation.animate(comparison, animate)
     if gui:
-        show_in_gui(compare(), slower=slower)
+        show_in_gui(comparison, slower=slower)
     answer = _answer(target, system, simulation, with_spread=spread)
-    return replace(answer, draw=lambda _: draw_comparison(compare()))
+    return replace(answer, draw=lambda _: draw_comparison(comparison))
 
 
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
@@ -327,7 +326,9 @@ def _characteristics(simulation: Simulation) -> pd.DataFrame:
 def _verdict(simulation: Simulation) -> list[str]:
     """How the original vehicle and, if it differs, the simulated one end."""
     least = simulation.scoring.safe_original
-    verdict = [f"{'The' if least is None else 'In this encounter the'} original vehicle {simulation.original.verdict}."]
+    name = simulation.pair.point.name
+    where = f"At {name} the" if name else "The" if least is None else "In this encounter the"
+    verdict = [f"{where} original vehicle {simulation.original.verdict}."]
     if simulation.setting != simulation.original.setting:
         verdict.append(f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}.")
     if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import warn
 from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
 from safevar_sumo.questions.case import Case
@@ -26,7 +27,7 @@ from safevar_sumo.questions.words import change_texts, counted_in_words, number_
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.animation import player_data
-from safevar_sumo.replay.comparison import compare_setting, list_differences, why_different
+from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
@@ -311,7 +312,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))
-        comparison = compare_setting(study.case.study, study.system, setting)
+        comparison = comparison_of(simulate_with_original(study.case.study, study.system, setting, filtered=False))
         last = comparison.rows[-1]
         differences = []
         if name in study.choices:
@@ -321,7 +322,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         reason = f" ({study.choices[name]})" if name in study.choices else ""
         yield {
             "title": f"{name}{reason}: {comparison.verdict(last)}",
-            "point": comparison.point,
+            "point": comparison.point.name,
             "changes": change_texts(characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True))),
             "differences": differences,
             "player": player_data(lay_out_scene(comparison)),

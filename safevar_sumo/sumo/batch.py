@@ -33,7 +33,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, Scenario, Scene, TrackScenario, WorldScenario
 from safevar_sumo.sumo.bodies import Contacts, Motion, SceneWorld, World
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
-from safevar_sumo.sumo.engine import Engine, open_varied_world, open_world
+from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
 from safevar_sumo.sumo.network import copied_network, stage_networks
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.recorded_world import RecordedWorld
@@ -172,7 +172,9 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
     return 2 if is_paired else 1
 
 
-def open_points_world(system: System, settings: FloatArray, stage: Stage | None) -> AbstractContextManager[SumoWorld]:
+def open_points_world(
+    system: System, settings: FloatArray, stage: Stage | None, start: Start = open_in_process
+) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
     (point,) = system.points
     step = system.scenes.step
@@ -188,8 +190,8 @@ def open_points_world(system: System, settings: FloatArray, stage: Stage | None)
         speeds = _start_speeds(system.at_encounters(settings)[0].points, n)
         create = partial(StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step))
     if len(encounters):
-        return open_varied_world(networks, step, create)
-    return open_world(copied_network(networks[0], n), n, step, create)
+        return open_varied_world(networks, step, create, start)
+    return open_world(copied_network(networks[0], n), n, step, create, start)
 
 
 @np.errstate(all="ignore")

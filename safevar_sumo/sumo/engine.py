@@ -10,7 +10,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
 from pathlib import Path
@@ -61,39 +61,26 @@ class Engine(StrEnum):
 
 
 @contextmanager
-def open_world(
-    files: CopiedNetwork, n: int, step: float | None = None, create: Callable[[Api, int], SumoWorld] = SumoWorld
-) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by default that of the
-    network; close SUMO at the end, also after an error. `create` makes the world of SUMO's API and the number of
-    copies.
+def open_in_process(options: Sequence[str]) -> Iterator[Api]:
+    """Start SUMO in this process with options; yields libsumo.
 
     Raises
     ------
     SimulationError
-        With SUMO's message, if SUMO cannot load the network or simulate a step.
+        With SUMO's message, if SUMO cannot simulate a step.
     """
     with redirect_stdout(sys.stderr):  # libsumo warns of a pyarrow of another version
         import libsumo
     with _open(libsumo, "SUMO"):
         try:
-            libsumo.start(["sumo", *sumo_options(files, step)])
+            libsumo.start(["sumo", *options])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
             raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
-        yield create(libsumo, n)
+        yield libsumo
 
 
 @contextmanager
-def open_varied_world(
-    networks: Sequence[Network], step: float | None = None, create: Callable[[Api, int], SumoWorld] = SumoWorld
-) -> Iterator[SumoWorld]:
-    """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
-    with varied_network(networks) as files, open_world(files, len(networks), step, create) as world:
-        yield world
-
-
-@contextmanager
-def open_window(options: Mapping[str, object]) -> Iterator[Api]:
+def open_window(options: Sequence[str]) -> Iterator[Api]:
     """Start sumo-gui with options; yields TraCI.
 
     Raises
@@ -108,13 +95,43 @@ def open_window(options: Mapping[str, object]) -> Iterator[Api]:
     import sumo
 
     api = traci_api()
-    command = [str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui")]
-    command += [str(text) for option in options.items() for text in option]
     with _open(api, "sumo-gui"):
         with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
             warnings.simplefilter("ignore")
-            api.start(command, numRetries=CONNECTION_ATTEMPTS)
+            api.start([str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui"), *options], numRetries=CONNECTION_ATTEMPTS)
         yield api
+
+
+Start = Callable[[Sequence[str]], AbstractContextManager[Api]]
+"""What starts SUMO with options: `open_in_process` or `open_window`."""
+
+
+@contextmanager
+def open_world(
+    files: CopiedNetwork,
+    n: int,
+    step: float | None = None,
+    create: Callable[[Api, int], SumoWorld] = SumoWorld,
+    start: Start = open_in_process,
+) -> Iterator[SumoWorld]:
+    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by default that of the
+    network; close SUMO at the end, also after an error. `create` makes the world of SUMO's API and the number of
+    copies. Raises the errors of `start`.
+    """
+    with start(sumo_options(files, step)) as api:
+        yield create(api, n)
+
+
+@contextmanager
+def open_varied_world(
+    networks: Sequence[Network],
+    step: float | None = None,
+    create: Callable[[Api, int], SumoWorld] = SumoWorld,
+    start: Start = open_in_process,
+) -> Iterator[SumoWorld]:
+    """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
+    with varied_network(networks) as files, open_world(files, len(networks), step, create, start) as world:
+        yield world
 
 
 @contextmanager

@@ -176,7 +176,7 @@ def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECOR
 
     In a matrix, all settings run at the worst point of the last setting. Raises the errors of `drive_all`.
     """
-    return drive_all(system_at_worst_point(system, settings), settings, engine)
+    return drive_all(system.at(worst_point(system, settings[-1])), settings, engine)
 
 
 def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
@@ -204,12 +204,13 @@ def simulate_groups(
         ]
 
 
-def system_at_worst_point(system: System, settings: FloatArray) -> System:
-    """The system at the worst point of the last setting."""
+def worst_point(system: System, setting: FloatArray) -> Point:
+    """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
-        return system
-    at_points = [result.evaluations for result in simulate_all_points(system, settings[-1:])]
-    return system.at(system.points[worst_points(system, at_points)[0]])
+        return system.points[0]
+    at_points = [result.evaluations for result in simulate_all_points(system, setting[np.newaxis])]
+    number = int(worst_points(system, at_points)[0])
+    return system.points[number]
 
 
 def at_point(study: Study, name: str) -> Study:

@@ -13,7 +13,7 @@ from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.sumo.batch import enter, observer_of, open_points_world, stage_of
 from safevar_sumo.sumo.bodies import Contacts
-from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.engine import Engine, Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size, simulate_groups
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
@@ -26,12 +26,16 @@ COMPARED = ("position", "gap", "lateral", "obstacle_speed")
 
 @np.errstate(all="ignore")
 def drive_again(
-    system: System, settings: FloatArray, runs: SimulationRuns, watch: Callable[[SumoWorld], None] = lambda world: None
+    system: System,
+    settings: FloatArray,
+    runs: SimulationRuns,
+    watch: Callable[[SumoWorld], None] = lambda world: None,
+    start: Start = open_in_process,
 ) -> dict[str, FloatArray]:
     """Drive N settings at the system's only point in SUMO, with the speeds of `runs`.
 
     Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s], NaN without a
-    collision, shape (T, N). `watch` is called with SUMO's world at every sample.
+    collision, shape (T, N). `watch` is called with SUMO's world at every sample; `start` may open a window.
     """
     trace = runs.trace
     n = len(runs.outcome)
@@ -39,7 +43,7 @@ def drive_again(
     fleet, vehicles = system.at_encounters(settings)
     point = fleet.points[0]
     stage = stage_of(system, settings)
-    with user_errors(system.source), open_points_world(system, settings, stage) as world:
+    with user_errors(system.source), open_points_world(system, settings, stage, start) as world:
         motion = enter(fleet, vehicles, world).motion
         observer = observer_of(point.scenario, world, stage)
         is_open = np.ones(n, dtype=bool)

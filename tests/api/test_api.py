@@ -121,12 +121,29 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
 
 
-def test_compare_needs_a_study_and_changes_alone() -> None:
-    comparison = sv.compare_with_original("sun", {"tireFric": 1.2})
+def test_a_simulation_is_shown_beside_the_original() -> None:
+    comparison = sv.comparison_of(sv.simulate("sun", {"tireFric": 1.2}))
     assert comparison.changes == ["tireFric 3.5 -> 1.20 (-65.7 %)"]
     assert (
         comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
     )
+
+
+def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> None:
+    """A table, a trace, and a picture show the same two drives."""
+    one = sv.simulate("wear", {"brakeTorque": 0.6})
+    comparison = sv.comparison_of(one)
+    name = comparison.point.name
+    assert sv.simulate("wear").pair.point.name != name, "the original's own worst point is another one"
+    for row, vehicle in enumerate((one.original, one)):
+        assert vehicle.metrics["safety_degree"] == comparison.evaluations.f_safe[row]
+        assert vehicle.trace["speed [m/s]"].to_numpy() == pytest.approx(
+            comparison.runs.trace.speed[: comparison.moments[row].end + 1, row], abs=0
+        )
+    at_point = sv.load_study("wear", matrix={"point": name})
+    alone = sv.simulate(at_point, {"brakeTorque": 0.6})
+    assert (alone.original.numbers, alone.numbers) == (one.original.numbers, one.numbers)
+    pd.testing.assert_frame_equal(alone.trace, one.trace)
 
 
 @pytest.mark.parametrize(

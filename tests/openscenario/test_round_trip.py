@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.replay.comparison import compare_setting
+from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.replay.export import write_files
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -52,7 +53,13 @@ def test_an_exported_run_is_the_same_from_its_file(
 ) -> None:
     study = load_study("wear", scenario=scenario, matrix={"tests": []})
     runs, system, setting = runs_of(study, wear)
-    write_files(compare_setting(study, system, setting), "openscenario", tmp_path / "out", "RS:0:0", {})
+    write_files(
+        comparison_of(simulate_with_original(study, system, setting, filtered=False)),
+        "openscenario",
+        tmp_path / "out",
+        "RS:0:0",
+        {},
+    )
     (file,) = (tmp_path / "out").glob("*.xosc")
     assert runs.outcome == outcome
     again, *_ = runs_of(load_study("wear", scenario={"file": str(file)}), wear)

@@ -17,9 +17,10 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
-from safevar_sumo.replay.comparison import Comparison, compare_setting
+from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.results import write_imported
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import at_point
@@ -67,7 +68,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     done = run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
     (results / "printed.txt").write_text(done.stdout)
     there = assemble(at_point(load_study(study), point)) if point else system
-    return out, compare_setting(load_study(study), there, setting)
+    return out, comparison_of(simulate_with_original(load_study(study), there, setting, filtered=False))
 
 
 def test_export_says_that_no_study_takes_a_file_in_which_ego_stands(exported: tuple[Path, Comparison]) -> None:
@@ -177,7 +178,9 @@ def test_carla_gets_pedals_places_and_walker(for_carla: ForCarla) -> None:
     import carla
 
     script, scene, setting = for_carla
-    comparison = compare_setting(load_study("rain"), assemble(load_study("rain")), setting)
+    comparison = comparison_of(
+        simulate_with_original(load_study("rain"), assemble(load_study("rain")), setting, filtered=False)
+    )
     control = script.pedals(scene, 3)
     end = comparison.moments[-1].end
     assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])

@@ -20,9 +20,10 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
+from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay.animation import animate
-from safevar_sumo.replay.comparison import compare_setting
+from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.sumo.system import assemble
 
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
@@ -95,7 +96,10 @@ def try_player(browser: Chrome, player: object) -> None:
 @pytest.mark.slow
 def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, case: Case, tmp_path: Path) -> None:
     setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
-    animate(compare_setting(case.study, assemble(case.study), setting), tmp_path / "it.html")
+    animate(
+        comparison_of(simulate_with_original(case.study, assemble(case.study), setting, filtered=False)),
+        tmp_path / "it.html",
+    )
     opened(browser, tmp_path / "it.html")
     try_player(browser, browser.find_element(By.CSS_SELECTOR, ".player"))
     assert [entry["message"] for entry in browser.get_log("browser")] == []
