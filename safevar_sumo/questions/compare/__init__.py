@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -23,7 +22,10 @@ from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
+    BOTH,
+    GROWN,
     LIMIT_COLUMNS,
+    SHRUNK,
     Difference,
     compare_counts,
     compare_limits,
@@ -97,36 +99,32 @@ def compare(
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
     study = evaluator.study
-    second = evaluator.for_study(in_order_of(evaluator.study, study_in(other)))
-    evaluators = evaluator, second
+    second = evaluator.for_study(in_order_of(study, study_in(other)))
+    evaluators = (evaluator, second)
+    subjects = (subject, other)
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
     stated = [one.parse_criterion(unsafe) for one in evaluators if unsafe is not None]
     originals = [one.evaluate_original() for one in evaluators]
-    criteria = _criteria((subject, other), evaluators, originals, stated, margin)
-    pairs, outside = pairs_of((subject, other), common, criteria, samples)
-    is_valid = pairs.runs[0].valid & pairs.runs[1].valid
-    left_out = int(np.count_nonzero(pairs.runs[0].infeasible | pairs.runs[1].infeasible))
-    settings = _settings_frame(common, pairs, criteria)[is_valid]
-    metric = RATING_POINTS.name if all(is_rated(one.study) for one in evaluators) else SAFETY_DEGREE
-    a, b = (run.take(is_valid).column(metric) for run in pairs.runs)
-    tested = _test(settings.assign(a=a, b=b))
+    criteria = _criteria(subjects, evaluators, originals, stated, margin)
+    pairs, outside = pairs_of(subjects, common, criteria, samples)
+    valid = pairs.take(pairs.are_valid)
+    settings = _settings_frame(common, valid, criteria)
+    is_rating = all(is_rated(one.study) for one in evaluators)
+    tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = tuple(one.study.name for one in evaluators)
-    titles = titles if len(set(titles)) == 2 else ("A", "B")
-    of_limits = limits_of_both(evaluators, criteria, within)
-    ends, of_originals = compare_originals(evaluators, originals, criteria, titles[0])
-    members = evaluator.characteristics.vehicle.members
-    quantity = "rating" if metric == RATING_POINTS.name else "safety degree"
-    differences = (
-        compare_counts(counts, titles[0]),
-        compare_limits(of_limits, members),
-        of_originals,
-        compare_values(quantity, tested.p, tested.a12),
+    titles = _titles(evaluators)
+    limits_table = limits_of_both(evaluators, criteria, within)
+    originals_numbers, originals_difference = compare_originals(evaluators, originals, criteria, titles[0])
+    difference = Difference.joined(
+        [
+            compare_counts(counts, titles[0]),
+            compare_limits(limits_table, evaluator.characteristics.vehicle.members),
+            originals_difference,
+            compare_values("rating" if is_rating else "safety degree", tested.p, tested.a12),
+        ]
     )
-    better, worse = ([*chain(*kind)] for kind in list(zip(*differences, strict=True))[:2])
-    changes = [row[-1] for row in of_limits]
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         "unsafe": str(criteria[0]),
@@ -135,32 +133,35 @@ def compare(
         **counts,
         "p": tested.p,
         "a12": tested.a12,
-        "better_in": len(better),
-        "worse_in": len(worse),
-        "limits_grown": changes.count("grown") + changes.count("both"),
-        "limits_shrunk": changes.count("shrunk") + changes.count("both"),
+        "better_in": len(difference.better),
+        "worse_in": len(difference.worse),
+        "limits_grown": int(limits_table["change"].isin([GROWN, BOTH]).sum()),
+        "limits_shrunk": int(limits_table["change"].isin([SHRUNK, BOTH]).sum()),
         "outside": outside,
-        "not_simulated": len(is_valid) - int(np.count_nonzero(is_valid)) - left_out,
-        **ends,
+        "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
+        **originals_numbers,
     }
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
-        *_verdict(differences, titles, criteria[0], is_measured=bool(ends["benign_scenes"])),
+        *_verdict(difference, titles, criteria[0], is_measured=bool(numbers["benign_scenes"])),
         _test_in_words(tested),
         *_basis_in_words(common, limits),
-        *counted_in_words(study, left_out),
+        *counted_in_words(study, pairs.number_infeasible),
     ]
     return Answer(
         question="compare",
         study=study,
         verdict=" ".join(sentences),
         numbers=numbers,
-        tables={
-            "limits": tabulate("Limits of each alone, rounded to the safe side", LIMIT_COLUMNS, of_limits),
-            "settings": _settings_table(common, settings),
-        },
+        tables={"limits": limits_table, "settings": _settings_table(common, settings)},
         draw=partial(draw_pairs, titles=titles),
     )
+
+
+def _titles(evaluators: Sequence[Evaluator]) -> tuple[str, ...]:
+    """What sentences call A and B: the names of their studies if they differ."""
+    names = tuple(one.study.name for one in evaluators)
+    return names if names[0] != names[1] else ("A", "B")
 
 
 def _criteria(
@@ -170,25 +171,30 @@ def _criteria(
     stated: Sequence[Unsafe],
     margin: float | None,
 ) -> list[Unsafe]:
-    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its bodies touch.
-
-    Points count only if both are rated; a collision, if any vehicle of either collides.
-    """
+    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its bodies touch."""
     if stated:
         criterion = stated[0]
     elif margin is not None:
         criterion = Unsafe()
     else:
-        chosen = list[Unsafe]()
-        for one, subject, original in zip(evaluators, subjects, originals, strict=True):
-            if Unsafe() not in chosen:
-                chosen.append(one.choose_criterion(None, subject, original))
-        without_points = [one for one in chosen if one.points is None]
-        criterion = Unsafe() if Unsafe() in chosen else [*without_points, *chosen][0]
+        criterion = _default_criterion(subjects, evaluators, originals)
     check_margin(criterion, margin)
     if criterion.is_collision and (margin is not None or not stated):
         criterion = replace(criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators))
     return [replace(criterion, contact=assemble(one.study).contact) for one in evaluators]
+
+
+def _default_criterion(
+    subjects: Sequence[Study | Case], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
+) -> Unsafe:
+    """A collision if any vehicle of either system collides, else a safety degree; points only if both are rated."""
+    defaults = list[Unsafe]()
+    for subject, evaluator, original in zip(subjects, evaluators, originals, strict=True):
+        default = evaluator.choose_criterion(None, subject, original)
+        if default == Unsafe():
+            return default
+        defaults.append(default)
+    return next((one for one in defaults if one.points is None), defaults[0])
 
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
@@ -223,13 +229,14 @@ class _PairedTest(NamedTuple):
     pairs: str
 
 
-def _test(frame: pd.DataFrame) -> _PairedTest:
-    """Test the columns `a` and `b` in pairs.
+def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
+    """Test a metric in A and B in pairs.
 
     A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs, over the settings
     that were drawn on a line.
     """
-    frame = frame.dropna(subset=[*SIDES])
+    a, b = (run.column(metric) for run in runs.runs)
+    frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
     unit = "line"
@@ -242,12 +249,10 @@ def _test(frame: pd.DataFrame) -> _PairedTest:
     return _PairedTest(p, a12, number_of(len(pairs), unit))
 
 
-def _verdict(
-    differences: Sequence[Difference], titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool
-) -> Iterator[str]:
+def _verdict(difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool) -> Iterator[str]:
     """Whether B is better: in something and worse in nothing, needless braking included."""
     a, b = titles
-    better, worse, facts = ("; ".join(chain(*kind)) for kind in zip(*differences, strict=True))
+    better, worse, facts = ("; ".join(phrases) for phrases in difference)
     if worse and better:
         yield f"Neither is better. {b} {worse}. But it {better}"
     elif worse:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Column, with_interval
+from safevar_sumo.questions.answer import Column, tabulate, with_interval
 from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.evaluator import Evaluator, Interval
 from safevar_sumo.questions.pairs import SIDES
@@ -19,7 +20,7 @@ from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, n
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import join_phrases, number_of
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic
@@ -31,7 +32,12 @@ LIMIT_COLUMNS = {
     **with_interval("b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")),
     "change": Column("", "what becomes of the interval: grown, shrunk, both, or the same"),
 }
-GROWN, SHRUNK, BOTH, SAME = "grown", "shrunk", "both", "the same"
+GROWN = "grown"
+SHRUNK = "shrunk"
+BOTH = "both"
+SAME = "the same"
+UNDEFINED = (np.nan, np.nan)
+"""The ends of no interval."""
 MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
 LEAST_METRES = 0.05
@@ -41,45 +47,59 @@ LEAST_METRES = 0.05
 class Difference(NamedTuple):
     """What B does in comparison with A, each a phrase: `better`, `worse`, and `facts` that are neither."""
 
-    better: list[str]
-    worse: list[str]
-    facts: list[str]
+    better: Sequence[str] = ()
+    worse: Sequence[str] = ()
+    facts: Sequence[str] = ()
+
+    @classmethod
+    def joined(cls, parts: Sequence[Difference]) -> Difference:
+        """All phrases of some differences, in their order."""
+        return cls(*([*chain(*phrases)] for phrases in zip(cls(), *parts, strict=True)))
+
+    @classmethod
+    def judged(cls, phrase: str, *, is_better: bool) -> Difference:
+        """A single phrase."""
+        return cls(better=[phrase]) if is_better else cls(worse=[phrase])
 
 
-def compare_counts(counts: Mapping[str, Any], a: str) -> Difference:
+def compare_counts(counts: Mapping[str, int], a: str) -> Difference:
     """The settings that are unsafe in one system only."""
-    only_a, only_b, both, neither = (counts[name] for name in ("only_a_unsafe", "only_b_unsafe", "both", "neither"))
-    better = [f"avoids {only_a} of {number_of(only_a + both, 'setting')} unsafe in {a}"] if only_a else []
-    worse = [f"is unsafe in {only_b} of {number_of(only_b + neither, 'setting')} safe in {a}"] if only_b else []
-    return Difference(better, worse, [])
+    only_a = counts["only_a_unsafe"]
+    only_b = counts["only_b_unsafe"]
+    unsafe_in_a = number_of(only_a + counts["both"], "setting")
+    safe_in_a = number_of(only_b + counts["neither"], "setting")
+    better = [f"avoids {only_a} of {unsafe_in_a} unsafe in {a}"] if only_a else []
+    worse = [f"is unsafe in {only_b} of {safe_in_a} safe in {a}"] if only_b else []
+    return Difference(better, worse)
 
 
 def compare_values(quantity: str, p: float, a12: float) -> Difference:
-    """A significant difference of the safety degree, or of the rating, over all pairs."""
-    is_significant = p < ALPHA  # without pairs, p is NaN
-    better = [f"has a higher {quantity} (p = {p:.2g})"] if is_significant and a12 < 0.5 else []
-    worse = [f"has a lower {quantity} (p = {p:.2g})"] if is_significant and a12 >= 0.5 else []
-    return Difference(better, worse, [])
+    """A significant difference of the safety degree, or of the rating, over all pairs; p is NaN without pairs."""
+    if not p < ALPHA:
+        return Difference()
+    is_better = a12 < 0.5
+    return Difference.judged(
+        f"has a {'higher' if is_better else 'lower'} {quantity} (p = {p:.2g})", is_better=is_better
+    )
 
 
 def limits_of_both(
     evaluators: Sequence[Evaluator], criteria: Sequence[Unsafe], limits: Mapping[str, Limit]
-) -> list[list[Any]]:
-    """The rows of `LIMIT_COLUMNS`: limits alone, rounded as `tolerance` rounds them, within the user's limits; no
-    interval where the original is unsafe.
+) -> pd.DataFrame:
+    """The table of limits alone, rounded as `tolerance` rounds them, within the user's limits; no interval where the
+    original is unsafe.
     """
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     scans = [scan(one, columns, unsafe) for one, unsafe in zip(evaluators, criteria, strict=True)]
+    domains = [one.study.domains for one in evaluators]
     rows = []
-    for both in zip(*scans, strict=True):
-        items = [one.characteristic for one in both]
-        name = items[0].name
-        ends = [
-            _within(one, within(limits, name, of.study.domains[name])) for one, of in zip(both, evaluators, strict=True)
-        ]
-        values = [(item.original, *(safe or (np.nan, np.nan))) for item, safe in zip(items, ends, strict=True)]
-        rows.append([name, items[0].unit, *chain(*values), _change_of(*ends)])
-    return rows
+    for a, b in zip(*scans, strict=True):
+        name = a.characteristic.name
+        in_a, in_b = (_within(one, within(limits, name, of[name])) for one, of in zip((a, b), domains, strict=True))
+        ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
+        ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
+        rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
+    return tabulate("Limits of each alone, rounded to the safe side", LIMIT_COLUMNS, rows)
 
 
 def _within(one: OneAtATimeScan, ends: Interval) -> Interval | None:
@@ -99,24 +119,28 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     return {(True, True): BOTH, (True, False): GROWN, (False, True): SHRUNK}.get((grows, shrinks), SAME)
 
 
-def compare_limits(rows: Sequence[Sequence[Any]], members: Sequence[Characteristic]) -> Difference:
-    """The limits that grow or shrink, in words."""
-    phrases = {}
-    for change, verb in ((GROWN, "grow"), (SHRUNK, "shrink"), (BOTH, "move")):
-        named = [(row, item) for row, item in zip(rows, members, strict=True) if row[-1] == change]
-        texts = [_limit_in_words(row, item) for row, item in named if np.isfinite([row[3], row[6]]).all()]
-        more = len(texts) - MAX_LIMITS_NAMED
-        some = [*texts[:MAX_LIMITS_NAMED], *([f"{more} more"] if more > 0 else [])]
-        phrases[change] = [f"has limits that {verb}: {join_phrases(some)}"] if texts else []
-    moved = phrases[BOTH]
-    return Difference(phrases[GROWN] + moved, phrases[SHRUNK] + moved, [])
+def compare_limits(limits: pd.DataFrame, members: Sequence[Characteristic]) -> Difference:
+    """The limits that grow or shrink, in words; `limits` has a row for each of `members`."""
+    grown = _moved_limits(limits, members, GROWN, "grow")
+    shrunk = _moved_limits(limits, members, SHRUNK, "shrink")
+    moved = _moved_limits(limits, members, BOTH, "move")
+    return Difference(grown + moved, shrunk + moved)
 
 
-def _limit_in_words(row: Sequence[Any], item: Characteristic) -> str:
+def _moved_limits(limits: pd.DataFrame, members: Sequence[Characteristic], change: str, verb: str) -> list[str]:
+    """The phrase about limits with this change that exist in both systems; empty if there are none."""
+    is_named = (limits["change"] == change) & limits[["a_low", "b_low"]].notna().all(axis=1)
+    numbers = np.flatnonzero(is_named).tolist()
+    texts = [_limit_in_words(limits.iloc[number], members[number]) for number in numbers[:MAX_LIMITS_NAMED]]
+    if len(numbers) > MAX_LIMITS_NAMED:
+        texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
+    return [f"has limits that {verb}: {join_phrases(texts)}"] if texts else []
+
+
+def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
     """A limit in B, and in A in brackets, such as `sensorRange from 19.1 (15) m`."""
-    _, _, _, *a, _, low, high, _ = row
-    sides = zip(("from", "to"), (low, high), a, strict=True)
-    moved = " ".join(f"{word} {b:g} ({before:g})" for word, b, before in sides if b != before)
+    ends = (("from", row["a_low"], row["b_low"]), ("to", row["a_high"], row["b_high"]))
+    moved = " ".join(f"{word} {b:g} ({a:g})" for word, a, b in ends if a != b)
     return f"{item.name} {moved}{item.suffix}"
 
 
@@ -126,35 +150,37 @@ def compare_originals(
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's brakes: the numbers,
     and what they say.
     """
-    numbers = _ends_of_originals(evaluators, originals)
-    both_rated = all(is_rated(one.study) for one in evaluators)
-    difference = Difference([], [], [])
     in_a, in_b = (bool(unsafe.of(one)[0]) for unsafe, one in zip(criteria, originals, strict=True))
-    if in_a != in_b:
-        kind = difference.worse if in_b else difference.better
-        kind.append(f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}")
     braking = _needless_braking(*evaluators)
-    numbers |= braking
-    before, after, scenes = braking.values()
-    if scenes and before != after:
-        kind = difference.worse if after > before else difference.better
-        kind.append(f"brakes needlessly in {after} of {scenes} benign scenes ({before} in {a})")
-    if both_rated:
-        numbers |= {
-            f"{side}_points": float(original.column(RATING_POINTS.name)[0])
-            for side, original in zip(SIDES, originals, strict=True)
-        }
-        points_a = numbers["a_points"]
-        points_b = numbers["b_points"]
-        if points_a != points_b:
-            kind = difference.better if points_b > points_a else difference.worse
-            kind.append(f"earns {points_b:.4g} points ({points_a:.4g} in {a})")
-    earlier, later = _metres_earlier(*evaluators)
-    numbers |= {"metres_earlier": earlier, "metres_later": later}
-    told = [(value, word) for value, word in ((earlier, "earlier"), (later, "later")) if (value or 0) > LEAST_METRES]
-    if told:
-        difference.facts.append(f"brakes {join_phrases([f'up to {value:.2g} m {word}' for value, word in told])}")
-    return numbers, difference
+    points = _points(evaluators, originals)
+    metres = _metres_earlier(*evaluators)
+    numbers = {**_ends_of_originals(evaluators, originals), **braking, **points, **metres}
+    parts = list[Difference]()
+    if in_a != in_b:
+        phrase = f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}"
+        parts.append(Difference.judged(phrase, is_better=in_a))
+    if braking["a_needless_braking"] != braking["b_needless_braking"]:
+        before = braking["a_needless_braking"]
+        after = braking["b_needless_braking"]
+        phrase = f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes ({before} in {a})"
+        parts.append(Difference.judged(phrase, is_better=after < before))
+    if points and points["a_points"] != points["b_points"]:
+        phrase = f"earns {points['b_points']:.4g} points ({points['a_points']:.4g} in {a})"
+        parts.append(Difference.judged(phrase, is_better=points["b_points"] > points["a_points"]))
+    onsets = ((metres["metres_earlier"], "earlier"), (metres["metres_later"], "later"))
+    phrases = [f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES]
+    if phrases:
+        parts.append(Difference(facts=[f"brakes {join_phrases(phrases)}"]))
+    return numbers, Difference.joined(parts)
+
+
+def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
+    """The rating points of both original vehicles; empty unless both studies are rated."""
+    if not all(is_rated(one.study) for one in evaluators):
+        return {}
+    return {
+        f"{side}_points": float(one.column(RATING_POINTS.name)[0]) for side, one in zip(SIDES, originals, strict=True)
+    }
 
 
 def _ends_of_originals(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
@@ -180,15 +206,21 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     return {"a_needless_braking": counts[0], "b_needless_braking": counts[1], "benign_scenes": len(brakes[0])}
 
 
-def _metres_earlier(a: Evaluator, b: Evaluator) -> Iterator[float | None]:
+def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
     """By how much B's original vehicle begins to brake earlier, and later, where the difference is largest [m]; None in
     rated studies, in other scenarios than A's, and where either does not brake.
     """
-    studies = a.study, b.study
-    metres = np.array([np.nan])
-    if (studies[0].scenario, studies[0].matrix) == (studies[1].scenario, studies[1].matrix) and not is_rated(a.study):
-        onsets = [drive_new_cars(assemble(one.study), one.characteristics.original[np.newaxis])[0] for one in (a, b)]
-        metres = onsets[0][0] - onsets[1][0]
-    metres = metres[np.isfinite(metres)]
-    for signed in (metres, -metres):
-        yield float(max(0.0, signed.max())) if len(signed) else None
+    metres = np.empty(0)
+    is_same_scenario = (a.study.scenario, a.study.matrix) == (b.study.scenario, b.study.matrix)
+    if is_same_scenario and not is_rated(a.study):
+        metres = _onset_places(a) - _onset_places(b)
+        metres = metres[np.isfinite(metres)]
+    if not len(metres):
+        return {"metres_earlier": None, "metres_later": None}
+    return {"metres_earlier": max(0.0, float(metres.max())), "metres_later": max(0.0, float(-metres.min()))}
+
+
+def _onset_places(evaluator: Evaluator) -> FloatArray:
+    """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does not [m]."""
+    onsets, _ = drive_new_cars(assemble(evaluator.study), evaluator.characteristics.original[np.newaxis])
+    return np.asarray(onsets[0])

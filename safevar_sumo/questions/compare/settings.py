@@ -60,6 +60,22 @@ class Pairs(NamedTuple):
         in_a, in_b = (Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True))
         return cls(pd.concat(frames, ignore_index=True), (a, b), (in_a, in_b))
 
+    @property
+    def are_valid(self) -> BoolArray:
+        """Which could be simulated in both systems, shape (M,)."""
+        return np.asarray(self.runs[0].valid & self.runs[1].valid)
+
+    @property
+    def number_infeasible(self) -> int:
+        """How many a constraint of either study rules out."""
+        return int(np.count_nonzero(self.runs[0].infeasible | self.runs[1].infeasible))
+
+    def take(self, rows: BoolArray) -> Pairs:
+        """Some of the pairs, in their order."""
+        a, b = self.settings
+        in_a, in_b = self.runs
+        return Pairs(self.frame[rows].reset_index(drop=True), (a[rows], b[rows]), (in_a.take(rows), in_b.take(rows)))
+
 
 class CommonDomain(NamedTuple):
     """What two systems have in common.

@@ -285,9 +285,10 @@ def find_boundary_shares(
     """The first unsafe share of each of M lines, shape (M,), and what lies just below it.
 
     A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`, shape (M,), on, and
-    its end must be unsafe. Each round simulates the bounds between equal parts of the interval from `low` to `high`, and
-    keeps the part below the first unsafe one. The error is at most `RESOLUTION` times the line above `lowest`. A setting
-    that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state `NOT_SIMULATED`.
+    its end must be unsafe. Each round simulates the bounds between equal parts of the interval from `low` to `high`,
+    and keeps the part below the first unsafe one. The error is at most `RESOLUTION` times the line above `lowest`. A
+    setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
+    `NOT_SIMULATED`.
     """
     lines = np.arange(len(starts))
     always = np.ones(len(starts), dtype=bool)
