@@ -107,10 +107,11 @@ class _Pace(ProgressColumn):
         """What was done when the stage began, such as by an earlier command, and the time [s]."""
 
     def update(self, done: int, total: int) -> None:
+        is_new = self._begun is None or done == 0 or done < self._done or not self._total
         self._done = done
         self._total = total
         self._last = time.monotonic()
-        if done == 0 or self._begun is None:
+        if is_new:
             self._begun = done, self._last
 
     def render(self, task: Task | None = None) -> Text:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -42,6 +42,15 @@ over its domain.
 """
 
 
+class _Call(NamedTuple):
+    """Progress of a call within a stage: its own stage, what was done when it began, what is done, and its total."""
+
+    stage: str
+    first: int
+    done: int
+    of: int
+
+
 class Evaluator:
     """Evaluates settings of one study without the filter, and draws settings that cover the study's domain.
 
@@ -64,6 +73,8 @@ class Evaluator:
         self._pool = pool
         self.progress = progress
         self._verified = verified
+        self._counts = dict[str, int]()
+        """Settings of each stage that has ended; where it begins again, its count goes on."""
         self.simulated = 0
         self.measure = ""
         self.undefined = list[tuple[int, int]]()
@@ -109,30 +120,34 @@ class Evaluator:
         left.
         """
         show = self.progress
-        earlier = 0
-        """Settings of the calls before the one under way."""
-        under_way = 0
+        earlier = self._counts.get(name, 0)
+        """Settings of the calls before the one under way, and of the same stage before this one."""
+        call = _Call("", 0, 0, 0)
+        if total is not None:
+            total += earlier
 
         def show_part(stage: str, done: int, of: int) -> None:
-            nonlocal earlier, under_way
+            nonlocal earlier, call
             if stage == COMPILING:
                 show(stage, done, of)
                 return
-            if not done:
-                earlier += under_way
-                under_way = of
-            show(name, earlier + done, 0 if total is None else max(total, earlier + of))
+            if stage != call.stage or not done or done < call.done:
+                earlier += call.done - call.first
+                call = _Call(stage, done, done, of)
+            call = call._replace(done=done)
+            show(name, earlier + done - call.first, 0 if total is None else max(total, earlier + of - call.first))
 
         def expect(left: int) -> None:
             nonlocal total
-            total = earlier + under_way + left
+            total = earlier + call.of - call.first + left
 
-        show(name, 0, total or 0)
+        show(name, earlier, total or 0)
         self.progress = show_part
         try:
             yield expect
         finally:
             self.progress = show
+            self._counts[name] = earlier + call.done - call.first
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.

@@ -250,9 +250,8 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
 
 @SLOW
 def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
-    Path("late.toml").write_text(
-        'extends = "smoke"\n[weather]\nname = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5\n'
-    )
+    weather = 'name = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5'
+    Path("late.toml").write_text(f'extends = "smoke"\n[weather]\n{weather}\n')
     searched = run("study", "late.toml", "--runs", "1", "--evaluations", "10", "--json")
     speed = sv.simulate("late.toml").collision_speed
     assert speed > 1

@@ -261,6 +261,27 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     assert shown[-1] == ("unplanned", 1, 1)
 
 
+def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
+    """A test of 3 settings, a search, another test of 2: alone, and within a whole."""
+    shown = list[tuple[str, int, int]]()
+    evaluator = made_up_evaluator(1, nowhere)
+    evaluator.progress = lambda *values: shown.append(values) if values[0] in ("test", "search", "whole") else None
+
+    def test_twice() -> None:
+        for number, name in ((3, "test"), (4, "search"), (2, "test")):
+            with evaluator.stage(name, number if name == "test" else None):
+                evaluator.evaluate(np.arange(number)[:, np.newaxis] + 1.0, "a call")
+
+    test_twice()
+    assert [*dict.fromkeys(shown)] == [
+        *[("test", 0, 3), ("test", 3, 3), ("search", 0, 0), ("search", 4, 0), ("test", 3, 5), ("test", 5, 5)]
+    ]
+    shown.clear()
+    with evaluator.stage("whole"):
+        test_twice()
+    assert [*dict.fromkeys(shown)] == [("whole", done, 0) for done in (0, 3, 7, 9)]
+
+
 def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
     study = load_study("smoke")
