@@ -31,7 +31,8 @@ from safevar_sumo.ads import PerVehicleAds, ScalarAds
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.batch import drive, observer_of
+from safevar_sumo.sumo.batch import observer_of
+from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.engine import open_world, sumo_options
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.network import copied_network, stage_network

@@ -11,8 +11,9 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.sumo.batch import enter, observer_of, open_points_world, stage_of
+from safevar_sumo.sumo.batch import observer_of, open_points_world, stage_of
 from safevar_sumo.sumo.bodies import Contacts
+from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size, simulate_groups
 from safevar_sumo.sumo.system import System
@@ -40,11 +41,11 @@ def drive_again(
     trace = runs.trace
     n = len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
-    fleet, vehicles = system.at_encounters(settings)
-    point = fleet.points[0]
+    on_road, vehicles = system.at_encounters(settings)
+    point = on_road.points[0]
     stage = stage_of(system, settings)
     with user_errors(system.source), open_points_world(system, settings, stage, start) as world:
-        motion = enter(fleet, vehicles, world).motion
+        motion = enter(on_road, vehicles, world).motion
         observer = observer_of(point.scenario, world, stage)
         is_open = np.ones(n, dtype=bool)
         frame = world.frame

@@ -16,7 +16,7 @@ from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.batch import drive
+from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points
 from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.system import assemble

@@ -14,7 +14,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo import batch
+from safevar_sumo.sumo import drive
 from safevar_sumo.sumo.bodies import Contacts
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
@@ -195,7 +195,7 @@ def hit_at_any_time(scenario: Any) -> list[str]:
 
 def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     """In SUMO, persons move first. In a test, contacts of the side would not count."""
-    monkeypatch.setattr(batch, "Contacts", lambda n, _: Contacts(n, np.zeros(n, dtype=bool)))
+    monkeypatch.setattr(drive, "Contacts", lambda n, _: Contacts(n, np.zeros(n, dtype=bool)))
     scenario = Crossing(test="CPFA", speed=30, impact_location=-30)
     assert hit_at_any_time(scenario).count(Outcome.COLLISION) > 5
 

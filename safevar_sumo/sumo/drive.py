@@ -1,0 +1,263 @@
+"""Drives vehicles through a world, sample by sample: from what they observe to the speeds that they reach."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from safevar_sumo.ads import Ads, FullBrake
+from safevar_sumo.ads.varied import with_tau
+from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import check_open_runs, open_rows
+from safevar_sumo.protocol.driving_robot import DrivingRobot
+from safevar_sumo.records import (
+    STANDSTILL,
+    TIME_DECIMALS,
+    BoolArray,
+    Command,
+    FloatArray,
+    Observation,
+    Outcome,
+    Quantity,
+    SimulationRuns,
+    Trace,
+)
+from safevar_sumo.scenarios import VUT, Point, Scene
+from safevar_sumo.sumo.bodies import Contacts, Motion, World
+from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
+from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, slope_of
+from safevar_sumo.vehicles.base import Prepared
+
+Listener = Callable[[Observation], None]
+"""A function that is called with what the ADS observes at every sample."""
+OF_ALL_RUNS = ("step", "vehicle_length", "vehicle_width", "time", "position")
+"""Fields of a trace that are no columns of a log."""
+TRUTHS = ("active", "visible")
+"""Columns of a log that are true or false."""
+
+
+@np.errstate(all="ignore")
+def drive(
+    system: System, settings: FloatArray, world: World, observer: Observer, listen: Listener | None = None
+) -> SimulationRuns:
+    """Simulate N settings of the vehicle's n characteristics, shape (N, n), in a world that has not taken its first
+    step; see `drive_all`.
+
+    With K points, `settings` holds K groups of equal size, and group k drives at point k.
+    """
+    points = system.points
+    vehicle = system.vehicle
+    step = world.step_length
+    n = len(settings)
+    size = n // len(points)
+    prepared, ads, motion = enter(system, settings, world)
+    state = vehicle.at_start(prepared, motion.speeds)
+    memory = ads.start(n, system.nominal, step)
+    perception = Perception([point.weather for point in points], step, size)
+    robot = DrivingRobot(points, vehicle, prepared, state, step)
+    contacts = Contacts(n, np.repeat([point.scenario.is_hit_in_front for point in points], size))
+    outcomes = _Outcomes(n)
+    last_sample = np.round(per_vehicle([point.scenario.duration / step for point in points], size)).astype(int)
+    log = _Log(world, int(last_sample.max()) + 1)
+    with check_open_runs(outcomes.is_checked):
+        for sample in range(log.capacity):
+            time = sample * step
+            speed = motion.speeds
+            scene = observer.observe(motion, outcomes.is_open)
+            if system.sees_nobody:  # the run ends at the place of the encounter
+                scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
+            collisions = contacts.count(world, motion.hits, scene)
+            if isinstance(observer, SceneObserver):  # bodies on a stage touch wherever they overlap
+                contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
+            active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_sample)
+
+            observation = perception.observe(time, speed, scene)
+            observation = observation._replace(throttle=state.throttle, brake=state.brake)
+            observation, state = vehicle.sense(prepared, state, observation)
+            if listen is not None:
+                listen(observation)
+            command, memory = ads.drive(observation, memory)
+            outcomes.note_warnings(ads.warns(memory), speed, scene)
+            command, state = robot.drive(command, state, outcomes.is_open)
+            log.write(motion.fronts, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
+            if not np.count_nonzero(outcomes.is_open):
+                break
+
+            np.copyto(outcomes.is_checked, outcomes.is_open)
+            state = vehicle.advance(prepared, state, command)
+            _check_finite(state.speed, settings, system.characteristics)
+            motion = world.step(state.speed, outcomes.is_open)
+    trace = log.trace()
+    return SimulationRuns(
+        trace=trace,
+        encounter=observer.encounter(trace),
+        outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
+        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
+        contact=contacts.first,
+        test_speed_error=robot.error,
+        acted_early=robot.acted_early,
+        warning_ttc=outcomes.warning_ttc,
+    )
+
+
+class Fleet(NamedTuple):
+    """Vehicles on the road: their constants, their ADS and their first motion."""
+
+    prepared: Prepared
+    ads: Ads
+    motion: Motion
+
+
+def enter(system: System, settings: FloatArray, world: World) -> Fleet:
+    """Put the vehicles of N settings, shape (N, n), onto the road."""
+    vehicle = system.vehicle
+    n = len(settings)
+    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
+    types = vehicle.sumo_type(prepared)
+    ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
+    if not isinstance(ads, TraciController):
+        return Fleet(prepared, ads, world.enter(types))
+    motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
+    return Fleet(prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion)
+
+
+def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
+    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model diverged would appear
+    to stand.
+
+    The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
+    """
+    is_finite = np.isfinite(speed)
+    if is_finite.all():
+        return
+    for copy in open_rows(~is_finite)[:1]:
+        changes = [
+            f"{characteristic.name} = {value:g}"
+            for characteristic, value in zip(characteristics, settings[copy], strict=True)
+            if value != characteristic.original
+        ]
+        values = ", ".join(changes) or "the original's values"
+        raise InputError(
+            "vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with"
+        )
+
+
+def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]:
+    """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
+    all points share it), time step and, unless all roads are level and dry, slope and water.
+    """
+    size = n // len(points)
+    friction = per_vehicle([point.weather.road_friction for point in points], size)
+    grades = [point.scenario.grade for point in points]
+    water = [point.weather.water for point in points]
+    slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
+    if any(water):
+        return friction, step, slope, np.repeat(water, size)
+    return (friction, step, slope) if any(grades) else (friction, step)
+
+
+def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
+    """The vehicles' sensors: the weather adds its recognition delay and scales the range by its visibility."""
+    (point,) = system.points  # SUMO simulates one point at once
+    latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
+    # Nobody is within a negative range.
+    reach_in_weather = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
+    return Sensors(latency + point.weather.recognition_delay, reach_in_weather, scale)
+
+
+class _Log:
+    """Up to `capacity` samples of N runs; T samples are arrays of shape (T, N), and the vehicles' positions on SUMO's
+    plane an array of shape (T, N, 2) [m].
+    """
+
+    def __init__(self, world: World, capacity: int) -> None:
+        self.capacity = capacity
+        self._samples = 0
+        self._step = world.step_length
+        self._length = world.vehicle_length(VUT)
+        self._width = world.vehicle_width
+        self._frame = world.frame
+        self._positions = np.zeros((capacity, world.n, 2))
+        names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
+        kinds = {name: bool if name in TRUTHS else float for name in names}
+        self._columns = {name: np.zeros((capacity, world.n), dtype=kind) for name, kind in kinds.items()}
+
+    def write(self, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray) -> None:
+        """Write the next sample."""
+        self._positions[self._samples] = position
+        values = {**scene._asdict(), **command._asdict(), **others}
+        for name, column in self._columns.items():
+            column[self._samples] = values[name]
+        self._samples += 1
+
+    def trace(self) -> Trace:
+        """All samples that were written."""
+        samples = self._samples
+        columns = {name: values[:samples] for name, values in self._columns.items()}
+        along = self._frame.along(self._positions[:samples].reshape(-1, 2))
+        return Trace(
+            step=self._step,
+            vehicle_length=self._length,
+            vehicle_width=self._width,
+            time=np.round(np.arange(samples) * self._step, TIME_DECIMALS),
+            position=along.reshape(samples, -1),
+            **columns,
+        )
+
+
+class _Outcomes:
+    """Outcomes of N runs (docs/method.md, section 4), shape (N,); `collision_speed` [m/s] and `warning_ttc`, the true
+    time to collision at the first warning [s], are NaN without one.
+
+    `is_open` is true where an outcome can change; `is_checked` where user code is checked: in runs that were open when
+    their vehicles last advanced.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.is_open = np.ones(n, dtype=bool)
+        self.is_checked = np.ones(n, dtype=bool)
+        self.collision_speed = np.full(n, np.nan)
+        self.warning_ttc = np.full(n, np.nan)
+        self._has_moved = np.zeros(n, dtype=bool)
+        self._has_stopped = np.zeros(n, dtype=bool)
+        self._is_over = np.zeros(n, dtype=bool)
+
+    def judge(
+        self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool
+    ) -> BoolArray:
+        """Process one sample; returns for which vehicles the sample is part of the run."""
+        active = self.is_open & ~over
+        for copy, collision_speed in collisions.items():
+            if self.is_open[copy]:
+                self.collision_speed[copy] = collision_speed
+                active[copy] = True
+                self.is_open[copy] = False
+        is_standing = speed <= STANDSTILL
+        self._has_stopped |= self.is_open & self._has_moved & is_standing
+        self._has_moved |= self.is_open & ~is_standing
+        self._is_over |= self.is_open & over
+        self.is_open &= ~over & ~np.asarray(last)
+        return active
+
+    def note_warnings(self, warns: BoolArray | None, speed: FloatArray, scene: Scene) -> None:
+        """Note the time to collision, not as it is sensed, of each open run's first warning."""
+        if warns is not None:
+            closing_speed = speed - scene.obstacle_speed
+            is_first = warns & self.is_open & np.isnan(self.warning_ttc) & (closing_speed > 0)
+            np.copyto(self.warning_ttc, scene.gap / closing_speed, where=is_first)
+
+    def classify(self) -> npt.NDArray[np.str_]:
+        """The outcomes of all runs, once no run is open."""
+        outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, dtype="U16")
+        outcome[self._is_over] = Outcome.PASSED
+        outcome[self._has_stopped] = Outcome.STOPPED
+        outcome[~self._has_moved] = Outcome.NEVER_MOVED
+        outcome[~np.isnan(self.collision_speed)] = Outcome.COLLISION
+        return outcome
