@@ -166,7 +166,7 @@ def _keep(item: Characteristic, alone: AloneLimit | None, together: LimitsTogeth
     low, high = ends
     name = item.short_name[:1].lower() + item.short_name[1:]
     if low == high:
-        return f"no room for {name}: {low:g}{item.suffix}, as in the original"
+        return f"no room for {name}: {low:.10g}{item.suffix}, as in the original"
     sides = (("at least", low, item.lower), ("at most", high, item.upper))
     keep = " and ".join(f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last)
     return f"{others}: {name} {keep or 'anywhere in its domain'}"
@@ -235,7 +235,7 @@ def _limit_texts(search: LevelSearch) -> Iterator[str]:
     for name, limit in search.limits.items():
         for word, end in (("at least", limit.at_least), ("at most", limit.at_most)):
             if end is not None:
-                yield f"{name} {word} {end:g}{members[name].suffix}"
+                yield f"{name} {word} {end:.10g}{members[name].suffix}"
 
 
 def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
@@ -247,7 +247,7 @@ def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
         is_low = item.original - item.lower >= item.upper - item.original
         is_whole = rows["alone_low"] <= item.lower if is_low else rows["alone_high"] >= item.upper
         whole = rows.loc[is_whole, f"by_{by.name}"].max()
-        text = f"{item.name} {item.lower if is_low else item.upper:g}{item.suffix}"
+        text = f"{item.name} {item.lower if is_low else item.upper:.10g}{item.suffix}"
         yield f"{text} not up to {by.text(by.values[0])}" if np.isnan(whole) else f"{text} up to {by.text(whole)}"
 
 

@@ -102,7 +102,7 @@ def limit_rows(
                 is_kept,
                 None if failure is None else failure.words,
                 None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True)),
-                None if together is None else _sentence(item, box, members, specified, beyond.get(name)),
+                None if together is None else _sentence(item, box, members, beyond.get(name)),
             )
         )
     return LimitRows(rows, broken)
@@ -140,7 +140,7 @@ def _broken_in_words(
     """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`."""
     item = alone.characteristic
     by, end = _outside(alone, specified)
-    name = f"{item.name} {next(value for value in specified if value is not None):.5g}{item.suffix}"
+    name = f"{item.name} {next(value for value in specified if value is not None):.10g}{item.suffix}"
     if by:
         members = models[0].evaluator.characteristics
         setting = members.setting({item.name: end})
@@ -150,7 +150,8 @@ def _broken_in_words(
                 break
         words = "the car is unsafe" if failure is None else failure.words
         value = end if failure is None else failure.setting[members.names.index(item.name)]
-        return f"{item.name} {value:.5g}{item.suffix}: {words} (outside by {by:.3g}{item.suffix})"
+        shown = f"{value:.10g}{item.suffix}" if value == end else _beyond(item, value)
+        return f"{item.name} {shown}: {words} (outside by {by:.10g}{item.suffix})"
     assert together is not None
     fits = {model.fit: model for model in models}
     fit, setting = next(iter(together.broken.items()))
@@ -217,28 +218,23 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
     return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from {scenario.obstacle()}{test}"
 
 
-def _sentence(
-    item: Characteristic, box: Any, members: CharacteristicSet, specified: Ends, failure: Failure | None
-) -> str:
-    """A sentence for a maintenance manual: all of these may be obeyed together. The original, and what the user
-    specified, have their own digits.
-    """
+def _sentence(item: Characteristic, box: Any, members: CharacteristicSet, failure: Failure | None) -> str:
+    """A sentence for a maintenance manual: all of these may be obeyed together."""
     name = item.short_name[:1].upper() + item.short_name[1:]
     if box is None:
         return f"{name}: no limits together were found."
     column = members.names.index(item.name)
     ends: Interval = float(box.lower[column]), float(box.upper[column])
-    own = (item.original, *specified)
     domain = (item.lower, item.upper)
     if ends[0] == ends[1]:
-        return f"{name}: keep {ends[0]:g}{item.suffix}, as in the original: no room was found for it."
+        return f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for it."
     keep = " and ".join(
-        f"{word} {f'{end:g}' if end in own else item.text(end)}{item.suffix}"
+        f"{word} {end:.10g}{item.suffix}"
         for word, end, last in zip(("at least", "at most"), ends, domain, strict=True)
         if end != last
     )
     if not keep:
-        return f"{name}: anything from {item.lower:g} to {item.upper:g}{item.suffix}."
+        return f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}."
     beyond = "" if failure is None else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
     return f"{name}: keep {keep}{beyond}."
 
@@ -250,9 +246,19 @@ def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet
     is_corner = bool((np.isclose(values, box.lower[others]) | np.isclose(values, box.upper[others])).all())
     value = failure.setting[members.names.index(item.name)]
     named = [
-        f"{members.members[number].name} {failure.setting[number]:.6g}{members.members[number].suffix}"
+        f"{members.members[number].name} {_nearest(members.members[number], failure.setting[number])}"
         for number in others
         if failure.setting[number] != members.original[number]
     ]
     rest = "" if is_corner else ", ".join(named)
-    return f"at {value:.6g}{item.suffix}{f', with {rest}' if rest else ''}"
+    return f"at {_beyond(item, value)}{f', with {rest}' if rest else ''}"
+
+
+def _nearest(item: Characteristic, value: float) -> str:
+    """A value with the digits of a limit: limits are rounded once, and written without further zeros, as in tables."""
+    return f"{round(value, item.digits):.10g}{item.suffix}"
+
+
+def _beyond(item: Characteristic, value: float) -> str:
+    """A value beyond a limit with the digits of the limit, which it does not become by rounding."""
+    return _nearest(item, item.rounded(value, upwards=value > item.original))
