@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.measures import RATING_POINTS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, Quantity
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables
 
@@ -25,7 +26,7 @@ CRITERIA = (
     "collision, points=X with X points of a rating, below=X with a safety degree X [m, or minus a collision's "
     'closing speed in m/s], or a metric with <, <=, > or >= and a number, such as "drac > 6"'
 )
-COMPARISONS: Mapping[str, Callable[[Any, float], Any]] = {
+COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,
@@ -141,7 +142,7 @@ class Unsafe:
         """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are unsafe."""
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
-    def _holds(self, outcome: Any, column: Callable[[str], Any]) -> Any:
+    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
         if self.points is not None:
             return column(RATING_POINTS.name) <= self.points
         if self.below is not None:
@@ -233,7 +234,7 @@ class Unsafe:
         raise InputError("unsafe", repr(criterion), CRITERIA)
 
     @classmethod
-    def default(cls, original: Tables, outcomes: Any) -> Unsafe:
+    def default(cls, original: Tables, outcomes: npt.NDArray[np.str_] | pd.Series[str]) -> Unsafe:
         """The criterion if none is stated.
 
         In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the

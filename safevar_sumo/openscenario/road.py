@@ -106,7 +106,7 @@ class Line:
     facings: Sequence[complex] = ()
 
     @cached_property
-    def starts(self) -> Any:
+    def starts(self) -> Number:
         """Distances at which the pieces begin, and that of the end."""
         return np.concatenate([[0.0], np.cumsum([piece.length for piece in self.pieces])])
 
@@ -142,14 +142,14 @@ class Line:
             pose = pose._replace(facing=between / np.abs(between))
         return pose if np.ndim(distance) else Pose(complex(pose.place[0]), complex(pose.facing[0]))
 
-    def curvature(self, distance: Any) -> Any:
+    def curvature(self, distance: Number) -> Number:
         """The curvatures at distances [1/m]."""
         inside = np.clip(distance, 0.0, self.length)
         firsts, slopes = (np.array([getattr(piece, name) for piece in self.pieces]) for name in ("first", "slope"))
         k = self._piece_at(inside)
         return firsts[k] + slopes[k] * (inside - self.starts[k])
 
-    def _piece_at(self, distance: Any) -> Any:
+    def _piece_at(self, distance: Number) -> Number:
         return np.clip(np.searchsorted(self.starts, distance, side="right") - 1, 0, len(self.pieces) - 1)
 
 

@@ -113,7 +113,7 @@ def _studies() -> Iterator[tuple[str, ...]]:
         yield study.name, study.title, study.vehicle.model, study.ads.model, study.scenario.model, weather
 
 
-def _characteristics() -> Iterator[tuple[Any, ...]]:
+def _characteristics() -> Iterator[tuple[float | str, ...]]:
     studies = {study.vehicle.model: study for study in reversed([*map(load_study, study_names())])}
     for vehicle, study in sorted(studies.items()):
         for row in CharacteristicSet.of(study).vehicle:

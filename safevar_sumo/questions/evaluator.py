@@ -273,7 +273,9 @@ class Evaluator:
         compile_vehicle(self.study, self._pool, self.progress)
         return ask_why_no_verdict(self.study, self._pool)
 
-    def choose_criterion(self, text: str | None, source: Study | Case, original: Evaluations | None = None) -> Unsafe:
+    def choose_criterion(
+        self, text: Unsafe | str | None, source: Study | Case, original: Evaluations | None = None
+    ) -> Unsafe:
         """The criterion that an option states, or else the default for the solutions of results, or for settings over
         the whole domain of a study.
 

@@ -106,7 +106,11 @@ class Models(NamedTuple):
 
 
 def limit_criterion(
-    evaluator: Evaluator, subject: Study | Case, unsafe: Any, margin: float | None, original: Evaluations
+    evaluator: Evaluator,
+    subject: Study | Case,
+    unsafe: Unsafe | str | None,
+    margin: float | None,
+    original: Evaluations,
 ) -> Unsafe:
     """What is unsafe for limits: the stated criterion as it is, else a collision or less than the margin [m], which
     is by default that of the study; `SEARCHED_MARGIN` in one that searches its scenario, whose originals keep more.

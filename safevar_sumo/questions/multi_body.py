@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.vehicles import Slope
 
 WHEEL_COUNT = 4
@@ -113,7 +113,7 @@ def build_plant(
     centre: FloatArray | None = None,
     wheelbase: float | None = None,
     height: float | None = None,
-    **constants: Any,
+    **constants: Quantity,
 ) -> Plant:
     """Scale the package's vehicle to vehicles of other masses [kg].
 
@@ -183,12 +183,19 @@ def balanced_state(plant: Plant, speed: FloatArray) -> MultiBodyState:
     return MultiBodyState(speed, heights, np.zeros_like(heights), ones * speed / plant.radius, ones)
 
 
-def tyre_forces(plant: Plant, body: MultiBodyState) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative.
-
-    Of one tyre of each axle, shape (2, N): the force along the road and its greatest value [N], the slip [-], positive
-    when braking, and the derivative of the force by the wheel's speed [N s/rad].
+class TyreForces(NamedTuple):
+    """Of one tyre of each axle, shape (2, N): the force along the road and its greatest value [N], the slip [-],
+    positive when braking, and the derivative of the force by the wheel's speed [N s/rad].
     """
+
+    force: FloatArray
+    peak: FloatArray
+    slip: FloatArray
+    by_wheel_speed: FloatArray
+
+
+def tyre_forces(plant: Plant, body: MultiBodyState) -> TyreForces:
+    """Pacejka's formula for pure longitudinal slip, as in the package's `formula_longitudinal`, and its derivative."""
     tyre = load_bmw_parameters().tire
     slip_denominator = np.maximum(body.speed, LEAST_SPEED)
     load = np.maximum(body.heights[2:] * plant.tyre_spring, 1.0)
@@ -200,14 +207,20 @@ def tyre_forces(plant: Plant, body: MultiBodyState) -> tuple[FloatArray, FloatAr
     angle = tyre.p_cx1 * np.arctan(curve) + load * tyre.p_vx1
     bend = 1 - tyre.p_ex1 + tyre.p_ex1 / (1 + scaled_slip * scaled_slip)
     force_by_scaled_slip = peak * np.cos(angle) * (tyre.p_cx1 / (1 + curve * curve)) * bend
-    force_by_wheel_speed = force_by_scaled_slip * (stiffness * plant.radius / slip_denominator)
-    return peak * np.sin(angle), peak, slip, force_by_wheel_speed
+    by_wheel_speed = force_by_scaled_slip * (stiffness * plant.radius / slip_denominator)
+    return TyreForces(peak * np.sin(angle), peak, slip, by_wheel_speed)
 
 
-def derivatives(
-    plant: Plant, body: MultiBodyState, torques: FloatArray, force: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The right-hand side of the package's equations: the derivatives of speed, rates and wheel speeds.
+class Accelerations(NamedTuple):
+    """Derivatives of a `MultiBodyState`: of speed, shape (N,), rates, (4, N), and wheel speeds, (2, N)."""
+
+    speed: FloatArray
+    rates: FloatArray
+    wheel_speeds: FloatArray
+
+
+def derivatives(plant: Plant, body: MultiBodyState, torques: FloatArray, force: FloatArray) -> Accelerations:
+    """The right-hand side of the package's equations.
 
     `torques`, shape (2, N), turn both wheels of an axle forward [N m]; `force` is that of one tyre of each axle [N].
     """
@@ -222,10 +235,10 @@ def derivatives(
     pitch_moment = 2 * (moments[0] + moments[1]) + traction * (plant.height - body.heights[0])
     pitch_acceleration = pitch_moment / plant.pitch_inertia
     axle_accelerations = plant.down - 2 * (body.heights[2:] * plant.tyre_spring - spring_forces) / plant.unsprung_mass
-    return (
-        traction / plant.mass - plant.back,
-        np.stack([heave_acceleration, pitch_acceleration, *axle_accelerations]),
-        (torques / 2 - plant.radius * force) / plant.wheel_inertia,
+    return Accelerations(
+        speed=traction / plant.mass - plant.back,
+        rates=np.stack([heave_acceleration, pitch_acceleration, *axle_accelerations]),
+        wheel_speeds=(torques / 2 - plant.radius * force) / plant.wheel_inertia,
     )
 
 
@@ -236,20 +249,21 @@ def advance(
 
     Wheel speeds, which are stiff, are integrated implicitly (linearised), others explicitly, rates before heights.
     """
-    force, peak, slip, force_by_wheel_speed = tyre_forces(plant, body)
-    is_locking = (slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
+    tyres = tyre_forces(plant, body)
+    is_locking = (tyres.slip > SLIP_LIMIT) & (body.speed > LEAST_CONTROL_SPEED)
     lower_shares = np.maximum(np.minimum(body.pressure_shares, pedal) - RELEASE_RATE * step, 0.0)
     pressure_shares = np.where(is_locking, lower_shares, np.minimum(body.pressure_shares + BUILD_UP_RATE * step, 1.0))
-    drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * peak)
+    drive = np.minimum(drive_torque * plant.drive_shares, 2 * TRACTION_SHARE * plant.radius * tyres.peak)
     brakes = np.minimum(pedal, pressure_shares) * (plant.brake_torque * plant.brake_shares)
-    acceleration, body_accelerations, wheel_accelerations = derivatives(plant, body, drive - brakes, force)
-    gradients = np.maximum(force_by_wheel_speed, 0.0)  # 0 beyond the peak of the tyre's force
+    accelerations = derivatives(plant, body, drive - brakes, tyres.force)
+    gradients = np.maximum(tyres.by_wheel_speed, 0.0)  # 0 beyond the peak of the tyre's force
     damping = 1 + step * gradients * plant.radius / plant.wheel_inertia
-    wheel_speeds = np.maximum(body.wheel_speeds + step * wheel_accelerations / damping, 0.0)
+    wheel_speeds = np.maximum(body.wheel_speeds + step * accelerations.wheel_speeds / damping, 0.0)
     added_force = gradients * (wheel_speeds - body.wheel_speeds)
-    speed = np.maximum(body.speed + step * (acceleration + 2 * (added_force[0] + added_force[1]) / plant.mass), 0.0)
+    acceleration = accelerations.speed + 2 * (added_force[0] + added_force[1]) / plant.mass
+    speed = np.maximum(body.speed + step * acceleration, 0.0)
     # Pacejka's tyres push slightly even without slip, so a vehicle without drive is held.
     is_standing = (body.speed <= 0) & (drive_torque <= 0) & (plant.back >= 0)
     speed = np.where(is_standing, 0.0, speed)
-    rates = body.rates + step * body_accelerations
+    rates = body.rates + step * accelerations.rates
     return MultiBodyState(speed, body.heights + step * rates, rates, wheel_speeds, pressure_shares)

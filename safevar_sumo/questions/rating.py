@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
@@ -182,7 +182,7 @@ def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: 
     )
 
 
-def _rows_of_tests(rater: Rater, scores: Points, names: list[str]) -> Iterator[tuple[Any, ...]]:
+def _rows_of_tests(rater: Rater, scores: Points, names: list[str]) -> Iterator[tuple[float | str | None, ...]]:
     for number, name in enumerate(names):
         for matrix in rater.protocol.matrices:
             points = scores.tests[matrix.name].round(DECIMALS)

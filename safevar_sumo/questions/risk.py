@@ -9,7 +9,8 @@ Research 226, 536-550).
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
@@ -49,6 +50,8 @@ COLUMNS = [
     "characteristic",
     *(f"{output}_{index}{end}" for output in OUTPUTS for index in ("first", "total") for end in ("", LOW, HIGH)),
 ]
+Indices = Mapping[str, FloatArray]
+"""SALib's results: by key, an index of each characteristic, shape (n,), or half of its confidence interval."""
 
 
 @question
@@ -162,9 +165,10 @@ def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
     is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
-    def indices_of(output: FloatArray) -> Any:
+    def indices_of(output: FloatArray) -> Indices:
         options = {"calc_second_order": False, "num_resamples": RESAMPLES, "conf_level": confidence, "seed": seed}
-        return analysis.analyze(problem, output[is_complete], **options)
+        indices: Indices = analysis.analyze(problem, output[is_complete], **options)
+        return indices
 
     outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
@@ -182,10 +186,11 @@ def given_data_indices(evaluator: Evaluator, drawn: Evaluations, criterion: Unsa
     problem = {"num_vars": len(names), "names": [str(number) for number in range(len(names))]}  # SALib reserves endings
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
-    def indices_of(output: FloatArray) -> Any:
+    def indices_of(output: FloatArray) -> Indices:
+        seed = evaluator.study.search.seed % 2**32
         with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):  # SALib sets both for the process
-            seed = evaluator.study.search.seed % 2**32
-            return analysis.analyze(problem, drawn.settings[:, varies], output, seed=seed, **options)
+            indices: Indices = analysis.analyze(problem, drawn.settings[:, varies], output, seed=seed, **options)
+        return indices
 
     outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
@@ -204,7 +209,7 @@ def _outputs(evaluations: Evaluations, criterion: Unsafe, counts: BoolArray) -> 
     }
 
 
-def _table(names: list[str], found: dict[str, Any], indices: dict[str, tuple[str, str]]) -> pd.DataFrame:
+def _table(names: list[str], found: Mapping[str, Indices], indices: dict[str, tuple[str, str]]) -> pd.DataFrame:
     """A row for each characteristic, the one that decides most of the safety degree first; `indices` maps an index to
     SALib's key and its meaning.
     """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice
-from typing import Any
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
@@ -77,7 +76,7 @@ def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence
     )
 
 
-def _values_in_words(values: Sequence[Any], is_range: bool) -> str:
+def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
     if is_range and len(values) > 1:
         return f"{min(values):g} to {max(values):g}"
     return join_phrases(f"{value:g}" if isinstance(value, float) else str(value) for value in values)

@@ -23,10 +23,10 @@ from safevar_sumo.questions.multi_body import (
     build_plant,
     load_bmw_parameters,
 )
-from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, JsonObject, Observation, Quantity
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.vehicles import LEVEL, VEHICLES, Carla, Sensors, Slope, SumoType, Vehicle
-from safevar_sumo.vehicles.base import Characteristics
+from safevar_sumo.vehicles.base import Characteristics, State
 from safevar_sumo.vehicles.carla import AIR_DENSITY, FRONTAL_AREA, WHEEL_MASS
 from safevar_sumo.vehicles.lgsvl import FRICTION, Lgsvl
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
@@ -38,7 +38,7 @@ METRES_PER_CM = 0.01  # m
 class Road(NamedTuple):
     """The road as `Vehicle.prepare` gets it: its factor on the tyres' friction, its slope, and the water on it."""
 
-    friction: Any
+    friction: Quantity
     slope: Slope
     water: float | FloatArray
 
@@ -172,8 +172,8 @@ class SecondState(NamedTuple):
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    vehicle: Any
-    original: Any
+    vehicle: State
+    original: State
     body: MultiBodyState
     brake_commands: DelayedSignal
 
@@ -217,7 +217,7 @@ class SecondVehicle(Vehicle):
     def prepare(
         self,
         characteristics: Characteristics,
-        road_friction: Any,
+        road_friction: Quantity,
         step: float,
         slope: Slope = LEVEL,
         water: float | FloatArray = 0.0,
@@ -285,7 +285,7 @@ class SecondVehicle(Vehicle):
         self._spinning.update(setting.tobytes() for setting in prepared.settings[spins])
         return SecondState(body.speed, original.throttle, brake, original.gear, state.vehicle, original, body, commands)
 
-    def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[Any, FloatArray]:
+    def _advance_engine(self, prepared: Prepared, state: SecondState, throttle: FloatArray) -> tuple[State, FloatArray]:
         """The original vehicle one step later, and the torque of its engine and all drags on all wheels [N m]."""
         plant = prepared.plant
         radius = prepared.plant.radius

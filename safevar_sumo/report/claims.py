@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from itertools import zip_longest
 from pathlib import Path
 from shlex import split
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import msgspec
 import numpy as np
@@ -57,8 +57,14 @@ CLAIMS = {
     "packed": Column("", "value in the pack, if it differs"),
     "here": Column("", "value here, or the reason why there is none"),
 }
-Claim = tuple[str, str, str, str, str]
-"""A row of `CLAIMS`."""
+
+
+class Claim(NamedTuple):
+    """What a pack claims under a name, and the function that computes it again."""
+
+    name: str
+    packed: bytes
+    compute: Callable[[], bytes]
 
 
 class Packed:
@@ -155,19 +161,19 @@ class Packed:
             results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)
             return json_bytes(count_outcomes(results.case)), rows_of(csv_of(results.solutions))
 
-    def checks(self, folder: Path, search: bool) -> Iterator[tuple[str, bytes, Callable[[], bytes]]]:
+    def claims(self, folder: Path, search: bool) -> Iterator[Claim]:
         """What the pack claims, and the functions that compute it again; the manifest is in `folder`."""
         solutions = self._solution_rows
-        yield "inputs", b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode()
-        yield "study", self.files[STUDY], self.study_file
-        yield "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
-        yield "solutions", solutions, lambda: self.simulated[1]
+        yield Claim("inputs", b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode())
+        yield Claim("study", self.files[STUDY], self.study_file)
+        yield Claim("original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0])
+        yield Claim("solutions", solutions, lambda: self.simulated[1])
         for text, answer in zip(self.packed.questions, json_of(self.files[ANSWERS]), strict=True):
-            yield f"answer {text}", json_bytes(answer), partial(self._answer_json, text)
-        yield "report", self.files[PAGE], self.page
+            yield Claim(f"answer {text}", json_bytes(answer), partial(self._answer_json, text))
+        yield Claim("report", self.files[PAGE], self.page)
         if search:
-            yield "search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0]
-            yield "search: solutions", solutions, lambda: self.searched[1]
+            yield Claim("search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0])
+            yield Claim("search: solutions", solutions, lambda: self.searched[1])
 
     @property
     def code(self) -> list[str]:
@@ -225,20 +231,20 @@ def count_outcomes(case: Case) -> dict[str, int]:
     return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
 
 
-def compare(study: str, claim: str, packed: bytes, compute: Callable[[], bytes]) -> Claim:
-    """A claim, computed again; the lines shown are the first that differ."""
+def compare(study: str, claim: Claim) -> tuple[str, ...]:
+    """A row of `CLAIMS`: a claim, computed again; the lines shown are the first that differ."""
     try:
-        here = compute()
+        here = claim.compute()
     except SafevarError as error:
-        return study, claim, CANNOT, "", " ".join(str(error).split())
-    if packed == here:
-        return study, claim, SAME, "", ""
-    lines, lines_here = (content.decode().splitlines(keepends=True) for content in (packed, here))
+        return study, claim.name, CANNOT, "", " ".join(str(error).split())
+    if claim.packed == here:
+        return study, claim.name, SAME, "", ""
+    lines, lines_here = (content.decode().splitlines(keepends=True) for content in (claim.packed, here))
     pairs = zip_longest(lines, lines_here, fillvalue="nothing")
     first, second = next((_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1)
     same = next(index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1)
     start = max(same - CONTEXT, 0) if max(len(first), len(second)) > SHOWN else 0
-    return study, claim, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN]
+    return study, claim.name, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN]
 
 
 def _shown(line: str, other: str) -> str:

@@ -33,6 +33,7 @@ from safevar_sumo.report.claims import (
     PAGE,
     SAME,
     STUDY,
+    Claim,
     Packed,
     compare,
     count_outcomes,
@@ -189,12 +190,13 @@ def verify(
             problem = f"`verify` would run code of the pack: {', '.join(code)}"
             raise InputError(path, problem, "`run_code=True`, if you trust it")
         names = ", ".join(packed.case.study.name for packed in studies.values())
-        claims = [compare(names, "files", json_bytes(description.files), lambda: json_bytes(digests_of(files)))]
+        of_files = Claim("files", json_bytes(description.files), lambda: json_bytes(digests_of(files)))
+        rows = [compare(names, of_files)]
         for place, packed in studies.items():
             with only_from(str(place / CODE)):
-                for name, there, compute in packed.checks(place, search):
-                    claims.append(compare(packed.case.study.name, name, there, compute))
-    counts = Counter(verdict for _, _, verdict, _, _ in claims)
+                rows += [compare(packed.case.study.name, claim) for claim in packed.claims(place, search)]
+    claims = tabulate("Claims", CLAIMS, rows)
+    counts = Counter(claims["verdict"])
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
@@ -206,7 +208,7 @@ def verify(
             "claims": len(claims),
             **{verdict.partition(" ")[0]: counts[verdict] for verdict in (SAME, DIFFERS, CANNOT)},
         },
-        tables={"claims": tabulate("Claims", CLAIMS, claims)},
+        tables={"claims": claims},
     )
 
 

@@ -271,9 +271,10 @@ def find_touches(own: Body, other: Body) -> Touches:
     direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
     smaller overlap.
     """
-    axes, extent, distance = _along_axes(own, other)
+    axes = _axes_of(own)
+    distance = _dot(other.middle - own.middle, axes)
     speed = _dot(own.velocity - other.velocity, axes)
-    overlap = extent - np.abs(distance)
+    overlap = _joint_extent(own, other, axes) - np.abs(distance)
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
     ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
@@ -295,23 +296,22 @@ def find_overlaps(own: Body, other: Body) -> FloatArray:
 
 def _overlaps_along(own: Body, other: Body) -> FloatArray:
     """The overlaps in that direction of the own bodies in which they are less deep [m]."""
-    _, extent, distance = _along_axes(own, other)
-    return np.asarray(np.minimum(*(extent - np.abs(distance))))
+    axes = _axes_of(own)
+    distance = _dot(other.middle - own.middle, axes)
+    return np.asarray(np.minimum(*(_joint_extent(own, other, axes) - np.abs(distance))))
 
 
-def _along_axes(own: Body, other: Body) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The axes of M bodies, along and across them, shape (2, M, 2); in these directions the joint half extents with M
-    other bodies, and the distances to their middles, shape (2, M) [m].
-    """
-    axes = np.stack([own.along, np.stack([-own.along[:, 1], own.along[:, 0]], axis=1)])
+def _axes_of(body: Body) -> FloatArray:
+    """The directions along and across M bodies, unit vectors, shape (2, M, 2)."""
+    return np.stack([body.along, np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)])
+
+
+def _joint_extent(own: Body, other: Body, axes: FloatArray) -> FloatArray:
+    """Half the extents of M pairs of bodies along the axes of the own ones, added up, shape (2, M) [m]."""
     cosine, sine = np.abs(_dot(other.along, axes))
-    extent = np.stack(
-        [
-            (own.length + other.length * cosine + other.width * sine) / 2,
-            (own.width + other.length * sine + other.width * cosine) / 2,
-        ]
-    )
-    return axes, extent, _dot(other.middle - own.middle, axes)
+    along = (own.length + other.length * cosine + other.width * sine) / 2
+    across = (own.width + other.length * sine + other.width * cosine) / 2
+    return np.stack([along, across])
 
 
 def _dot(vectors: FloatArray, axes: FloatArray) -> FloatArray:

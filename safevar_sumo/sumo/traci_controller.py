@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,9 @@ from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
+from safevar_sumo.sumo.bodies import World
 from safevar_sumo.sumo.traci_view import OWN_LOOP, SensedTraffic, TraciView, Value, real_traci, refused
+from safevar_sumo.sumo.world import SumoWorld
 from safevar_sumo.vehicles import Sensors, SumoType
 
 Controller = Callable[..., None]
@@ -41,11 +43,12 @@ class TraciController(Ads):
 
     def __init__(self, create: Callable[[], Controller]) -> None:
         self._create = create
-        self._world: Any = None
-        self._sensors: Any = None
+        self._world: SumoWorld
+        self._sensors: Sensors
 
-    def in_world(self, world: Any, sensors: Sensors) -> TraciController:
+    def in_world(self, world: World, sensors: Sensors) -> TraciController:
         """The controller in SUMO's world, with the vehicles' sensors in their weather."""
+        assert isinstance(world, SumoWorld)
         controller = copy.copy(self)
         controller._world = world
         controller._sensors = sensors

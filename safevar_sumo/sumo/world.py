@@ -217,22 +217,24 @@ class SumoWorld:
         self._persons[actor] = positions
         return positions
 
-    def actor_poses(self) -> dict[str, tuple[float, float, float]]:
-        """All actors on the road, by id: x and y of front or person [m], heading clockwise from north [degrees]."""
+    def actor_poses(self) -> dict[str, tuple[tuple[float, float], float]]:
+        """All actors on the road, by id: the place of the front, or of a person [m], and the heading clockwise from
+        north [degrees].
+        """
         domains = (self.api.vehicle, self.api.person)
         return {
-            id_: (*domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
+            id_: (domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
         }
 
     def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
         """Write the motion of all actors on the road, by name, at one of `length` samples."""
-        for id_, (x, y, angle) in self.actor_poses().items():
+        for id_, (place, angle) in self.actor_poses().items():
             copy, name = copy_and_name(id_)
             domain = self._domain_of(id_)
             if name not in tracks:
                 motion = np.full((length, self.n, 5), np.nan)
                 tracks[name] = Film(motion, domain is self.api.person, domain.getLength(id_), domain.getWidth(id_))
-            tracks[name].motion[sample, copy] = x, y, *direction_of(angle), domain.getSpeed(id_)
+            tracks[name].motion[sample, copy] = *place, *direction_of(angle), domain.getSpeed(id_)
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))
