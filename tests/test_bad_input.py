@@ -43,6 +43,7 @@ TYPED = [
     ("study smoke --only nsga2:2", "'nsga2:2'"),
     ("study smoke --evaluations 99999999999999999999", "--evaluations"),
     ("study smoke --algorithms os:system", "os:system"),
+    ("study smoke --algorithms mine.py:Mine", "its module: 'mine:Mine'"),
     ("study smoke --cluster nowhere", "tcp://host:8786"),
     ("study smoke --cluster tcp://127.0.0.1:9", "no scheduler answers at 'tcp://127.0.0.1:9'"),
     ("study heavy.toml", "heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg"),

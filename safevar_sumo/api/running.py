@@ -48,8 +48,8 @@ def run(
     pool
         Pool that simulates, in place of new worker processes or a cluster.
     progress
-        True for a bar on the terminal; or a function called with the study's name and its finished runs, the number of
-        evaluations done, and the number to do at most.
+        True for a bar on the terminal; or a function called with a stage (the study's name and its finished runs), the
+        number of evaluations done, and the number to do at most.
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once every run is finished.
     batch
@@ -76,9 +76,9 @@ def run(
         keys = [RunKey(*key) for key in only]
     if batch is not None:
         check_whole("batch", batch, MAX_BATCH)
+    directory = Path("results") / loaded_study.name if out is None else Path(out)
     if out == "":
         raise InputError("out", "''", "a directory")
-    directory = Path(out) if out is not None else Path("results") / loaded_study.name
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)
     with pool_context as workers, open_progress(progress) as show:
         run_campaign(

@@ -92,17 +92,18 @@ class LazyCommands(click.Group):
         except InputError as error:
             command = self.get_command(ctx, str(ctx.invoked_subcommand))
             parameters = command.params if command else []
-            flags = {option.name: option.opts[-1] for option in parameters if isinstance(option, click.Option)}
-            if isinstance(error.source, str):  # a path is no argument
-                error.source = flags.get(error.source, error.source)
-            to_flag = partial(_to_flag, flags)
-            error.problem, error.legal = (ARGUMENT.sub(to_flag, text) for text in (error.problem, error.legal))
+            long_flags = {option.name: option.opts[-1] for option in parameters if isinstance(option, click.Option)}
+            if isinstance(error.source, str):  # only a text may name an argument
+                error.source = long_flags.get(error.source, error.source)
+            to_flag = partial(_to_flag, long_flags)
+            error.problem = ARGUMENT.sub(to_flag, error.problem)
+            error.legal = ARGUMENT.sub(to_flag, error.legal)
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
-                formatter.write_dl([(name, first_sentence(function)) for name, function in group.items()])
+                formatter.write_dl([(name, first_paragraph(function)) for name, function in group.items()])
 
 
 def function_of(command: str) -> Callable[..., Any]:
@@ -111,7 +112,7 @@ def function_of(command: str) -> Callable[..., Any]:
     return cast("Callable[..., Any]", getattr(importlib.import_module(f"safevar_sumo.{module}"), name))
 
 
-def first_sentence(function: str) -> str:
+def first_paragraph(function: str) -> str:
     """The first paragraph of a function's docstring, read from its file: to load it takes long."""
     module, _, name = function.partition(":")
     path = Path(__file__).parents[1] / module.replace(".", "/")
@@ -127,7 +128,7 @@ def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
     name, value = argument.groups()
     if name not in flags:
         return argument[0]
-    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"
+    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"  # `beyond=True` is --beyond
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -164,7 +165,8 @@ def main() -> None:
     except (KeyboardInterrupt, click.exceptions.Abort):
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except OSError as error:
-        _exit_with_error(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}", 1)
+        where = f": {error.filename}" if error.filename else ""
+        _exit_with_error(f"{error.strerror or error}{where}", 1)
     except ValueError:
         if not sys.stdout.closed:
             raise
@@ -174,7 +176,9 @@ def main() -> None:
 
 def _error_in_two_lines(error: click.ClickException) -> str:
     """Put an error of click into the form of this program's errors."""
-    command = " ".join([PROGRAM_COMMAND, *(word for word in sys.argv[1:2] if word in COMMANDS)])
+    command = PROGRAM_COMMAND
+    if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
+        command += f" {sys.argv[1]}"
     return f"{' '.join(error.format_message().split())}\nexpected: see {command} --help"
 
 
@@ -188,13 +192,15 @@ def _exit_on_interrupt() -> Iterator[None]:
         os.write(2, f"{PROGRAM}: interrupted\n".encode())
         os._exit(INTERRUPT_EXIT_CODE)
 
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    previous = {one: signal.signal(one, exit_at_once) for one in INTERRUPTS} if in_main_thread else {}
+    previous = {}
+    if threading.current_thread() is threading.main_thread():
+        for one in INTERRUPTS:
+            previous[one] = signal.signal(one, exit_at_once)
     try:
         yield
     finally:
         for one, handler in previous.items():
-            signal.signal(one, handler or signal.default_int_handler)
+            signal.signal(one, handler or signal.default_int_handler)  # None: not set from Python
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:

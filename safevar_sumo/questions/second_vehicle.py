@@ -36,7 +36,9 @@ METRES_PER_CM = 0.01  # m
 
 
 class Road(NamedTuple):
-    """The road as `Vehicle.prepare` gets it: its factor on the tyres' friction, its slope, and the water on it."""
+    """The road as `Vehicle.prepare` gets it: its factor on the tyres' friction (of all N vehicles, or shape (N,)), its
+    slope, and the water on it [mm].
+    """
 
     friction: Quantity
     slope: Slope
@@ -44,7 +46,9 @@ class Road(NamedTuple):
 
 
 def _brakes_for(force: FloatArray, mass: float) -> JsonObject:
-    """The package's wheels, and brakes that decelerate a vehicle of `mass` [kg] with them by `force` / `mass`."""
+    """The package's wheels, and brakes that decelerate a vehicle of `mass` [kg] with them by `force` / `mass`: they
+    also brake the wheels, whose inertia is that of `wheel_inertia` / `radius`^2 each.
+    """
     bmw = load_bmw_parameters()
     return {
         "radius": bmw.R_w,
@@ -78,11 +82,12 @@ def _represent_carla(vehicle: Carla, values: Characteristics, original: Mapping[
         original["mass"],
         road.slope,
         radius=radius,
-        wheel_inertia=0.5 * WHEEL_MASS * radius**2,
+        wheel_inertia=0.5 * WHEEL_MASS * radius**2,  # a disc
         friction=values["tireFric"] * vehicle.tyre_friction * road.friction,
         brake_torque=WHEEL_COUNT * values["maxBrakeTorque"],
         brake_rise=vehicle.brake_rise,
         brake_fall=vehicle.brake_fall,
+        # The original's own losses are in the torque of its engine.
         air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * (values["dragCoeff"] - original["dragCoeff"]),
         wheel_damping=WHEEL_COUNT * (values["dampRate"] - original["dampRate"]),
     )
@@ -190,7 +195,7 @@ class SecondVehicle(Vehicle):
     def __init__(self, vehicle: Vehicle, study: Study) -> None:
         self._vehicle = vehicle
         self.UNITS = vehicle.UNITS
-        self._spinning = set[bytes]()
+        self._spinning = set[bytes]()  # settings
         if vehicle.second_model not in MAPPINGS:
             problem = f"vehicle.model = {study.vehicle.model!r} is no vehicle that the second model can represent"
             raise InputError(study.source, problem, f"one of {', '.join(MAPPINGS)}, or a class derived from one")
@@ -226,9 +231,8 @@ class SecondVehicle(Vehicle):
         settings = np.stack([*characteristics.values()], axis=1)
         original = {name: np.full(len(settings), value) for name, value in self._original.items()}
         represented = original | {name: characteristics[name] for name in self._matching}
-        plant, original_plant = (
-            self._represent(self._engine, values, self._original, road) for values in (represented, original)
-        )
+        plant = self._represent(self._engine, represented, self._original, road)
+        original_plant = self._represent(self._engine, original, self._original, road)
         return Prepared(
             vehicle=self._vehicle.prepare(characteristics, road_friction, step, slope, water),
             original=self._engine.prepare(original, road_friction, step, slope, water),
@@ -278,8 +282,8 @@ class SecondVehicle(Vehicle):
         step = prepared.step / step_count
         lag_share = step / (step + plant.brake_lag)
         for _ in range(step_count):
-            change = np.maximum((demand - brake) * lag_share, -plant.brake_fall * step)
-            brake = brake + np.minimum(change, plant.brake_rise * step)
+            change = (demand - brake) * lag_share
+            brake = brake + np.minimum(np.maximum(change, -plant.brake_fall * step), plant.brake_rise * step)
             body = advance(plant, body, brake, drive_torque, step)
         spins = np.max(body.wheel_speeds * plant.radius, axis=0) > body.speed + SPIN_LIMIT
         self._spinning.update(setting.tobytes() for setting in prepared.settings[spins])
@@ -293,10 +297,10 @@ class SecondVehicle(Vehicle):
         original = state.original
         # The speed at which the original's wheels turn as fast as the second model's.
         original_speed = speed * prepared.engine_radius / radius
-        if hasattr(original, "wheel_speed"):
-            wheels = original.wheel_speed * original_speed / np.maximum(original.speed, CREEP_SPEED)
-            wheels = np.where(original.speed > CREEP_SPEED, wheels, original.wheel_speed)
-            original = original._replace(wheel_speed=wheels)
+        if hasattr(original, "wheel_speed"):  # `carla` and `lgsvl` have wheels
+            wheel_speed = original.wheel_speed * original_speed / np.maximum(original.speed, CREEP_SPEED)
+            wheel_speed = np.where(original.speed > CREEP_SPEED, wheel_speed, original.wheel_speed)
+            original = original._replace(wheel_speed=wheel_speed)
         command = Command(throttle, brake=np.zeros_like(throttle))
         original = self._engine.advance(prepared.original, original._replace(speed=original_speed), command)
         acceleration = (original.speed - original_speed) / prepared.step

@@ -22,7 +22,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import number_of, points_in_words
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
@@ -155,21 +155,25 @@ def simulate(
     chosen = [name for name, given in choices.items() if given]
     target = load_target(source, solution, chosen, as_it_is_now, point)
     system = assemble(target.study)
+    filtered = not no_filter
+    changes = set
     with about("set"):
-        values = read_changes(set, system.characteristics, beyond=beyond)
+        values = read_changes(changes, system.characteristics, beyond=beyond)
         requested = _combine(values, target.setting(system), system)
-        if not beyond and set:
-            system.check_feasible(requested, filtered=not no_filter, switch="--beyond")
-    for path, name, endings in ((trace, "trace", (".csv",)), (animate, "animate", animation.ENDINGS)):
-        if path is not None:
-            check_writable(path, name, endings, but=SOLUTIONS)
-    if any(len(options) > 1 for options in values.values()):
+        if changes and not beyond:  # what a study or results hold has been checked
+            system.check_feasible(requested, filtered=filtered, switch="--beyond")
+    if trace is not None:
+        check_writable(trace, "trace", (".csv",), but=SOLUTIONS)
+    if animate is not None:
+        check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
+    is_sweep = any(len(options) > 1 for options in values.values())
+    if is_sweep:
         if trace or animate or gui or spread:
             expected = "one value for each characteristic with --trace, --animate, --gui or --spread"
-            raise InputError("set", f"{' '.join(set)} is a sweep", expected)
-        return _sweep(target.study, system, requested, list(values), not no_filter)
-    simulation = simulate_with_original(target.study, system, requested[0], filtered=not no_filter)
-    if target.row and not set and point is None:  # results belong to the whole matrix
+            raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
+        return _sweep(target.study, system, requested, list(values), filtered)
+    simulation = simulate_with_original(target.study, system, requested[0], filtered=filtered)
+    if target.row and not changes and point is None:  # results belong to the whole matrix
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
         with whole_file(trace, "trace") as file:
@@ -188,7 +192,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     study = target.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks(system)
-    remarks += (
+    remarks.extend(
         f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
         f"{simulation.setting[name]:g}; --no-filter keeps it."
         for name, value in simulation.reset_values.items()
@@ -204,22 +208,23 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         verdict.append(f"The command `rating` simulates all {len(system.matrix)} cells and variations.")
     elif system.matrix:
         records = map(point_record, simulate_all_points(system, setting[np.newaxis]))
-        points = [{**row, **row.get("contact", {})} for row in records]
+        points = [{**row, **row.get("contact", {})} for row in records]  # side and place are columns
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
-        failing = [row["point"] for row in points if row["impact_speed"] is not None]
+        failing = [row["point"] for row in points if row["outcome"] == Outcome.COLLISION]
         verdict.append(points_in_words(failing, len(points)))
     if with_spread:
         remarks += remarks_on_sets(study)
-        bands = compute_model_spreads(study, np.stack([setting, system.characteristics.with_original_vehicle(setting)]))
-        rows = [(name, *band) for name, band in zip(("simulated", "original"), bands, strict=True)]
+        vehicles = {"simulated": setting, "original": system.characteristics.with_original_vehicle(setting)}
+        bands = compute_model_spreads(study, np.stack([*vehicles.values()]))
+        rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = _remark_table(remarks)
-    handle = {} if target.handle is None else {"solution": str(target.handle)}
+    solution = {} if target.handle is None else {"solution": str(target.handle)}
     return Answer(
         question="simulate",
         study=study,
         verdict=" ".join(filter(None, verdict)),
-        numbers={**handle, **simulation.numbers},
+        numbers={**solution, **simulation.numbers},
         tables=tables,
     )
 
@@ -229,7 +234,7 @@ def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
     if any(np.any(point.scenario.depends_until > 0) for point in system.points):
         for result in simulate_all_points(system, setting[np.newaxis]):
             (acted,) = result.runs.acted_early
-            if np.isfinite(acted):
+            if np.isfinite(acted):  # NaN: it never did
                 at = f"{result.point.name}: " if result.point.name else ""
                 yield (
                     f"{at}invalid test: {result.point.scenario.dependence}, and the driving system acts at "
@@ -337,9 +342,10 @@ def _verdict(simulation: Simulation) -> list[str]:
 
 
 def _safety_comparison(simulation: Simulation) -> str:
-    stop, original = (one.metrics.get(STOPPING_DISTANCE.name, np.nan) for one in (simulation, simulation.original))
-    if np.isfinite(stop / original):
-        return f"in {stop / original:.2f} times the distance of the original"
+    stop = simulation.metrics.get(STOPPING_DISTANCE.name, np.nan)
+    original_stop = simulation.original.metrics.get(STOPPING_DISTANCE.name, np.nan)
+    if np.isfinite(stop / original_stop):
+        return f"in {stop / original_stop:.2f} times the distance of the original"
     degree = simulation.metrics[SAFETY_DEGREE]
     original = simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):
@@ -353,5 +359,5 @@ def _safety_comparison(simulation: Simulation) -> str:
 
 def _remarks(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
-    types = pre_crash_sentence(system.points)
-    return [*remarks, *system.remarks, *vehicle_remarks(system), *([types] if types else [])]
+    pre_crash = pre_crash_sentence(system.points)
+    return [*remarks, *system.remarks, *vehicle_remarks(system), *filter(None, [pre_crash])]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, warn
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
 from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
@@ -29,11 +29,11 @@ class Failure(NamedTuple):
 
     algorithm: str
     run: int
-    evaluation: int
+    position: int
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.algorithm}:{self.run}, evaluation {self.evaluation}: {self.reason}"
+        return f"{self.algorithm}:{self.run}, evaluation {self.position}: {self.reason}"
 
 
 def failures_of(key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations) -> list[Failure]:
@@ -99,14 +99,16 @@ def load_runs(directory: str | Path) -> StoredResults:
     all_positions = []
     failures = []
     has_checksums = True
-    search = manifest["study"]["search"]
+    search = study["search"]
     digest = identity_digest(manifest)
     budget = search["evaluations"]
-    for algorithm, run in product(dict.fromkeys(map(label_of, search["algorithms"])), range(search["runs"])):
-        path = journal_file(folder, run_name(algorithm, run))
+    labels = dict.fromkeys(map(label_of, search["algorithms"]))
+    for algorithm, run in product(labels, range(search["runs"])):
+        name = run_name(algorithm, run)
+        path = journal_file(folder, name)
         if not path.exists():
             continue
-        content = read_journal(path, journal_head(digest, path.stem, characteristics))
+        content = read_journal(path, journal_head(digest, name, characteristics))
         has_checksums &= content.checksum is not None
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
@@ -117,7 +119,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     if not has_checksums:
         warn(f"{folder}: has journals of an earlier version, without checksums: altered lines go unnoticed")
     frame = evaluations_frame(characteristics, evaluations_of_runs)
-    frame.insert(2, "evaluation", all_positions)  # behind algorithm and run
+    frame.insert(2, "evaluation", all_positions)  # behind algorithm and run; rows are in the order of their runs
     solutions = solutions_frame(characteristics, solutions_of_runs)
     return StoredResults(
         manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
@@ -180,7 +182,7 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
     all_handles = handles_of(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
-    last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}
+    last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}  # of each run the last
     expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
     raise InputError("solution", f"there is no solution {handle}", expected)
 
@@ -189,7 +191,6 @@ CHOICES = {
     "most_severe": ["f_safe", "f_num_diff", "f_diff"],
     "fewest": ["f_num_diff", "f_safe", "f_diff"],
     "smallest": ["f_diff", "f_safe", "f_num_diff"],
-    "most_points": [RATING_POINTS.name, "f_num_diff", "f_diff"],
 }
 """Objectives that decide a choice, in order; smaller values first."""
 
@@ -219,4 +220,5 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> Solut
             f"these results hold no {missing}",
             "other results, the most severe solution, or a solution by its handle",
         )
-    return handles_of(table)[int(candidates.sort_values(CHOICES[choice], kind="stable").index[0])]
+    position = candidates.sort_values(CHOICES[choice], kind="stable").index[0]
+    return handles_of(table)[int(position)]

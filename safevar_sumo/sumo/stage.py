@@ -16,7 +16,8 @@ from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
 from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
-"""Closing speed above which a vehicle approaches a body ahead [m/s]; once it is never faster again, it has avoided it.
+"""Closing speed above which a vehicle approaches a body ahead [m/s]; once the vehicle cannot be faster than the body
+again, it has avoided it.
 """
 LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
@@ -26,13 +27,17 @@ LANE = Frame((0.0, 0.0), (1.0, 0.0))
 """The coordinates of the vehicle's lane, in which tracks are."""
 BLOCK = 16_384
 """Number of distances that are computed at once: so many fit into a processor's cache."""
+NOBODY = -1
+"""In place of the number of a body that a vehicle has struck."""
 OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
 """What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden, passed, or scenery."""
 
 
 class Stage:
-    """The bodies around N vehicles. `group`, shape (N,), is the number of each one's scenario among K, or that of its
-    encounter of the only one, whose parameters are arrays.
+    """The bodies around N vehicles.
+
+    `group`, shape (N,), is the number of each vehicle's scenario; or, where the only one has arrays as parameters, the
+    number of its encounter.
     """
 
     def __init__(self, scenarios: Sequence[TrackScenario], group: IntArray, *, n_samples: int, step: float) -> None:
@@ -43,27 +48,30 @@ class Stage:
         times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
         own = self._own(np.zeros(1), np.zeros(1))
         n_groups = int(group.max()) + 1
-        self.cast = cast_of(scenarios, times, n_groups if len(scenarios) == 1 else 1, step, own)
+        n_encounters = n_groups if len(scenarios) == 1 else 1
+        self.cast = cast_of(scenarios, times, n_encounters, step, own)
         self.n = len(group)
         self.step = step
+        # None: all vehicles share a column, or each has its own.
         self.group: IntArray | None = group if 1 < n_groups < self.n else None
         bodies = [Moving.of(track, step, self.width) for track in self.cast]
-        level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
-        self._counts = [np.atleast_2d(body.level == level) for body in bodies]
+        highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
+        self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
-        self._met = [k for k, body in enumerate(bodies) if body.level.max() >= min(level.max(), 1)]
+        self._met = [k for k, body in enumerate(bodies) if body.level.max() >= min(highest_level.max(), 1)]
         self._bodies = bodies
+        screens = [body for body in bodies if body.track.kind == SCREEN]
         self._hides = [
             k
             for k, body in enumerate(bodies)
-            if not any(other.covers(body) for other in bodies if other is not body and other.track.kind == SCREEN)
+            if not any(screen.covers(body) for screen in screens if screen is not body)
         ]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
         self._ended = np.zeros((len(bodies), n_samples, self.n), dtype=bool)
-        # Who comes from beside has been approached as soon as it is in the path.
+        # Who is not in the path at the start has been approached as soon as it comes into it.
         self._approached = [~self._row(body.is_in_path, 0) for body in bodies]
         self._sample = 0
-        self._struck = np.full(self.n, -1)
+        self._struck = np.full(self.n, NOBODY)
 
     def _row(self, column: Column, sample: int | None = None) -> Column:
         return row(column, self._sample if sample is None else sample, self.group)
@@ -115,7 +123,7 @@ class Stage:
         leave: Quantity = np.inf
         for position, change, size in ((rx, dx, other.track.length), (ry, dy, other.track.width)):
             half = self._row(size) / 2 + TIE
-            first = (-half - position) / change
+            first = (-half - position) / change  # infinite along the body
             second = (half - position) / change
             enter = np.maximum(enter, np.minimum(first, second))
             leave = np.minimum(leave, np.maximum(first, second))
@@ -141,42 +149,42 @@ class Stage:
         for one in seen:
             body = self._bodies[one.body]
             counts: BoolArray = self._row(self._counts[one.body])
-            arrival = np.where(
-                one.closing > 0, np.maximum(one.gap, 0.0) / np.maximum(one.closing, LEAST_CLOSING_SPEED), 0.0
-            )
-            at_arrival = np.abs(self._row(body.track.y) + self._row(body.vy) * arrival)
-            comes = (one.closing > 0) & (at_arrival < self.width / 2 + self._row(body.half_width))
+            time_to_arrival = np.maximum(one.gap, 0.0) / np.maximum(one.closing, LEAST_CLOSING_SPEED)
+            lateral = self._row(body.track.y)
+            drift = self._row(body.vy)
+            lateral_at_arrival = lateral + drift * np.where(one.closing > 0, time_to_arrival, 0.0)
+            comes = (one.closing > 0) & (np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width))
             # A leader at the vehicle's speed who makes way is nobody to brake for.
-            leaves = (np.sign(self._row(body.track.y)) * self._row(body.vy) > 0) & (one.closing <= APPROACH_SPEED)
+            leaves = (np.sign(lateral) * drift > 0) & (one.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
                 one.gap + OFF_THE_WAY * ~is_in_way + HIDDEN * ~one.visible + PASSED * one.is_passed + NOT_MET * ~counts
             )
             ranks.append(np.where(self._struck == one.body, -np.inf, rank))
         chosen = np.argmin(np.stack(ranks), axis=0)
-        first, *others = (number for number in range(len(seen)) if (chosen == number).any())
+        first, *others = [number for number in range(len(seen)) if (chosen == number).any()]
         scene = self._scene_of(seen[first], over)
         for number in others:
-            columns = zip(self._scene_of(seen[number], over), scene, strict=True)
-            scene = Scene(*(np.where(chosen == number, its, known) for its, known in columns))
+            columns = zip(scene, self._scene_of(seen[number], over), strict=True)
+            scene = Scene(*(np.where(chosen == number, new, old) for old, new in columns))
         return scene
 
     def hits(self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray) -> dict[int, float]:
-        """Speeds of the vehicles of open runs that touch a body at a sample, by number."""
+        """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is that of `observe`."""
         self._sample = sample
-        self._struck = np.full(self.n, -1)
+        self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
         rear = front - self.length
         for k in self._met:
             body = self._bodies[k]
-            if foremost <= body.edge[sample if len(body.edge) > 1 else 0].min():
+            if foremost <= row(body.edge, sample, None).min():
                 continue
             is_beside = (front > self._row(body.edge)) & (rear < self._row(body.far)) & self._row(body.is_in_path)
-            vehicles = np.flatnonzero(is_beside & is_open & (self._struck < 0))
+            vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
             if vehicles.size:
                 overlaps = find_overlaps(self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles))
                 self._struck[vehicles[overlaps > TOUCH]] = k
-        touched = np.flatnonzero(self._struck >= 0)
+        touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 
     def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> BodyPairs:
@@ -225,7 +233,7 @@ class Stage:
                 np.copyto(distance[samples], apart, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts
-        return Encounter(distance, distance, closing, in_conflict)
+        return Encounter(separation=distance, distance=distance, closing_speed=closing, in_conflict=in_conflict)
 
     def _apart(
         self, number: int, samples: slice, front: FloatArray, speed: FloatArray

@@ -35,7 +35,7 @@ class Car(NamedTuple):
     wheel_damping: Number
     brake_torque: Number
     grip: Number
-    slip_stiffness: Number  # K / (3 |slip|)
+    slip_stiffness: Number  # K / (3 |slip|), see `tyre_force`
     clutch: Number
     engine_limit: Number
     damping_full: Number
@@ -91,7 +91,7 @@ class CarlaState(NamedTuple):
 
 
 class Gearbox(NamedTuple):
-    """Columns of `CarlaState`."""
+    """The gears of a `CarlaState` after a substep."""
 
     gear: Number
     target_gear: Number
@@ -99,7 +99,7 @@ class Gearbox(NamedTuple):
 
 
 class Speeds(NamedTuple):
-    """Columns of `CarlaState`."""
+    """The speeds of a `CarlaState` after a substep."""
 
     speed: Number
     wheel_speed: Number
@@ -139,7 +139,7 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
     speed_share = s.engine_speed / car.engine_limit
     is_ready = s.since_shift >= law.shift_latency
     sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
-    up = sets_off | is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+    up = sets_off | (is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR))
     down = is_ready & (speed_share < law.shift_down) & (s.gear > FIRST_GEAR)
     target = s.target_gear + (1.0 if up else 0.0) - (1.0 if down else 0.0)
     since_shift = 0.0 if up | down else s.since_shift + law.substep
@@ -156,8 +156,8 @@ def tyre_force(car: Car, law: Law, speed: Number, rim: Number) -> Number:
     """
     slip_speed = rim - speed
     denominator = np.maximum(rim, speed) + law.slip_offset
-    root = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
-    return np.copysign(car.grip - car.grip * root * root * root, slip_speed)
+    rest = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator  # 1 - K / 3
+    return np.copysign(car.grip - car.grip * rest * rest * rest, slip_speed)
 
 
 @equation
@@ -176,9 +176,10 @@ def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brak
     clutch = car.clutch if gear > NEUTRAL else 0.0
     damping = car.damping_engaged if gear > NEUTRAL else car.damping_neutral
     clutch_by_ratio = ratio * clutch
+    # Inertias with everything that is implicit:
     engine = law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
     wheel = car.wheel_inertia + car.wheel_damping + clutch_by_ratio * ratio * (1.0 - clutch / engine)
-    # Coefficients of a tyre step for the speeds (of a wheel, at its rim), for torques and for the tyre force:
+    # Coefficients of a tyre step: x_by_y is the change of x for a unit of y; the rim's speed stands for the wheel's.
     engine_share = law.engine_inertia / engine
     engine_gain = throttle * _full_torque(car, law, s.engine_speed) / engine
     rim_by_torque = car.radius / wheel
@@ -197,8 +198,9 @@ def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brak
         free_engine_speed = engine_share * engine_speed + engine_gain
         free_rim = rim_share * rim + rim_by_engine * free_engine_speed - rim_loss
         slip_end_force = (free_rim - speed) / slip_by_force
-        force = tyre_force(car, law, speed, rim)
-        force = np.minimum(np.maximum(force, np.minimum(slip_end_force, 0.0)), np.maximum(slip_end_force, 0.0))
+        least = np.minimum(slip_end_force, 0.0)
+        most = np.maximum(slip_end_force, 0.0)
+        force = np.minimum(np.maximum(tyre_force(car, law, speed, rim), least), most)
         rim = np.maximum(free_rim - rim_by_force * force, 0.0)
         engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, car.engine_limit)
         speed = np.maximum(speed + car.speed_by_force * force - speed_loss, 0.0)
@@ -239,7 +241,7 @@ def advance(cars: FloatArray, law: Law, states: FloatArray, commands: FloatArray
     `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
     """
     n = states.shape[1]
-    t = np.ones((26, BLOCK))
+    t = np.ones((26, BLOCK))  # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
         t[:16, :count] = cars[:, start : start + count]

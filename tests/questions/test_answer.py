@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner
 
 import safevar_sumo as sv
-from safevar_sumo.cli.program import COMMANDS, commands, first_sentence
+from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
 from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.words import list_of_changes
@@ -168,7 +168,7 @@ def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
     ask = find_question(name)
     assert getattr(sv, name) is ask
     first, _, _ = (ask.__doc__ or "").partition("\n\n")
-    assert first_sentence(COMMANDS[name]) == " ".join(first.split())
+    assert first_paragraph(COMMANDS[name]) == " ".join(first.split())
     text = CliRunner().invoke(commands, [name, "--help"]).output
     for option in ask.options:
         assert option.meaning

@@ -45,7 +45,7 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     groups = []
     for setting in settings_of(characteristics, causes):
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
-        is_left_out = np.diag(is_changed)[is_changed]
+        is_left_out = np.diag(is_changed)[is_changed]  # in a row for each change
         groups.append(np.vstack([setting, np.where(is_left_out, characteristics.original, setting)]))
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
@@ -66,31 +66,34 @@ def ranges_across_fits(
     With its own parameters, the shares of failures that need a characteristic are `needed`, and of collisions that a
     driver avoids `avoided`.
     """
-    order = np.random.default_rng(evaluator.study.search.seed).permutation(len(evaluations))
-    vehicles = evaluations.settings[order[:MAX_VEHICLES]]
+    shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(len(evaluations))
+    vehicles = evaluations.settings[shuffled[:MAX_VEHICLES]]
     failures = evaluations.take(unsafe.of(evaluations))
     failures = failures.take(np.argsort(failures.f_num_diff, kind="stable")[:MAX_FAILURES])
 
-    def sample_shares(evaluator: Evaluator) -> pd.Series[float]:
+    def sample_shares(of_set: Evaluator) -> pd.Series[float]:
         """All shares of the sample with the parameters of a set."""
-        causes = find_minimal_causes(evaluator, failures.settings, unsafe)
+        causes = find_minimal_causes(of_set, failures.settings, unsafe)
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
-        changed = evaluator.characteristics.changed(failures.settings[rows])
-        frame = count_needed(evaluator.characteristics, changed, [causes[row] for row in rows], len(rows))
-        runs = evaluator.evaluate(vehicles, STAGE)
-        is_judged = not avoided.empty
-        avoided_here = avoided_shares(judge_sample(evaluator, runs.take(runs.collided))[0]) if is_judged else avoided
+        changed = of_set.characteristics.changed(failures.settings[rows])
+        frame = count_needed(of_set.characteristics, changed, [causes[row] for row in rows], len(rows))
+        runs = of_set.evaluate(vehicles, STAGE)
+        avoided_here = avoided
+        if not avoided.empty:
+            judged, *_ = judge_sample(of_set, runs.take(runs.collided))
+            avoided_here = avoided_shares(judged)
         return _shares_by_kind(unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here)
 
     shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
-    samples = pd.concat(across(evaluator, min(fits, MAX_SHARE_SETS), sample_shares), axis=1).reindex(shares.index)
-    # Column 0 has the study's own parameters. There is no share where a sample has no failure, or no collision.
-    differences = samples.sub(samples[0].fillna(shares), axis=0)
-    lows, highs = (
-        (shares + extremes.fillna(0.0)).clip(0.0, 1.0).tolist()
-        for extremes in (differences.min(axis=1), differences.max(axis=1))
-    )
-    return dict(zip(shares.index, zip(lows, highs, strict=True), strict=True))
+    of_sets = across(evaluator, min(fits, MAX_SHARE_SETS), sample_shares)
+    samples = pd.concat(of_sets, axis=1).reindex(shares.index)
+    # There is no share where a sample has no failure, or no collision.
+    of_own_parameters = samples[0].fillna(shares)
+    differences = samples.sub(of_own_parameters, axis=0)
+    lows = (shares + differences.min(axis=1).fillna(0.0)).clip(0.0, 1.0)
+    highs = (shares + differences.max(axis=1).fillna(0.0)).clip(0.0, 1.0)
+    ranges = zip(lows.tolist(), highs.tolist(), strict=True)
+    return dict(zip(shares.index, ranges, strict=True))
 
 
 def conclusions_across_fits(

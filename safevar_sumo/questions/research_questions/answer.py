@@ -66,16 +66,16 @@ def tables(
     if algorithm:
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
         check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
-    counted = {case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs}
-    answer = answer_questions(cases, Choices(label_of(algorithm), alpha, counted))
+    causes_of_cases = {case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs}
+    answer = answer_questions(cases, Choices(label_of(algorithm), alpha, causes_of_cases))
     if figures is not None:
         save_figures(cases, figures)
     options = {"--algorithm": algorithm, "--alpha": alpha if alpha != ALPHA else "", "--causes": causes or ""}
     flags = [f"{flag} {quote(str(value))}" for flag, value in options.items() if value]
     directories = [quote(str(getattr(source, "directory", source))) for source in results]
     command = " ".join([PROGRAM_COMMAND, "tables", *directories, *flags])
-    main = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
-    folded = () if all else tuple(name for name in answer.tables if name not in (*main, "remarks"))
+    main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
+    folded = () if all else tuple(name for name in answer.tables if name not in (*main_tables, "remarks"))
     return replace(answer, command=command, folded=folded)
 
 
@@ -121,7 +121,8 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         if name == CAUSES and not choices.causes:
             continue
         parts = []
-        for group in [cases] if name == WEATHER else [[case] for case in cases]:
+        groups = [cases] if name == WEATHER else [[case] for case in cases]
+        for group in groups:
             try:
                 part = compute(*group, *([choices] if name in CHOSEN else []))
             except UnanswerableError as error:
@@ -134,10 +135,10 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         frames[name] = tabulate(
             title, shown, pd.concat(parts, ignore_index=True) if parts else [], wide=wide, words=words
         )
-    if all(frame.empty for frame in frames.values()):
+    if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
-    of_all = [remark for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
-    remarks = [*(("all", remark) for remark in of_all), *remarks]
+    of_cases = [remark for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
+    remarks = [*(("all", remark) for remark in of_cases), *remarks]
     frames["remarks"] = tabulate("Remarks", REMARKS, list(dict.fromkeys(remarks)))
     return Answer(
         question="tables",
@@ -200,8 +201,8 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         if undefined := int(values.isna().sum()):
             yield f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
     if table == "rq1":
-        is_known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
-        omitted = [name for name, value in case.original.items() if math.isnan(value) or name not in is_known]
+        known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
+        omitted = [name for name, value in case.original.items() if math.isnan(value) or name not in known]
         if omitted:
             yield f"the original vehicle's {', '.join(omitted)} is undefined, so that no test uses it."
     elif not case.has_runs:
@@ -217,9 +218,9 @@ def _on_tests_of_runs(table: str, frame: pd.DataFrame, alpha: float) -> Iterator
     """How tests of runs are corrected, and which have too few runs."""
     rq = table.removesuffix("-runs").upper()
     tests = frame.dropna(subset="effect_size")
-    counted = number_of(len(tests), "test")
+    tests_in_words = number_of(len(tests), "test")
     if len(tests):
-        yield f"p is corrected by Holm's method for the {counted} of {rq}, a family."
+        yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."
     if few_count := len(tests) - tests["enough_runs"].sum():
         needed = fewest_runs(rq, alpha, len(tests))
-        yield f"too few runs for {few_count} of {counted} of {rq} ({needed} are needed after the correction)."
+        yield f"too few runs for {few_count} of {tests_in_words} of {rq} ({needed} are needed after the correction)."
