@@ -55,12 +55,12 @@ def real_traci() -> Api:
 
 def refused(domain: str, name: str, problem: str) -> InputError:
     """The error for a controller's call of a function, of traci itself if `domain` is ""."""
-    legal = "the body of your script's loop, without this call, as a function step(traci, vehicle_id), with calls of "
-    legal += ", ".join(CALLS.get(domain, CALLS))
-    if (domain, name) == ("vehicle", "setType"):
+    function = ".".join(filter(None, ("traci", domain, name)))
+    if function == "traci.vehicle.setType":
         problem = "makes it another vehicle, but the study's vehicle drives"
-        legal = ", ".join(DRIVER_COMMANDS)
-    return InputError(f"traci.{domain}.{name}".replace("..", "."), problem, legal)
+        return InputError(function, problem, ", ".join(DRIVER_COMMANDS))
+    body = "the body of your script's loop, without this call, as a function step(traci, vehicle_id)"
+    return InputError(function, problem, f"{body}, with calls of {', '.join(CALLS.get(domain, CALLS))}")
 
 
 class Snapshot(NamedTuple):
@@ -93,13 +93,15 @@ class SensedTraffic:
         """Record the traffic of this step; must be called in every later step."""
         names: dict[tuple[int, str], list[str]] = defaultdict(list)
         for domain in SENSED:
-            for copy, name in map(copy_and_name, getattr(self._world.api, domain).getIDList()):
+            for id_ in getattr(self._world.api, domain).getIDList():
+                copy, name = copy_and_name(id_)
                 names[copy, domain].append(name)
         self.seen = list[Snapshot]()
-        sensors = self._sensors
-        for copy, (past, reach, scale) in enumerate(zip(self._past, sensors.reach, sensors.scale, strict=True)):
+        reaches = self._sensors.reach.tolist()
+        scales = self._sensors.scale.tolist()
+        for copy, past in enumerate(self._past):
             past.append(self._snapshot(copy, names))
-            self.seen.append(_limit_to_range(past[0], float(reach), float(scale)))
+            self.seen.append(_limit_to_range(past[0], reaches[copy], scales[copy]))
 
     def is_on_road(self, copy: int) -> bool:
         """Whether a vehicle has not left the road."""
@@ -110,12 +112,13 @@ class SensedTraffic:
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
-        actors = {}
+        actors: dict[str, dict[str, Values]] = {}
         for domain, functions in SENSED.items():
-            getters = [(name, getattr(getattr(api, domain), name)) for name in (*functions, "getLength")]
-            actors[domain] = {
-                actor: {name: get(copied_id(copy, actor)) for name, get in getters} for actor in names[copy, domain]
-            }
+            getters = {name: getattr(getattr(api, domain), name) for name in (*functions, "getLength")}
+            actors[domain] = {}
+            for actor in names[copy, domain]:
+                id_ = copied_id(copy, actor)
+                actors[domain][actor] = {name: get(id_) for name, get in getters.items()}
         own = actors["vehicle"].pop(VUT)
         leader = api.vehicle.getLeader(vut, LEADER_RANGE)
         if not leader or not leader[0]:  # without a leader, libsumo and traci return None or ("", -1)
@@ -140,17 +143,23 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
             position = own["getPosition"]
             rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
-                actors[domain][name] = values if scale == 1 else {**values, **_scaled(own, values, scale)}
-    leader_name, gap = snapshot.leader or ("", 0.0)
-    return Snapshot(own, actors, (leader_name, gap * scale) if leader_name in actors["vehicle"] else None)
+                actors[domain][name] = values | _positions_in_scale(own, values, scale)
+    leader = snapshot.leader
+    if leader is None or leader[0] not in actors["vehicle"]:
+        return Snapshot(own, actors, None)
+    name, gap = leader
+    return Snapshot(own, actors, (name, gap * scale))
 
 
-def _scaled(own: Values, values: Values, scale: float) -> Values:
+def _positions_in_scale(own: Values, values: Values, scale: float) -> Values:
     """The positions of an actor, with distances from the vehicle itself multiplied by the sensors' scale."""
-    return {
-        name: tuple(here + scale * (there - here) for here, there in zip(own[name], values[name], strict=True))
-        for name in POSITIONS
-    }
+    if scale == 1:
+        return {}
+    positions = {}
+    for name in POSITIONS:
+        pairs = zip(own[name], values[name], strict=True)
+        positions[name] = tuple(here + scale * (there - here) for here, there in pairs)
+    return positions
 
 
 class TraciView:
@@ -172,14 +181,13 @@ class TraciView:
 
     def commanded_acceleration(self, speed: float) -> float:
         """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle [m/s^2]."""
-        vehicle = self._api.vehicle
-        vut = self._vut
-        last_speed = self._last_speed
+        accel = self._api.vehicle.getAccel(self._vut)
+        decel = self._api.vehicle.getDecel(self._vut)
+        sumo_speed = 2 * speed - self._last_speed  # between two actions the driver keeps his acceleration
         self._last_speed = speed
-        accel = vehicle.getAccel(vut)
-        decel = vehicle.getDecel(vut)
-        sumo_speed = 2 * speed - last_speed  # between two actions the driver keeps his acceleration
-        if round(self.time / self._step) % self._steps_of_action == 0:
+        steps = round(self.time / self._step)
+        is_action = steps % self._steps_of_action == 0
+        if is_action:
             sumo_speed = self._speed_of_sumo(speed, accel, decel)
         return self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
 
@@ -214,17 +222,23 @@ class TraciView:
                 reason = OWN_LOOP if domain in ("", "simulation") else BYPASS
                 raise refused(domain, name, f"is not for a controller of {VUT!r}: {reason}")
             bound = _signature(domain, name).bind(*arguments, **named)
-            if name not in COMMANDS and name not in SUBSCRIPTIONS:
-                return self._query(domain, name, *bound.args)
-            bound.apply_defaults()
-            return (self._command if name in COMMANDS else self._subscription)(domain, name, *bound.args)
+            if name in COMMANDS or name in SUBSCRIPTIONS:
+                bound.apply_defaults()
+            if name in COMMANDS:
+                return self._command(domain, name, *bound.args)
+            if name == "subscribe":
+                return self._subscribe(domain, *bound.args)
+            if name in SUBSCRIPTIONS:
+                return self._subscribed_values(domain, *bound.args)
+            return self._query(domain, name, *bound.args)
         except InputError as error:
             self.last_error = error
             raise
         except (self._api.TraCIException, self._api.FatalTraCIError) as error:
-            raise real_traci().exceptions.TraCIException(re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))) from None
+            message = re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))  # ids of the traffic file
+            raise real_traci().exceptions.TraCIException(message) from None
 
-    def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> None:
+    def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:
             raise refused(domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}")
         self._commands.command(name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values)
@@ -232,14 +246,20 @@ class TraciView:
             self._sumo_value(domain, name, VUT, *values)
 
     def _query(self, domain: str, name: str, *arguments: Value) -> Value:
+        """The value of a function that only reads: of other actors what the sensors report, of all else what SUMO
+        knows.
+        """
+        if name == "getIDList":
+            return self._ids(domain)
         if name in LISTS:
-            ids = self._ids(domain)
-            return ids if name == "getIDList" else len(ids)
+            return len(self._ids(domain))
         if domain in SENSED and name not in CONSTANT and arguments[0] != VUT:
             return self._sensed_value(domain, name, *arguments)
         if name == "getLeader":
             return self._leader(*arguments[1:])
-        return self._commands.mode if name == "getSpeedMode" else self._sumo_value(domain, name, *arguments)
+        if name == "getSpeedMode":
+            return self._commands.mode
+        return self._sumo_value(domain, name, *arguments)
 
     def _sensed_value(self, domain: str, name: str, actor: str, *others: Value) -> Value:
         """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO reports one that is
@@ -251,14 +271,19 @@ class TraciView:
         if actor in actors:
             return _original_ids(actors[actor][name])
         value = self._sumo_value(domain, name, actor, *others)
+        if isinstance(value, str):
+            return ""
         if isinstance(value, tuple):
             return (float(INVALID_NUMBER),) * len(value)
-        return "" if isinstance(value, str) else type(value)(INVALID_NUMBER)
+        return type(value)(INVALID_NUMBER)  # an int or a float, as SUMO has it
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        if domain in SENSED:
-            return (*((VUT,) if domain == "vehicle" else ()), *self._traffic.seen[self._copy].actors[domain])
-        return tuple(dict.fromkeys(map(_original_ids, getattr(self._api, domain).getIDList())))
+        """The ids of the actors that the sensors see, the vehicle under test first, or of the network's parts."""
+        if domain not in SENSED:
+            of_all_copies = getattr(self._api, domain).getIDList()
+            return tuple(dict.fromkeys(map(_original_ids, of_all_copies)))
+        own = [VUT] if domain == "vehicle" else []
+        return (*own, *self._traffic.seen[self._copy].actors[domain])
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
         """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
@@ -272,39 +297,50 @@ class TraciView:
         copied = [_copied_ids(self._copy, argument) for argument in arguments]
         return _original_ids(getattr(getattr(self._api, domain), name)(*copied))
 
-    def _subscription(self, domain: str, name: str, actor: str = "", *details: Value) -> Value:
-        """Subscribe to variables, or return their values, as the sensors report them."""
-        if name != "subscribe":
-            results = {
-                id_: {number: self._query(domain, function, id_, *more) for number, (function, more) in values.items()}
-                for (of_domain, id_), values in self._subscriptions.items()
-                if of_domain == domain and id_ in self._ids(domain)
-            }
-            return results if name == "getAllSubscriptionResults" else results.get(actor, {})
-        requested, *_, parameters = details  # between them: begin and end
+    def _subscribe(
+        self, domain: str, actor: str, requested: Value, begin: float, end: float, parameters: Value
+    ) -> Value:
+        """Subscribe to variables of an actor, by their numbers, at all times."""
         functions = {_constant(name): function for name, function in VARIABLES.items()}
-        variables = {}
+        variables: Variables = {}
         for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:
             if functions.get(number) not in CALLS[domain]:
-                raise refused(domain, name, f"variable {number!r} is none of {', '.join(VARIABLES)}")
+                problem = f"variable {number!r} is none of {', '.join(VARIABLES)}"
+                raise refused(domain, "subscribe", problem)
             more = (parameters or {}).get(number, ())
-            variables[number] = functions[number], more[1:] if isinstance(more, tuple) else (more,)
+            # TraCI's tuples begin with the type of what follows.
+            variables[number] = (functions[number], more[1:] if isinstance(more, tuple) else (more,))
         self._subscriptions[domain, actor] = variables
-        return None
+
+    def _subscribed_values(self, domain: str, actor: str | None = None) -> Value:
+        """The variables of an actor, by default of all actors, as the sensors report them; none of one that they do not
+        see.
+        """
+        values: dict[str, dict[int, Value]] = {}
+        ids = self._ids(domain)
+        for (of_domain, id_), variables in self._subscriptions.items():
+            if of_domain == domain and id_ in ids:
+                items = variables.items()
+                values[id_] = {number: self._query(domain, name, id_, *more) for number, (name, more) in items}
+        return values if actor is None else values.get(actor, {})
 
 
 def _copied_ids(copy: int, value: Value) -> Value:
     """Arguments for a copy: every text is an id; default types of SUMO are the same in all copies."""
     if isinstance(value, str):
         return re.sub(r"^(?!DEFAULT_)([:!]?)(?=.)", rf"\g<1>{copy}.", value)
-    return type(value)(_copied_ids(copy, element) for element in value) if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return type(value)(_copied_ids(copy, element) for element in value)
+    return value
 
 
 def _original_ids(value: Value) -> Value:
     """A result with the ids of the traffic file."""
     if isinstance(value, str):
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
-    return type(value)(map(_original_ids, value)) if type(value) in (list, tuple) else value
+    if type(value) in (list, tuple):  # not TraCI's own classes, which derive from tuple
+        return type(value)(map(_original_ids, value))
+    return value
 
 
 def _constant(name: str) -> int:
