@@ -30,16 +30,16 @@ CONFIDENCE = 0.95
 Found = TypeVar("Found")
 Interval = tuple[float, float]
 """Lower and upper end."""
-CRITERION_SETTINGS, FIRST_SETTINGS = 1024, 64
+CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
-a safety degree; and how many of them are tried first.
+a safety degree.
 """
-
-
-ENCOUNTERS, CANDIDATES = 16, 512
-"""Number of encounters in which a vehicle is tried, in a study that searches its scenario; they are chosen from so many
-over its domain.
-"""
+FIRST_SETTINGS = 64
+"""Number of them that are tried first: one collision decides."""
+ENCOUNTERS = 16
+"""Number of encounters in which a vehicle is tried, in a study that searches its scenario."""
+CANDIDATES = 512
+"""Number of encounters over its domain from which they are chosen."""
 
 
 class _Call(NamedTuple):
@@ -99,9 +99,10 @@ class Evaluator:
             f_diff=self.characteristics.largest_change(infeasible),
             f_num_diff=self.characteristics.number_changed(infeasible),
         )
-        groups = [self._evaluate_shown(settings[is_feasible], stage, self._verified), not_simulated]
-        rows = np.argsort(~is_feasible, kind="stable")  # of `settings`, as `groups` have them
-        return Evaluations.concatenate(groups).take(np.argsort(rows))  # restores the order of the settings
+        simulated = self._evaluate_shown(settings[is_feasible], stage, self._verified)
+        both = Evaluations.concatenate([simulated, not_simulated])
+        rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
+        return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
     def plan(self, *stages: str) -> None:
         """Let progress number these stages of a question: `2 of 5, boundaries`."""
@@ -178,7 +179,9 @@ class Evaluator:
         if self.measure:
             is_undefined = np.isnan(evaluations.column(self.measure)) & evaluations.valid & ~evaluations.collided
             self.undefined.append((int(np.count_nonzero(is_undefined)), len(evaluations)))
-        return self._without_unsafe_originals(evaluations) if selection == EVERYTHING else evaluations
+        if selection != EVERYTHING:
+            return evaluations
+        return self._without_unsafe_originals(evaluations)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """Evaluations whose results are undefined where the original vehicle is not safe in the same encounter."""
@@ -204,7 +207,8 @@ class Evaluator:
         evaluations = self.evaluate(pairs, stage)
         degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
         worst = np.argmin(degrees.reshape(-1, len(encounters)), axis=1)
-        return evaluations.take(worst + np.arange(len(settings)) * len(encounters))
+        first_rows = np.arange(len(settings)) * len(encounters)
+        return evaluations.take(first_rows + worst)
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
@@ -215,8 +219,9 @@ class Evaluator:
             return np.zeros((0, len(self.characteristics)))
         drawn = sobol_settings(self.characteristics, CANDIDATES)
         originals = self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
-        order = np.argsort(originals.f_safe, kind="stable")  # NaN is last
-        return originals.settings[order[originals.valid[order]][:ENCOUNTERS]]
+        valid = originals.take(originals.valid)
+        least_safe_first = np.argsort(valid.f_safe, kind="stable")  # NaN is last
+        return valid.settings[least_safe_first[:ENCOUNTERS]]
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly.
@@ -288,11 +293,11 @@ class Evaluator:
         original = original or self.evaluate_original()
         if RATING_POINTS.name in original.metrics:  # a lost point depends on the original vehicle alone
             return Unsafe.default_among(original, original)
+        stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        for rows in (settings[:FIRST_SETTINGS], settings):  # one collision decides
-            evaluations = self.evaluate(rows, "settings over the whole domain")
-            if evaluations.collided.any():
-                break
+        evaluations = self.evaluate(settings[:FIRST_SETTINGS], stage)
+        if not evaluations.collided.any():
+            evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 
     def parse_criterion(self, text: Unsafe | str) -> Unsafe:
@@ -380,10 +385,9 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """
     import scipy  # takes longer to load than a simulation
 
-    points = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed)).random_base2(
-        max(0, math.ceil(math.log2(number)))
-    )
-    return np.asarray(points[:number])
+    sequence = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
+    exponent = max(0, math.ceil(math.log2(number)))
+    return np.asarray(sequence.random_base2(exponent)[:number])
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:

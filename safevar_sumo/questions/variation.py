@@ -37,13 +37,14 @@ class VariationModel:
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
         distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
-        self._study = study.source
+        self._source = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
         self.is_correlated = bool(study.correlations)
         correlations = np.eye(len(distributions))
         for correlation in study.correlations:
             first, second = map(self.characteristics.names.index, correlation.between)
-            correlations[first, second] = correlations[second, first] = correlation.value
+            correlations[first, second] = correlation.value
+            correlations[second, first] = correlation.value
         try:
             self._factor = np.linalg.cholesky(correlations)
         except np.linalg.LinAlgError:
@@ -65,7 +66,7 @@ class VariationModel:
         )
         if len(settings) < number:
             raise InputError(
-                self._study,
+                self._source,
                 f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: {self.region}",
                 "a [variation] and [[constraints]] that agree",
             )
@@ -80,17 +81,16 @@ def _quantile_function(
     high = characteristic.upper
     original = characteristic.original
     stated = stated_values(distribution)
+    lower = stated.get("lower", low)
+    width = stated.get("upper", high) - lower
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))
-        case Uniform() | Triangular():
-            lower = stated.get("lower", low)
-            upper = stated.get("upper", high)
-            if isinstance(distribution, Uniform):
-                return lambda p: lower + p * (upper - lower)
-            triangle = scipy.stats.triang(
-                (stated.get("mode", original) - lower) / (upper - lower), lower, upper - lower
-            )
+        case Uniform():
+            return lambda p: lower + p * width
+        case Triangular():
+            mode = stated.get("mode", original)
+            triangle = scipy.stats.triang((mode - lower) / width, lower, width)
             return lambda p: triangle.ppf(p)
         case Normal():
             mean = stated.get("mean", original)

@@ -77,11 +77,13 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
     """
     points = system.points
     if system.rater is not None:
-        points = tuple(points[k] for k in np.linspace(0, len(points) - 1, RATED_POINTS).astype(int))
+        evenly_spaced = np.linspace(0, len(points) - 1, RATED_POINTS).astype(int)
+        points = tuple(points[number] for number in evenly_spaced)
     reduced = replace(system, matrix=points, rater=None)
     remark = ""
     size = batch_size(system, Engine.RECORDED)
-    for batch in (settings[start : start + size] for start in range(0, len(settings), size)):
+    for start in range(0, len(settings), size):
+        batch = settings[start : start + size]
         for result in chain.from_iterable(simulate_groups(reduced, batch)):
             try:
                 _verify_point(system.at(result.point), batch, result.runs)
@@ -94,27 +96,32 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     """Verify runs at the only point; runs of similar length together, so that few copies wait for the longest."""
     order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
     size = batch_size(system, Engine.LIBSUMO)
-    for rows in (order[start : start + size] for start in range(0, len(order), size)):
+    for start in range(0, len(order), size):
+        rows = order[start : start + size]
         chosen = runs.of(rows)
-        _compare(system, settings[rows], chosen, drive_again(system, settings[rows], chosen))
+        in_sumo = drive_again(system, settings[rows], chosen)
+        _compare(system, settings[rows], chosen, in_sumo)
 
 
 def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]) -> None:
+    """Compare the quantities of N recorded runs, shape (T, N), with those in SUMO; raises the first difference."""
     trace = runs.trace
     last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
     collision = np.full(trace.speed.shape, np.nan)
     collision[last, np.arange(len(last))] = runs.collision_speed
     recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
-    for name, values in {**recorded, "collision": collision}.items():
-        is_compared = trace.active & ((name != "collision") | (runs.outcome != Outcome.INVALID_TEST))
-        differs = is_compared & ~np.isclose(in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True)
+    recorded["collision"] = collision
+    for name, values in recorded.items():
+        differs = trace.active & ~np.isclose(in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True)
+        if name == "collision":  # an invalid test has none
+            differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():
             sample, row = np.argwhere(differs)[0]
             pairs = zip(system.characteristics.names, settings[row].tolist(), strict=True)
+            setting = ", ".join(f"{key} = {value:.17g}" for key, value in pairs)
             raise InputError(
                 system.source,
                 f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g} in the recorded "
-                f"scene and {in_sumo[name][sample, row]:.9g} in SUMO, with "
-                + ", ".join(f"{key} = {value:.17g}" for key, value in pairs),
+                f"scene and {in_sumo[name][sample, row]:.9g} in SUMO, with {setting}",
                 "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
             )

@@ -23,7 +23,8 @@ from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
-SUBSETS, BOUNDARIES = "subsets of the changes", "boundaries"
+SUBSETS = "subsets of the changes"
+BOUNDARIES = "boundaries"
 """Stages of progress."""
 MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call, which bounds the memory."""
@@ -48,21 +49,18 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
     characteristics = evaluator.characteristics
-    changed = [
-        np.flatnonzero(flags).tolist() for flags in characteristics.changed(settings) & characteristics.of_vehicle
-    ]
+    names = characteristics.names
+    is_changed = characteristics.changed(settings) & characteristics.of_vehicle
+    changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
+    of_scenario = np.flatnonzero(~characteristics.of_vehicle).tolist()
     originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
     with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))) as expect:
         for size in range(max(map(len, changed), default=0) + 1):
-            left = [len(columns) for columns, found in zip(changed, causes, strict=True) if not found]
-            expect(sum(_subset_counts(left, size)))
-            subsets = (
-                (row, list(columns))
-                for row, columns_changed in enumerate(changed)
-                if not causes[row]  # no smaller subset is one; of this size, all subsets are simulated
-                for columns in combinations(columns_changed, size)
-            )
+            # Where a smaller subset is a cause, no larger one is minimal.
+            rows_left = [row for row, of_row in enumerate(causes) if not of_row]
+            expect(sum(_subset_counts((len(changed[row]) for row in rows_left), size)))
+            subsets = ((row, list(columns)) for row in rows_left for columns in combinations(changed[row], size))
             while chunk := list(islice(subsets, MAX_SUBSETS)):
                 partial_settings = originals[[row for row, _ in chunk]]
                 for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
@@ -70,14 +68,14 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
                 evaluations = evaluator.evaluate(partial_settings, SUBSETS)
                 for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
                     row, columns = chunk[index]
-                    changes = {characteristics.names[column]: float(settings[row, column]) for column in columns}
-                    outcome = str(evaluations.outcome[index])
-                    degree = float(evaluations.f_safe[index])
-                    encounter = {
-                        item.name: float(settings[row, characteristics.names.index(item.name)])
-                        for item in characteristics.scenario
-                    }
-                    causes[row].append(Cause(changes, outcome, degree, encounter))
+                    values = settings[row].tolist()
+                    cause = Cause(
+                        changes={names[column]: values[column] for column in columns},
+                        outcome=str(evaluations.outcome[index]),
+                        safety_degree=float(evaluations.f_safe[index]),
+                        encounter={names[column]: values[column] for column in of_scenario},
+                    )
+                    causes[row].append(cause)
     return causes
 
 
@@ -125,16 +123,24 @@ def count_needed(
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
     changed = changed[:, characteristics.of_vehicle]
-    in_causes = [np.array([[name in cause.changes for name in names] for cause in group]) for group in causes if group]
-    needed, in_some = (
-        sum((combine(rows, axis=0) for rows in in_causes), np.zeros(len(names))) for combine in (np.all, np.any)
-    )
-    is_sample = len(changed) < failures
-    intervals = [clopper_pearson(int(count), number) if is_sample else (count / number,) * 2 for count in needed]
-    columns = ["characteristic", "changed", "needed", "needed_low", "needed_high", "in_some"]
-    values = (names, changed.sum(axis=0) / number, needed / number, *zip(*intervals, strict=True), in_some / number)
-    frame = pd.DataFrame(dict(zip(columns, values, strict=True)))
-    frame = frame if len(changed) else frame.head(0)
+    needed = np.zeros(len(names))
+    in_some = np.zeros(len(names))
+    for group in filter(None, causes):
+        is_in_cause = np.array([[name in cause.changes for name in names] for cause in group])
+        needed += is_in_cause.all(axis=0)
+        in_some += is_in_cause.any(axis=0)
+    intervals = [(count / number, count / number) for count in needed.tolist()]
+    if len(changed) < failures:  # a sample
+        intervals = [clopper_pearson(int(count), number) for count in needed]
+    shares = {
+        "characteristic": names,
+        "changed": changed.sum(axis=0) / number,
+        "needed": needed / number,
+        "needed_low": [low for low, _ in intervals],
+        "needed_high": [high for _, high in intervals],
+        "in_some": in_some / number,
+    }
+    frame = pd.DataFrame(shares).head(len(names) if len(changed) else 0)
     return frame.sort_values(["needed", "in_some", "changed"], ascending=False, kind="stable", ignore_index=True)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -132,22 +133,25 @@ def repair(
         for model in models.members
     ]
     problem = problems[0]
-    vehicles = _first_vehicles(problem, subject)
-    if not len(vehicles):
+    first = _first_vehicles(problem, subject)
+    if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
         text = f"{study.name!r}: the new vehicle {kept} in no encounter that was tried"
         raise InputError(study.source, text, "a smaller --margin, or other domains under [scenario.search]")
-    left = problem.lefts_with(problem.today, vehicles, "the driving system of today")
-    order = np.argsort(left, kind="stable")
-    vehicles = vehicles[order]
+    left = problem.lefts_with(problem.today, first, "the driving system of today")
+    worst_first = np.argsort(left, kind="stable")
+    vehicles = first[worst_first]
     # What no driving system survives needs another part, not a parameter; the rest is repaired.
-    is_repairable = left[order] >= 0
-    is_repairable[~is_repairable] = problem.repairable(vehicles[~is_repairable])
-    worst_vehicles = vehicles[is_repairable]
-    found = _find_survivors(problems, worst_vehicles) if len(worst_vehicles) else Survivors([], len(problems), ())
-    worst = problem.worst_today(worst_vehicles[0] if len(worst_vehicles) else vehicles[0])
+    is_repairable = left[worst_first] >= 0
+    is_unsafe = ~is_repairable
+    is_repairable[is_unsafe] = problem.repairable(vehicles[is_unsafe])
+    survivors = Survivors([], len(problems), ())
+    worst = vehicles[0]
+    if is_repairable.any():
+        survivors = _find_survivors(problems, vehicles[is_repairable])
+        worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
-    answer = _answer_of(problem, models, found, worst, not_repairable)
+    answer = _answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
@@ -185,12 +189,12 @@ def _find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> 
     if changes or len(problems) == 1:
         return Survivors(changes, len(problems), ())
     changes = _survivors_in(problems[:1], vehicles)
-    broken = [
-        problem.fit
-        for problem in problems[1:]
-        if any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
-    ]
-    return Survivors(changes, len(problems) - len(broken), tuple(broken))
+
+    def breaks_one(problem: RepairProblem) -> bool:
+        return any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
+
+    broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
+    return Survivors(changes, len(problems) - len(broken), broken)
 
 
 def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
@@ -210,20 +214,22 @@ def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> li
             failures = find_failures(problems, change, search.settings, attacks)
             if not failures:
                 proof, failures = prove_change(problems, change, attacks, failed_proofs)
-                failed_proofs += bool(failures)
-                proofs |= {} if failures else {change.tobytes(): proof}
+                if failures:
+                    failed_proofs += 1
+                else:
+                    proofs[change.tobytes()] = proof
             for number, settings in failures.items():
                 if number not in search.settings_of:
-                    search.add(number, _joining(problems[number], vehicles))
+                    search.add(number, _worst_with_fit(problems[number], vehicles))
                 search.add(number, settings)
     return []
 
 
-def _joining(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
-    """The worst known vehicles that count with another fit."""
-    rows = vehicles[:JOINING_VEHICLES]
-    rows = rows[problem.holds(rows)]
-    return rows[problem.repairable(rows)]
+def _worst_with_fit(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
+    """The worst of known vehicles, shape (L, n), that count with another fit."""
+    worst = vehicles[:JOINING_VEHICLES]
+    promised = worst[problem.holds(worst)]
+    return promised[problem.repairable(promised)]
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
@@ -234,19 +240,20 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
         return []
     driver = problem.best_driver.evaluator
     unsafe = problem.unsafe
-    chosen = failures[np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)]
-    causes = [cause for group in find_minimal_causes(driver, chosen, unsafe) for cause in group]
-    limits: dict[tuple[object, ...], dict[str, float]] = {}
-    for one, cause in zip(find_limits(driver, causes, unsafe), causes, strict=True):
-        kind = tuple(one.boundary if cause.encounter else one.boundary.items())  # of many encounters the first
-        limits.setdefault(kind, one.boundary | cause.encounter)
-    return list(limits.values())
+    evenly_spaced = np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)
+    causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
+    parts: dict[tuple[object, ...], dict[str, float]] = {}
+    for limits, cause in zip(find_limits(driver, causes, unsafe), causes, strict=True):
+        # Of equal causes in many encounters only the first counts.
+        kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
+        parts.setdefault(kind, limits.boundary | cause.encounter)
+    return list(parts.values())
 
 
 def _answer_of(
     problem: RepairProblem,
     models: Models,
-    found: Survivors,
+    survivors: Survivors,
     worst_today: Evaluations,
     not_repairable: list[dict[str, float]],
 ) -> Answer:
@@ -255,11 +262,12 @@ def _answer_of(
     `worst_today` is how the driving system of today ends with the worst vehicle of the promise that was tried and that
     a driving system can keep safe.
     """
-    survivors = found.changes
     unsafe = problem.unsafe
     worst = float(worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0])
-    kept_today = bool(survivors) and not problem.changed_values(survivors[0][0])
-    repairs = [] if kept_today else [_row(problem, *pair, found.fits) for pair in survivors]
+    kept_today = any(not problem.changed_values(change) for change, _ in survivors.changes)
+    repairs = []
+    if not kept_today:
+        repairs = [_row(problem, change, proof, survivors.fits) for change, proof in survivors.changes]
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "unsafe": str(unsafe),
@@ -270,7 +278,7 @@ def _answer_of(
         "repairs": len(repairs),
         "not_repairable": not_repairable,
         "simulations": sum(model.evaluator.simulated for model in models.members),
-        "fits": found.fits if survivors else 0,
+        "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": len(models.members),
     }
     demand = f"with {unsafe.keep:g} m left" if unsafe.keep else f"without {unsafe.description}"
@@ -281,30 +289,31 @@ def _answer_of(
         ending = unsafe.value_in_words(worst) if unsafe.bound else degree
         verdict = (
             f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried {ending}, and "
-            f"{_proof_in_words(survivors[0][1])}."
+            f"{_proof_in_words(survivors)}."
         )
     elif repairs:
-        verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors[0][1])}."
+        verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors)}."
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
-    verdict += _fits_in_words(models, found)
+    verdict += _fits_in_words(models, survivors)
     if not_repairable:
         fewest = sorted(not_repairable, key=len)
         parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
-        parts += f" (or {len(fewest) - SHOWN_LIMITS} more, not_repairable)" if len(fewest) > SHOWN_LIMITS else ""
-        verdict += f" No driving system survives {parts}: that needs another part, not a parameter."
+        more = len(fewest) - SHOWN_LIMITS
+        others = f" (or {more} more, not_repairable)" if more > 0 else ""
+        verdict += f" No driving system survives {parts}{others}: that needs another part, not a parameter."
     return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
 
 
-def _fits_in_words(models: Models, found: Survivors) -> str:
+def _fits_in_words(models: Models, survivors: Survivors) -> str:
     """In how many fits of the vehicle the answer holds, in a sentence; empty with one model."""
     count = len(models.members)
-    if count == 1 or not found.changes:
+    if count == 1 or not survivors.changes:
         return ""
-    broken = f", not in {fit_names(found.broken)}, where it collides" if found.broken else ""
+    broken = f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
     left_out = f"; left out: {fit_names(models.left_out)}, where the original is unsafe" if models.left_out else ""
-    return f" It holds in {found.fits} of {count} fits of the vehicle, attacked with each{broken}{left_out}."
+    return f" It holds in {survivors.fits} of {count} fits of the vehicle, attacked with each{broken}{left_out}."
 
 
 def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) -> JsonObject:
@@ -315,10 +324,17 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) ->
         for name, row, today in problem.parameters
         if name in values
     ]
-    size = float(np.max(np.abs(change - problem.today)))
-    row = {"parameters": values, "change": ", ".join(texts), "changed": len(values), "largest_change": size}
-    row |= {"fits": fits, "proof_samples": proof.samples, "proof_failures": proof.failures, "at_most": proof.at_most}
-    return {**row, **price_of(problem.study, values, problem.encounters)}
+    return {
+        "parameters": values,
+        "change": ", ".join(texts),
+        "changed": len(values),
+        "largest_change": float(np.max(np.abs(change - problem.today))),
+        "fits": fits,
+        "proof_samples": proof.samples,
+        "proof_failures": proof.failures,
+        "at_most": proof.at_most,
+        **price_of(problem.study, values, problem.encounters),
+    }
 
 
 def _repair_in_words(repair: JsonObject, wear: str) -> str:
@@ -335,7 +351,9 @@ def _repair_in_words(repair: JsonObject, wear: str) -> str:
     return f"{number} this wear {wear}: {repair['change']}. A new vehicle {earlier} and needlessly {needless}"
 
 
-def _proof_in_words(proof: Proof) -> str:
+def _proof_in_words(survivors: Survivors) -> str:
+    """The proof of the first change."""
+    _, proof = survivors.changes[0]
     return (
         f"of {proof.samples:,} fresh worn vehicles {proof.failures} are unsafe (at most "
         f"{100 * proof.at_most:.2g} %, with {100 * CONFIDENCE:g} % confidence)"
@@ -345,12 +363,12 @@ def _proof_in_words(proof: Proof) -> str:
 def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
     """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its encounter."""
     characteristics = problem.promise.region.characteristics
-    limits = [
-        f"{member.name} {'below' if part[member.name] < member.original else 'above'} "
-        f"{member.text(part[member.name])}{member.suffix}"
-        for member in characteristics.vehicle
-        if member.name in part
-    ]
+    limits = list[str]()
+    for member in characteristics.vehicle:
+        if member.name in part:
+            value = part[member.name]
+            side = "below" if value < member.original else "above"
+            limits.append(f"{member.name} {side} {member.text(value)}{member.suffix}")
     return (" with ".join(limits) or "even the original") + encounter_in_words(characteristics, part)
 
 
