@@ -41,7 +41,8 @@ USUAL_QUESTIONS = ("tolerance", "explain --limit 30000", "risk --samples 4000", 
 """Questions of a page, the one whose verdict decides first; with smaller samples than those of the commands."""
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
-"""Numbers with more decimals than a screen can show."""
+"""Coordinates with more decimals than a screen can show."""
+TAG = re.compile(r"<[^>]*>")
 SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
@@ -226,7 +227,7 @@ def make_page(
             pictures=pictures,
             commands=[
                 *(command for study in studies for command in commands(study)),
-                *((f"The answer {answer.question}", answer.command) for answer in shared),
+                *((f"The answer {answer.question}", answer.command) for answer in shared if answer.command),
             ],
             player=player_files(),
             css=_web_file("report.css"),
@@ -296,7 +297,7 @@ def _picture(figure: Figure) -> JsonObject:
     buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = LONG_DECIMALS.sub(r"\1", buffer.getvalue().decode())
+    svg = TAG.sub(lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode())  # texts keep their digits
     words = f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}"
     return {"alt": words.replace("\n", " "), "source": "data:image/svg+xml," + quote(svg, safe=" =:/;,()'!?@&+$*")}
 

@@ -342,7 +342,8 @@ def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
         what = f"The study {study.case.study.name}, as its manifest.json records it, into another directory"
         yield what, f"python -c {shlex.quote(script)}"
     for answer in study.answers:
-        yield f"The answer {answer.question}", answer.command + flag
+        if answer.command:
+            yield f"The answer {answer.question}", answer.command + flag
     for handle in study.choices:
         simulate = f"{question_command('simulate', directory, study.point)} --solution {handle}"
         yield f"The replay of {handle}", f"{simulate} --plot it.png --animate it.html{flag}"

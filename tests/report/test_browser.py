@@ -167,6 +167,15 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
         return member.read().decode()
 
 
+BROKEN_NAMES = """
+    const text = document.createRange();
+    const lines = (cell) => { text.selectNodeContents(cell); return text.getClientRects().length; };
+    const names = [...document.querySelectorAll("td.label")].filter((cell) => !/\\s/.test(cell.textContent.trim()));
+    return names.filter((cell) => lines(cell) > 1).map((cell) => cell.textContent);
+"""
+"""Labels of one word that are on several lines."""
+
+
 @pytest.mark.slow
 def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Chrome, report: Path) -> None:
     opened(browser, report)
@@ -177,6 +186,7 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Ch
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False})
     try:
         assert browser.execute_script(TOO_WIDE) == []
+        assert browser.execute_script(BROKEN_NAMES) == []
         front = "return document.querySelector('.front').getBoundingClientRect().bottom + scrollY"
         assert browser.execute_script(front) <= A4["height"], "verdicts and limits are one page"
         every = "return document.querySelectorAll(arguments[0]).length"

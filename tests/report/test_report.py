@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
@@ -27,8 +28,9 @@ from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.ask import find_question, parse_question
 from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.figures import new_figure
 from safevar_sumo.report import sections
-from safevar_sumo.report.page import answer_or_reason, answer_to, usual_questions
+from safevar_sumo.report.page import _picture, answer_or_reason, answer_to, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
@@ -266,6 +268,22 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
+
+
+def test_a_picture_on_a_page_has_all_digits_of_its_texts() -> None:
+    figure, ((axis,),) = new_figure("rules", 1, 1, (3, 2))
+    axis.set_yticks([0.123456], ["brakeResponse above 0.226 s"])
+    svg = unquote(_picture(figure)["source"])
+    assert ">brakeResponse above 0.226 s<" in svg
+    assert not re.search(r'="[^"]*\d\.\d{3}', svg)
+
+
+def test_an_answer_that_cannot_be_given_has_no_command() -> None:
+    case: Any = SimpleNamespace(study=load_study("smoke"), has_runs=False)
+    missing: Any = [SimpleNamespace(question="risk", command=""), SimpleNamespace(question="rules", command="rules it")]
+    one = ReportedStudy(directory=Path("it"), case=case, versions={}, answers=missing)
+    vars(one)["choices"] = {}
+    assert [*sections.commands(one)] == [("The answer rules", "rules it")]
 
 
 @pytest.mark.slow
