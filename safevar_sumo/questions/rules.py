@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
@@ -68,14 +69,15 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     criterion = evaluator.choose_criterion(unsafe, subject)
     vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
     evaluations = evaluator.evaluate(vehicles, "settings over the whole domain")
-    rows = np.arange(len(evaluations))
-    training, testing = (evaluations.take(half[evaluations.valid[half]]) for half in np.split(rows, [len(rows) // 2]))
+    is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
+    training = evaluations.take(evaluations.valid & is_first_half)
+    testing = evaluations.take(evaluations.valid & ~is_first_half)
     is_unsafe = criterion.of(training)
     is_unsafe_in_test = criterion.of(testing)
     total = len(training) + len(testing)
     failures = int(is_unsafe.sum() + is_unsafe_in_test.sum())
     if not total:
-        raise SimulationError(f"study {study.name!r}: none of {len(rows)} vehicles could be simulated")
+        raise SimulationError(f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated")
     boxes = []
     remark = ""
     if is_unsafe.all() and len(training):
@@ -84,17 +86,22 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
         remark = f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N draws more)."
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
-    cells = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
-    table = tabulate("Where failures lie", COLUMNS, sorted(cells, key=lambda row: -row[4]))
+    rows = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
+    frame = pd.DataFrame(rows, columns=[*COLUMNS]).sort_values("coverage", ascending=False, kind="stable")
+    table = tabulate("Where failures lie", COLUMNS, frame)
     low, high = clopper_pearson(failures, total)
     drawn = "drawn as [variation] says" if study.variation or study.correlations else "over the whole domain"
     verdict = (
         f"{100 * failures / total:.2f} % of {total:,} vehicles {drawn} are unsafe "
         f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
     )
-    for row in table[table["density_low"] > failures / total].head(1).to_dict("records"):
-        density, coverage = (f"{100 * row[name]:.0f} %" for name in ("density", "coverage"))
-        verdict += f" {coverage} of them have {row['rule']}; of all vehicles like that {density} are unsafe."
+    denser = table[table["density_low"] > failures / total]
+    if len(denser):
+        rule = denser.iloc[0]
+        verdict += (
+            f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like that "
+            f"{100 * rule['density']:.0f} % are unsafe."
+        )
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -138,18 +145,20 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
     leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
+    densest = max(density for _, density in leaves)
     dense_boxes = [box for box, density in leaves if density > 0.5]
     if not dense_boxes:
-        densest, _ = max(leaves, key=lambda leaf: leaf[1])
-        dense_boxes = [densest]
+        dense_boxes = [box for box, density in leaves if density == densest][:1]
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
     rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
+    boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
     chosen = list[FloatArray]()
     is_uncovered = is_unsafe.copy()
-    for box in sorted(boxes, key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings))):
+    least_added = MIN_ADDED_SHARE * np.count_nonzero(is_unsafe)
+    for box in boxes:
         is_inside = is_within(box, settings)
-        if not chosen or np.count_nonzero(is_uncovered & is_inside) >= MIN_ADDED_SHARE * np.count_nonzero(is_unsafe):
+        if not chosen or np.count_nonzero(is_uncovered & is_inside) >= least_added:
             chosen.append(box)
             is_uncovered &= ~is_inside
     return chosen
@@ -186,20 +195,21 @@ def _boxes_of_leaves(
         yield box, float(counts[-1] / counts.sum())
         return
     column = int(tree.feature[node])
-    # The threshold is the lower end of the right child, and the upper end of the left one.
-    for end, children in enumerate((tree.children_right, tree.children_left)):
-        part = box.copy()
-        part[end, column] = lower[column] + tree.threshold[node] * width[column]
-        yield from _boxes_of_leaves(tree, int(children[node]), part, lower, width)
+    threshold = lower[column] + tree.threshold[node] * width[column]
+    above = box.copy()
+    above[0, column] = threshold
+    yield from _boxes_of_leaves(tree, int(tree.children_right[node]), above, lower, width)
+    below = box.copy()
+    below[1, column] = threshold
+    yield from _boxes_of_leaves(tree, int(tree.children_left[node]), below, lower, width)
 
 
 def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> FloatArray:
     """Drop conditions while the lower bound of the density does not fall."""
 
     def least_density(box: FloatArray) -> float:
-        is_inside = is_within(box, settings)
-        count = int(np.count_nonzero(is_inside))
-        return clopper_pearson(int(np.count_nonzero(is_unsafe & is_inside)), count)[0] if count else 0.0
+        inside = is_unsafe[is_within(box, settings)]
+        return clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0] if len(inside) else 0.0
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))

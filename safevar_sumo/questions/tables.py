@@ -14,7 +14,8 @@ import pandas as pd
 from safevar_sumo.questions.bars import LEGEND
 from safevar_sumo.terminal import WholeTable
 
-LOW, HIGH = "_low", "_high"
+LOW = "_low"
+HIGH = "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
 LONG_TEXT = 60
 """Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room [characters]."""
@@ -82,11 +83,9 @@ def tabulate(
 
 def with_interval(name: str, column: Column) -> dict[str, Column]:
     """A column and the two that hold the ends of its interval."""
-    ends = {
-        f"{name}{end}": column._replace(meaning=f"{word} end of {name}")
-        for end, word in ((LOW, "lower"), (HIGH, "upper"))
-    }
-    return {name: column, **ends}
+    low = column._replace(meaning=f"lower end of {name}")
+    high = column._replace(meaning=f"upper end of {name}")
+    return {name: column, f"{name}{LOW}": low, f"{name}{HIGH}": high}
 
 
 def columns_of(frame: pd.DataFrame) -> dict[str, Column]:
@@ -118,11 +117,13 @@ def text_of(value: Any, number_format: str = ".4g") -> str:
         return ", ".join(f"{name} {text_of(inner, number_format)}" for name, inner in value.items()) or "-"
     if isinstance(value, list):
         is_interval = len(value) == 2 and not isinstance(value[0], dict)
-        return (" to " if is_interval else "; ").join(text_of(inner, number_format) for inner in value) or "-"
+        separator = " to " if is_interval else "; "
+        return separator.join(text_of(inner, number_format) for inner in value) or "-"
     return str(value)
 
 
 def csv_cell(value: Any) -> Any:
+    """A value as CSV has it: a list as words."""
     return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
@@ -136,16 +137,17 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
     heads = frame[wide.by].unique()
     title = frame.attrs["title"]
     words = frame.attrs["words"]
+    names = [words.get(str(head), wide.head.format(head)) for head in heads]
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
-        column = columns[f"{value}{ends[0]}"]
+        of_value = [f"{value}{end}" for end in ends]
+        column = columns[of_value[0]]
         shown = {label: columns[label] for label in wide.labels}
-        names = [words.get(str(head), wide.head.format(head)) for head in heads]
         shown |= {f"{name}{end}": column._replace(unit="") for name in names for end in ends}
-        rows = [
-            (*key, *group.set_index(wide.by)[[f"{value}{end}" for end in ends]].reindex(heads).to_numpy().ravel())
-            for key, group in frame.groupby([*wide.labels], sort=False)
-        ]
+        rows = []
+        for labels, group in frame.groupby([*wide.labels], sort=False):
+            by_head = group.set_index(wide.by)[of_value].reindex(heads)
+            rows.append((*labels, *by_head.to_numpy().ravel()))
         heading = title if len(wide.values) == 1 else f"{title}: {column.meaning}"
         yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
 
@@ -172,19 +174,24 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         base = re.sub(f"({LOW}|{HIGH})$", "", name)
         column = columns.get(name, Column("", ""))
         ends = [f"{base}{LOW}", f"{base}{HIGH}"]
-        if not column.is_shown or (base != name and (base in frame or name == ends[1])):
+        is_end = base != name
+        is_with_value = is_end and (base in frame or name == ends[1])
+        if not column.is_shown or is_with_value:
             continue
-        if len(frame) and frame[[name] if base == name else ends].isna().all(axis=None):  # undefined in every row
+        of_column = ends if is_end else [name]
+        if len(frame) and frame[of_column].isna().all(axis=None):  # undefined in every row
             continue
         texts = [text_of(value, column.number_format) for value in frame[name]]
         texts = [words.get(text, text) for text in texts]
         if ends[0] in frame:
             pairs = frame[ends].itertuples(index=False)
             intervals = [_interval_text(low, high, column.number_format) for low, high in pairs]
-            is_exact = frame[ends[0]] == frame[ends[1]]
-            own = zip(texts, intervals, is_exact, strict=True)
-            texts = [text if exact or text == "-" else f"{text} ({interval})" for text, interval, exact in own]
-            texts = texts if base == name else intervals
+            if is_end:
+                texts = intervals
+            else:
+                is_exact = frame[ends[0]] == frame[ends[1]]
+                behind = zip(texts, intervals, is_exact, strict=True)
+                texts = [text if exact or text == "-" else f"{text} ({interval})" for text, interval, exact in behind]
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
         yield _ReaderColumn(f"{base.replace('_', ' ')}{unit}", column.meaning, texts, is_number)

@@ -105,49 +105,49 @@ class CommonDomain(NamedTuple):
             If B's original vehicle does not keep a limit, or the domains of a searched parameter have nothing in
             common.
         """
-        members = [one.characteristics for one in evaluators]
-        rows = [one.study.domains for one in evaluators]
-        with about(evaluators[1].study.source):
-            check_limits(rows[1], limits, "limits: ")
-        shift = np.where(members[0].of_vehicle, members[1].original - members[0].original, 0.0)
-        ends = np.array([[within(limits, name, of[name]) for name in members[0].names] for of in rows])
-        common = cls(evaluators, shift, ends[:, :, 0], ends[:, :, 1])
+        a, b = (one.characteristics for one in evaluators)
+        second = evaluators[1].study
+        with about(second.source):
+            check_limits(second.domains, limits, "limits: ")
+        shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
+        domains = [one.study.domains for one in evaluators]
+        ends = np.array([[within(limits, name, of_study[name]) for name in a.names] for of_study in domains])
+        common = cls(evaluators, shift, lower=ends[:, :, 0], upper=ends[:, :, 1])
         lower, upper = common.ends_in_a
-        if (lower > upper).any():
-            name = members[0].names[int(np.argmax(lower > upper))]
-            problem = f"{name}: the domains of the two studies do not overlap"
-            raise InputError(evaluators[1].study.source, problem, "studies with a common domain of each parameter")
+        is_empty = lower > upper
+        if is_empty.any():
+            problem = f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not overlap"
+            raise InputError(second.source, problem, "studies with a common domain of each parameter")
         return common
 
     @property
     def ends_in_a(self) -> tuple[FloatArray, FloatArray]:
         """The lower and upper ends of A's settings that both domains hold, shape (n,)."""
-        lower, upper = ([ends[0], self.moved(ends[1], -1)] for ends in (self.lower, self.upper))
-        return np.max(lower, axis=0), np.min(upper, axis=0)
+        lower = np.maximum(self.lower[0], self.as_in_a(self.lower[1]))
+        upper = np.minimum(self.upper[0], self.as_in_a(self.upper[1]))
+        return lower, upper
 
-    def moved(self, settings: FloatArray, sign: int = 1) -> FloatArray:
-        """A's settings as B's, or with -1 B's as A's: the same changes of the other original vehicle."""
-        return np.where(self.shift == 0, settings, settings + sign * self.shift)
+    def as_in_b(self, settings: FloatArray) -> FloatArray:
+        """A's settings as B's: the same changes of the other original vehicle."""
+        return np.where(self.shift == 0, settings, settings + self.shift)
+
+    def as_in_a(self, settings: FloatArray) -> FloatArray:
+        """B's settings as A's."""
+        return np.where(self.shift == 0, settings, settings - self.shift)
 
     def holds(self, settings: Sequence[FloatArray]) -> BoolArray:
         """Which settings are in both domains, shape (M,)."""
-        inside = [
-            ((values >= lower) & (values <= upper)).all(axis=1)
-            for values, lower, upper in zip(settings, self.lower, self.upper, strict=True)
-        ]
-        return np.asarray(inside[0] & inside[1])
+        values = np.stack(settings, axis=1)  # shape (M, 2, n)
+        return np.asarray(((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2)))
 
     def in_both(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A's settings, and the same in B; what rounding moves out of B's domain is put onto its end."""
-        return settings, np.clip(self.moved(settings), self.lower[1], self.upper[1])
+        return settings, np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
 
     def evaluate(self, settings: tuple[FloatArray, FloatArray]) -> tuple[Evaluations, Evaluations]:
         """Evaluate settings in both systems."""
-        a, b = (
-            one.evaluate(values, f"settings in {side}")
-            for one, values, side in zip(self.evaluators, settings, "AB", strict=True)
-        )
-        return a, b
+        in_a, in_b = self.evaluators
+        return in_a.evaluate(settings[0], "settings in A"), in_b.evaluate(settings[1], "settings in B")
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
@@ -163,7 +163,8 @@ def in_order_of(a: Study, b: Study) -> Study:
     InputError
         If B has other characteristics or searched parameters, or other units.
     """
-    units_a, units_b = ({(name, row.unit) for name, row in study.domains.items()} for study in (a, b))
+    units_a = {(name, row.unit) for name, row in a.domains.items()}
+    units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
         return msgspec.structs.replace(
@@ -171,13 +172,14 @@ def in_order_of(a: Study, b: Study) -> Study:
             vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
             scenario=msgspec.structs.replace(b.scenario, search={name: b.domains[name] for name in a.scenario.search}),
         )
-    a_alone, b_alone = (
-        ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
-        for units in (units_a - units_b, units_b - units_a)
-    )
+
+    def in_words(units: set[tuple[str, str]]) -> str:
+        return ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
+
     raise InputError(
         b.source,
-        f"cannot be compared: characteristics of {a.name!r} alone: {a_alone}; of {b.name!r} alone: {b_alone}",
+        f"cannot be compared: characteristics of {a.name!r} alone: {in_words(units_a - units_b)}; "
+        f"of {b.name!r} alone: {in_words(units_b - units_a)}",
         "studies with the same characteristics and searched parameters in the same units",
     )
 
@@ -195,8 +197,7 @@ def pairs_of(
         if not isinstance(case, Case):
             continue
         own = case.solutions[names].to_numpy(float)
-        other = common.moved(own, 1 if side == "a" else -1)
-        settings = (own, other) if side == "a" else (other, own)
+        settings = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
         is_inside = common.holds(settings)
         kept = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
         frame = case.solutions[kept].assign(source=side, solution=list(map(str, handles_of(case.solutions))))
@@ -221,8 +222,10 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
     shares = np.full(len(ends), 0.5)
     step = 0.5
     rounds = list[Pairs]()
-    while (drawn := sum(len(one.frame) for one in rounds)) < samples and len(rounds) < ROUNDS and len(ends):
-        lines = np.arange(min(len(ends), samples - drawn))
+    left = samples if len(ends) else 0
+    while left and len(rounds) < ROUNDS:
+        lines = np.arange(min(len(ends), left))
+        left -= len(lines)
         share = shares[lines, np.newaxis]
         settings = common.in_both(starts[lines] + share * (ends - starts)[lines])
         runs = common.evaluate(settings)

@@ -70,13 +70,14 @@ def tables(
     answer = answer_questions(cases, Choices(label_of(algorithm), alpha, causes_of_cases))
     if figures is not None:
         save_figures(cases, figures)
-    options = {"--algorithm": algorithm, "--alpha": alpha if alpha != ALPHA else "", "--causes": causes or ""}
-    flags = [f"{flag} {quote(str(value))}" for flag, value in options.items() if value]
-    directories = [quote(str(getattr(source, "directory", source))) for source in results]
-    command = " ".join([PROGRAM_COMMAND, "tables", *directories, *flags])
+    words = [PROGRAM_COMMAND, "tables"]
+    words += [quote(str(getattr(source, "directory", source))) for source in results]
+    words += ["--algorithm", quote(algorithm)] if algorithm else []
+    words += ["--alpha", str(alpha)] if alpha != ALPHA else []
+    words += ["--causes", str(causes)] if causes else []
     main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
     folded = () if all else tuple(name for name in answer.tables if name not in (*main_tables, "remarks"))
-    return replace(answer, command=command, folded=folded)
+    return replace(answer, command=" ".join(words), folded=folded)
 
 
 def figures(*results: Results | str | Path) -> dict[str, Figure]:
@@ -120,26 +121,27 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         title, compute, columns, wide = TABLES[name]
         if name == CAUSES and not choices.causes:
             continue
-        parts = []
         groups = [cases] if name == WEATHER else [[case] for case in cases]
+        options = [choices] if name in CHOSEN else []
+        parts = []
         for group in groups:
             try:
-                part = compute(*group, *([choices] if name in CHOSEN else []))
+                part = compute(*group, *options)
             except UnanswerableError as error:
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
                 parts.append(part if name == WEATHER else part.assign(setting=group[0].name))
-                remarks += [(name, note) for case in group for note in _remarks(name, case, part, choices.alpha)]
+                for case in group:
+                    remarks += [(name, note) for note in _remarks(name, case, part, choices.alpha)]
         shown = {**columns, "setting": columns["setting"]._replace(is_shown=len(cases) > 1)}
-        frames[name] = tabulate(
-            title, shown, pd.concat(parts, ignore_index=True) if parts else [], wide=wide, words=words
-        )
+        rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+        frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
     if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
-    of_cases = [remark for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
-    remarks = [*(("all", remark) for remark in of_cases), *remarks]
-    frames["remarks"] = tabulate("Remarks", REMARKS, list(dict.fromkeys(remarks)))
+    of_all = [("all", remark) for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
+    different = dict.fromkeys([*of_all, *remarks])
+    frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
     return Answer(
         question="tables",
         study=cases[0].study,
@@ -166,10 +168,12 @@ def _verdict(case: Case) -> str:
 
 def _equal_solutions(case: Case) -> str:
     """How many solutions of pooled tables are equal to another one of their run, in a sentence; "" if none is."""
-    same = ["algorithm", *(["run"] if case.has_runs else []), *case.characteristics.names]
-    count = int(case.solutions.duplicated(same).sum())
+    run = ["algorithm", "run"] if case.has_runs else ["algorithm"]
+    count = int(case.solutions.duplicated([*run, *case.characteristics.names]).sum())
+    if not count:
+        return ""
     of_all = f"{count} of {number_of(len(case.solutions), 'solution')}"
-    return f"{of_all} equal an earlier one of their run, and count here, as in the paper's method." if count else ""
+    return f"{of_all} equal an earlier one of their run, and count here, as in the paper's method."
 
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
@@ -177,8 +181,8 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     remarks = list[str]()
     if table in ("rq1", "rq2"):
         remarks += _on_pooled_tests(table, case, frame, alpha)
-    if table in POOLED and (equal := _equal_solutions(case)):
-        remarks.append(equal)
+    if table in POOLED:
+        remarks += filter(None, [_equal_solutions(case)])
     if table in ("rq1-runs", "rq2-runs"):
         remarks += _on_tests_of_runs(table, frame, alpha)
     if table == "a12" and len(frame):
@@ -190,15 +194,18 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
 
 def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
     """What tests of pooled solutions leave out: algorithms with too few runs, and undefined values."""
-    few = frame.loc[~frame["enough_runs"], "algorithm" if table == "rq1" else "baseline"].unique()
-    if names := ", ".join(map(case.title_of, few)):
+    tested = "algorithm" if table == "rq1" else "baseline"
+    with_few_runs = frame.loc[~frame["enough_runs"], tested].unique()
+    if len(with_few_runs):
+        names = ", ".join(map(case.title_of, with_few_runs))
         needed = fewest_runs(table.upper(), alpha)
         yield (
             f"too few runs of {names} for a test ({needed} are needed): no p-value of pooled solutions is significant."
         )
     for metric in case.scoring.metrics:
         values = solutions_for_metric(case.solutions, metric)[metric.name]
-        if undefined := int(values.isna().sum()):
+        undefined = int(values.isna().sum())
+        if undefined:
             yield f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
     if table == "rq1":
         known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
@@ -221,6 +228,7 @@ def _on_tests_of_runs(table: str, frame: pd.DataFrame, alpha: float) -> Iterator
     tests_in_words = number_of(len(tests), "test")
     if len(tests):
         yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."
-    if few_count := len(tests) - tests["enough_runs"].sum():
+    few = len(tests) - int(tests["enough_runs"].sum())
+    if few:
         needed = fewest_runs(rq, alpha, len(tests))
-        yield f"too few runs for {few_count} of {tests_in_words} of {rq} ({needed} are needed after the correction)."
+        yield f"too few runs for {few} of {tests_in_words} of {rq} ({needed} are needed after the correction)."
