@@ -395,8 +395,5 @@ def test_what_cannot_be_run_has_its_reason() -> None:
     def fail() -> bytes:
         raise InputError("model", "is not installed", "an extra")
 
-    assert claims.compare("mine", claims.Claim("answer", b"", fail))[2:] == (
-        "cannot be run",
-        "",
-        "model: is not installed expected: an extra",
-    )
+    row = claims.compare("mine", claims.Claim("answer", b"", fail))
+    assert row[2:] == ("cannot be run", "", "model: is not installed expected: an extra")

@@ -42,7 +42,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     survival_median,
 )
 from safevar_sumo.study import CharacteristicTable
-from tests.research_questions.test_questions import made_up, made_up_study, row, three_algorithms
+from tests.research_questions.cases import made_up, made_up_study, row, three_algorithms
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:

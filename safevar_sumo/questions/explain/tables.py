@@ -1,0 +1,170 @@
+"""The tables of `explain`: failures and their causes, what failures need, and who avoids them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.across_fits import Ranges
+from safevar_sumo.questions.explain.causes import Cause, count_distinct_causes, find_limits, settings_of
+from safevar_sumo.questions.explain.failures import Population, Reasons, compare_at_cells, compare_at_points
+from safevar_sumo.questions.explain.moved import COLUMNS as MOVED_COLUMNS, find_moved_borders
+from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
+from safevar_sumo.questions.preventability import COLUMNS as DRIVER_COLUMNS, avoided_by, judge_collisions
+from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.words import number_of
+from safevar_sumo.records import BoolArray
+from safevar_sumo.sumo.system import assemble
+
+MAX_DISTINCT = 10
+"""Maximum number of distinct causes in their table."""
+CAUSE_COLUMNS: Columns = {
+    "solution": "handle of the failure",
+    "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
+    "encounter": Column("", "the encounter, in which the original vehicle is safe", ".5g"),
+    "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
+    "single_boundary": Column("", "of each, the value if this change alone is scaled back", ".5g", is_shown=False),
+    "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
+    "end": Column("", "what lies just below the boundary", is_shown=False),
+    "size": Column("", "number of changes", is_shown=False),
+    "elsewhere": "whether these changes are unsafe in the original encounter, too",
+    "outcome": Column("", "outcome with these changes only", is_shown=False),
+    "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
+    "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
+    "fits_holding": "number of fitted vehicle models in which these changes are a cause, too",
+    "avoided_by": Column("", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False),
+}
+OF_ENCOUNTER = ("encounter", "elsewhere")
+"""Columns of a study that searches its scenario."""
+SOLUTION_COLUMNS: Columns = {
+    "solution": "handle",
+    "reason": "why it is explained",
+    "outcome": Column("", "outcome", is_shown=False),
+    "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
+    "changed": "number of changes",
+    "largest_change": Column("-", "largest change, as a share of the original value", is_shown=False),
+    "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
+    "ends": Column("", "how the original vehicle and this one end, where this one is worst", is_shown=False),
+    "points": Column("", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False),
+    "avoided_by": "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable",
+}
+CHARACTERISTIC_COLUMNS: Columns = {
+    "characteristic": "characteristic of the vehicle",
+    "changed": Column("-", "share of the failures that change it", ".2f"),
+    **with_interval("needed", Column("-", "share of the failures of which every minimal cause contains it", ".2f")),
+    "in_some": Column("-", "share of the failures of which some minimal cause contains it", ".2f"),
+}
+"""The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else the share itself."""
+DISTINCT_COLUMNS: Columns = {
+    "cause": "a minimal cause, without the sizes of its changes",
+    "failures": "failures with this cause",
+    "share": Column("-", "their share", ".2f"),
+}
+
+
+def solutions_frame(population: Population, evaluator: Evaluator, reasons: Reasons) -> pd.DataFrame:
+    """A row of `SOLUTION_COLUMNS` for each chosen failure."""
+    if not reasons:
+        return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
+    study = evaluator.study
+    failures = population.evaluations.take(list(reasons))
+    settings = failures.settings
+    unsafe = population.unsafe
+    if is_rated(study):  # each neighbour is simulated in all cells
+        factors = STEP_FACTORS[:1]
+        comparisons = compare_at_cells(evaluator, settings)
+    else:
+        factors = STEP_FACTORS
+        comparisons = compare_at_points(assemble(study), settings, unsafe)
+    is_judged = failures.collided & (not is_rated(study))
+    judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
+    columns = {
+        "solution": [population.names[row] for row in reasons],
+        "reason": [*reasons.values()],
+        "outcome": failures.outcome,
+        "safety_degree": failures.f_safe,
+        "changed": failures.f_num_diff.astype(int),
+        "largest_change": failures.f_diff,
+        "robust_share": robust_shares(evaluator, settings, assemble(study).step, unsafe, factors).mean(axis=1),
+        "ends": [sentence for sentence, _ in comparisons],
+        "points": [list(points) for _, points in comparisons],
+        "avoided_by": [avoided_by(next(judged)) if flag else None for flag in is_judged],
+    }
+    return pd.DataFrame(columns)
+
+
+def causes_table(
+    population: Population,
+    evaluator: Evaluator,
+    holding: Sequence[BoolArray],
+    solutions: pd.DataFrame,
+    causes_of: Sequence[Sequence[Cause]],
+) -> pd.DataFrame:
+    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust one first."""
+    study = evaluator.study
+    unsafe = population.unsafe
+    causes = [cause for group in causes_of for cause in group]
+    robust = np.full(len(causes), np.nan)
+    if causes and not is_rated(study):
+        settings = settings_of(evaluator.characteristics, causes)
+        robust = robust_shares(evaluator, settings, assemble(study).step, unsafe).mean(axis=1)
+    limits = find_limits(evaluator, causes, unsafe)
+    elsewhere = np.zeros(len(causes), dtype=bool)
+    if causes and study.scenario.search:
+        at_original = [cause._replace(encounter={}) for cause in causes]
+        settings = settings_of(evaluator.characteristics, at_original)
+        elsewhere = unsafe.of(evaluator.evaluate(settings, "causes in the original encounter"))
+    solution_of = np.repeat(range(len(solutions)), [len(group) for group in causes_of])
+    rows = [
+        {
+            **solutions[["solution", "avoided_by"]].iloc[solution_of[index]],
+            **causes[index]._asdict(),
+            **limits[index]._asdict(),
+            "size": len(causes[index].changes),
+            "elsewhere": bool(elsewhere[index]),
+            "robust_share": robust[index],
+            "fits_holding": sum(int(is_cause[index]) for is_cause in holding) if holding else None,
+        }
+        for index in np.lexsort([-robust, solution_of]).tolist()
+    ]
+    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
+    omitted = () if study.scenario.search else OF_ENCOUNTER
+    columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
+    return tabulate("Minimal causes, all else as in the original", columns, frame)
+
+
+def statistics_tables(
+    evaluator: Evaluator, needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
+) -> dict[str, pd.DataFrame]:
+    """The tables of characteristics and of drivers, with ranges over the fitted vehicle models."""
+    in_fits = Column("-", "range over the fitted vehicle models", ".2f")
+    of_characteristics = [ranges.get(("needed", str(name))) for name in needed["characteristic"]]
+    of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
+    return {
+        "characteristics": tabulate(
+            f"Changed and needed, in {number_of(failures, 'failure')}",
+            {**CHARACTERISTIC_COLUMNS, "needed_in_fits": in_fits},
+            needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
+        ),
+        "drivers": tabulate(
+            f"Other drivers in the same vehicle, in {number_of(collisions, 'collision')}",
+            {**DRIVER_COLUMNS, "share_in_fits": in_fits},
+            drivers.assign(share_in_fits=pd.Series(of_drivers, dtype=object)),
+        ),
+    }
+
+
+def moved_table(evaluator: Evaluator, causes_of: Sequence[Sequence[Cause]]) -> pd.DataFrame:
+    causes = [] if is_rated(evaluator.study) else [cause for group in causes_of for cause in group]
+    title = "Avoidable in a new car, no longer in this one: a competent driver, any braking of a leader"
+    return tabulate(title, MOVED_COLUMNS, find_moved_borders(evaluator, causes))
+
+
+def distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
+    distinct = count_distinct_causes(evaluator.characteristics, causes)
+    rows = distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT)
+    return tabulate(f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows)
