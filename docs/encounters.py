@@ -13,8 +13,8 @@ import sys
 
 import numpy as np
 
-from safevar_sumo.questions.evaluator import sobol_settings
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
+from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble

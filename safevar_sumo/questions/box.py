@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.evaluator import CONFIDENCE, sobol_points
+from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import FeasibleRegion
 

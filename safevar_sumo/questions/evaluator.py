@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,17 +18,14 @@ from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.sampling import CONFIDENCE as CONFIDENCE, Interval as Interval, sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
-from safevar_sumo.vehicles import CharacteristicSet, region_of
+from safevar_sumo.vehicles import region_of
 
-CONFIDENCE = 0.95
-"""Confidence level of the intervals of shares, unless an option sets another level."""
 Found = TypeVar("Found")
-Interval = tuple[float, float]
-"""Lower and upper end."""
 CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
 a safety degree.
@@ -377,29 +373,3 @@ def open_evaluator(
     assemble(study)
     with open_pool(jobs) as new_pool:
         yield Evaluator(study, new_pool, progress)
-
-
-def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if `number` is a power of
-    two.
-    """
-    import scipy  # takes longer to load than a simulation
-
-    sequence = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
-    exponent = max(0, math.ceil(math.log2(number)))
-    return np.asarray(sequence.random_base2(exponent)[:number])
-
-
-def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
-    """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
-    lower = characteristics.lower
-    upper = characteristics.upper
-    return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
-
-
-def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> Interval:
-    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`."""
-    import scipy
-
-    interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
-    return float(interval.low), float(interval.high)

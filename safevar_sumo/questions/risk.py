@@ -20,7 +20,8 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
-from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray

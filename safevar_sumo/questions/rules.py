@@ -17,7 +17,8 @@ import pandas as pd
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
-from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import BoolArray, FloatArray

@@ -15,7 +15,8 @@ import pandas as pd
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.evaluator import Evaluator, Interval, sobol_points
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import Limit, Study

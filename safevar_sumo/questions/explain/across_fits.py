@@ -11,10 +11,11 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator, Interval
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import Cause, count_needed, find_minimal_causes, settings_of
 from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import avoided_shares, judge_sample
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import BoolArray, Evaluations
 
 MAX_SHARE_SETS = 8

@@ -19,7 +19,8 @@ import pandas as pd
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.evaluator import Evaluator, clopper_pearson
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 

@@ -26,13 +26,14 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
-from safevar_sumo.questions.evaluator import CONFIDENCE, Evaluator, sobol_points
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE, find_failures, prove_change
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import Search
+from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words

@@ -18,9 +18,10 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.evaluator import Evaluator, sobol_points
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.repair.full_braking import FullBraking, lefts_of
+from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
 from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
