@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ import tomli_w
 from safevar_sumo.errors import InputError, about, did_you_mean, one_of, warn
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
+from safevar_sumo.study.characteristics import Domain
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
@@ -119,12 +120,28 @@ def _converted(raw: _RawStudy) -> Study:
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
-    study = convert_table(tables, Study)
+    study = convert_table(_with_declared(tables, raw.origin.places), Study)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
         raise InputError("", "rating.claims: the study is not rated", "matrix.protocol, or no claims")
     for name in study.spread:
         locate_parameter(msgspec.to_builtins(study), name)
     return msgspec.structs.replace(study, origin=raw.origin)
+
+
+def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
+    """The tables of a study, with what the scenario's class declares of parameters that the study searches."""
+    scenario = tables.get("scenario")
+    search = scenario.get("search") if isinstance(scenario, dict) else None
+    if not isinstance(scenario, dict) or not isinstance(search, dict):
+        return tables
+    needed = {field.name for field in msgspec.structs.fields(Domain) if field.required}
+    domains = dict(search)
+    for name, domain in search.items():
+        if isinstance(domain, dict) and needed - domain.keys():
+            from safevar_sumo.scenarios.declared import with_declared  # the one import upwards: classes declare ranges
+
+            domains[name] = with_declared(domain, name, tables, places)
+    return {**tables, "scenario": {**scenario, "search": domains}}
 
 
 def _without_characteristics(model: object) -> InputError:

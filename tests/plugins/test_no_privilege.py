@@ -15,6 +15,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, Unsafe, time_to_collision
 from safevar_sumo.protocol.cells import MODELS
 from safevar_sumo.questions.opinion import judge_causes
@@ -81,6 +82,38 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(n
     base = load_study(BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search})
     copy = msgspec.structs.replace(base, scenario=msgspec.structs.replace(base.scenario, model=own))
     assert_equal(base, copy)
+
+
+DEER = """
+from typing import Annotated
+from msgspec import Meta, Struct
+
+
+class Deer(Struct):
+    speed: Annotated[float, Meta(ge=20, le=60, description="speed", extra={"unit": "km/h"})] = 40.0
+
+    def tracks(self, times):
+        return []
+"""
+
+
+def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_users(in_tmp: Path) -> None:
+    """The original is the class's default; in a matrix the class may be that of a test."""
+    (in_tmp / "deer.py").write_text(DEER)
+    for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
+        domain = ("km/h", 40, *((20, 60) if model == "deer:Deer" else (10, 80)))
+        search = {"speed": {}, "visibility": {"lower": 0.5}}
+        test = {"name": "it", "model": model}
+        for tables in (
+            {"scenario": {"model": model, "search": search}, "matrix": None},
+            {"scenario": {"search": search}, "matrix": {"tests": [test]}},
+        ):
+            found = load_study("wear", **tables).scenario.search
+            speed = found["speed"]
+            assert (speed.unit, speed.original, speed.lower, speed.upper) == domain, model
+            assert (found["visibility"].lower, found["visibility"].upper) == (0.5, 1.5)
+    with pytest.raises(InputError, match=r"scenario\.search\.pace: unit is missing"):
+        load_study("wear", matrix=None, scenario={"model": "deer:Deer", "search": {"pace": {}}})
 
 
 @pytest.mark.parametrize("name", sorted(SCENARIOS.keys() - {"openscenario", "stop"}))  # which have no such scenes
