@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from itertools import chain, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,13 +52,12 @@ class Source(NamedTuple):
         declarations = declared(root_of(self.concrete))
         has_constraints = any(parameter.groups for parameter in declarations)
         for sets in product(*(choice.sets for choice in self.choices)):
-            values = {
-                name: value
-                for choice, own in zip(self.choices, sets, strict=True)
-                for name, value in zip(choice.names, own, strict=True)
-            }
-            if not (has_constraints and violated(declarations, values_of(declarations, {**given, **values}, {}))):
-                yield values
+            values = dict[str, str]()
+            for choice, own in zip(self.choices, sets, strict=True):
+                values |= zip(choice.names, own, strict=True)
+            if has_constraints and violated(declarations, values_of(declarations, {**given, **values}, {})):
+                continue
+            yield values
 
     def without(self, names: Mapping[str, object]) -> Source:
         """The file with other choices than those of these parameters, which something else sets."""
@@ -178,24 +177,24 @@ def constraints_of(
     middle = (low + high) / 2
     half = (high - low) / 2
     for name, _, groups in declarations:
-        for rule, limit in (one for group in groups for one in group):
+        for rule, limit in chain(*groups):
             if rule not in KINDS:
                 continue
             base = difference(name, limit, middle)
-            steps = np.diag(half)
-            slopes = np.array([difference(name, limit, middle + step) - base for step in steps]) / half
+            slopes = np.array([difference(name, limit, middle + step) - base for step in np.diag(half)]) / half
             sign = 1 if KINDS[rule] == "at_least" else -1
             reach = np.abs(slopes * half).sum()
-            if reach < 1e-12 or sign * base > reach or (sign * base == reach and rule.endswith("Equal")):
-                continue  # the other values decide, or it holds everywhere
-            corners = [low, high, middle - half / 3]
-            far = [difference(name, limit, corner) - base - slopes @ (corner - middle) for corner in corners]
-            if np.abs(far).max() > 1e-6 * reach:
+            is_given = reach < 1e-12
+            least = sign * base - reach
+            holds_everywhere = least > 0 or (least == 0 and rule.endswith("Equal"))
+            if is_given or holds_everywhere:
+                continue
+            elsewhere = [low, high, middle - half / 3]
+            errors = [difference(name, limit, at) - base - slopes @ (at - middle) for at in elsewhere]
+            if np.abs(errors).max() > 1e-6 * reach:
                 raise unsupported(
                     f"the constraint of {name} is not linear in {', '.join(names)}", "other parameters to search"
                 )
-            text = f"{name} {rule} {limit}"
-            bounds.append(
-                Bound(slopes.tolist(), KINDS[rule], float(slopes @ middle - base + sign * INSIDE * reach), text)
-            )
+            bound = float(slopes @ middle - base + sign * INSIDE * reach)
+            bounds.append(Bound(slopes.tolist(), KINDS[rule], bound, f"{name} {rule} {limit}"))
     return bounds

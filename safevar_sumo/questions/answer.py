@@ -62,12 +62,13 @@ class Contents(NamedTuple):
 
     def with_options(self, values: Mapping[str, Any]) -> Contents:
         """The names that an answer has with these values of options; `NAME` for an option that has none."""
-        stated = {name: text.partition("=")[0].strip() for name, text in values.items() if isinstance(text, str)}
-        named = defaultdict(lambda: "NAME", stated)
-        tables = {
-            table: [name if name is ... else name.format_map(named) for name in names]
-            for table, names in self.tables.items()
-        }
+        named = defaultdict(lambda: "NAME")
+        for option, text in values.items():
+            if isinstance(text, str):
+                named[option] = text.partition("=")[0].strip()
+        tables = {}
+        for table, names in self.tables.items():
+            tables[table] = [name if name is ... else name.format_map(named) for name in names]
         return self._replace(tables=tables)
 
     def check_table(self, name: str) -> None:
@@ -77,20 +78,25 @@ class Contents(NamedTuple):
     def check_key(self, key: str) -> None:
         """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
         name, _, rest = key.rpartition(".")
-        number = name if name and rest.isdecimal() else key
-        wanted, names = (rest, self.tables[name]) if name in self.tables else (number, self.numbers)
+        names = self.numbers
+        wanted = key
+        legal = [number for number in self.numbers if number != ...]
+        legal += [f"{table}.COLUMN" for table in self.tables]  # the columns of all tables would fill the screen
+        if name in self.tables:
+            names = self.tables[name]
+            wanted = rest
+            legal = [f"{name}.{column}" for column in names if column != ...]
+        elif name and rest.isdecimal():
+            wanted = name
         if ... not in names and wanted not in names:
-            # Of a table its columns are legal; the columns of all tables would fill the screen.
-            of_table = [legal for legal in self.keys if legal.startswith(f"{name}.")]
-            legal = of_table or [*(name for name in self.numbers if name != ...), *(f"{t}.COLUMN" for t in self.tables)]
             problem = f"the answer has no number {key!r}{did_you_mean(key, self.keys)}"
             raise InputError("fail_if", problem, one_of(legal))
 
     @property
     def keys(self) -> list[str]:
         """All names of numbers, and `table.column`, without those that a study gives."""
-        columns = ((f"{table}.", name) for table, names in self.tables.items() for name in names)
-        return [f"{before}{name}" for before, name in (*(("", name) for name in self.numbers), *columns) if name != ...]
+        columns = [f"{table}.{name}" for table, names in self.tables.items() for name in names if name != ...]
+        return [*(name for name in self.numbers if name != ...), *columns]
 
 
 def contents(
@@ -152,15 +158,13 @@ class Answer:
         """Plain values: question, study, verdict, numbers, and of each table its columns and rows; null where
         undefined.
         """
-        tables = {
-            name: {
-                "columns": {
-                    name: {"unit": unit, "meaning": text} for name, (unit, text, *_) in columns_of(frame).items()
-                },
+        tables = {}
+        for name, frame in self.tables.items():
+            columns = columns_of(frame).items()
+            tables[name] = {
+                "columns": {key: {"unit": column.unit, "meaning": column.meaning} for key, column in columns},
                 "rows": [plain(row) for row in frame.to_dict("records")],
             }
-            for name, frame in self.tables.items()
-        }
         head = {"question": self.question, "study": getattr(self.study, "name", None), "verdict": self.verdict}
         return {**head, "numbers": plain(self.numbers), "tables": tables}
 
@@ -203,8 +207,9 @@ class Answer:
         if form == "latex":
             shown = self._short_tables
             remarks = shown.pop("remarks", None)
-            tables = [latex_table(self._label_of(name), frame) for name, frame in shown.items()]
-            return "\n".join([LATEX_PREAMBLE, *tables, *([] if remarks is None else [latex_notes(remarks)])])
+            parts = [LATEX_PREAMBLE, *(latex_table(self._label_of(name), frame) for name, frame in shown.items())]
+            parts += [] if remarks is None else [latex_notes(remarks)]
+            return "\n".join(parts)
         if form == "html":
             first, *later = map(escape, SENTENCE_END.split(self.verdict))
             verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])

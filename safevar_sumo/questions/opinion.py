@@ -158,24 +158,27 @@ def _drive_both(
 ) -> tuple[pd.DataFrame, _Runs]:
     """Simulate the original vehicle and the causes with both models: a frame with `SETTING_COLUMNS`, and the runs."""
     characteristics = system.characteristics
-    contact = system.contact
     values = [{}, *(cause["changes"] | cause.get("encounter", {}) for cause in causes)]
     settings = np.stack([characteristics.setting(one, beyond=True) for one in values])
     originals = characteristics.with_original_vehicle(settings)
     both = np.concatenate([settings, originals])
     # Shares of each setting's changes, one setting after the other; shape (settings, shares, n).
-    scaled = originals[:, np.newaxis] + CHANGE_SHARES[:, np.newaxis] * (settings - originals)[:, np.newaxis]
+    changes = (settings - originals)[:, np.newaxis]
+    scaled = originals[:, np.newaxis] + CHANGE_SHARES[:, np.newaxis] * changes
     ours = evaluate(system, both)
     theirs = evaluate(second_system, np.concatenate([both, scaled.reshape(-1, len(characteristics))]))
     names = ["", *(cause["solution"] for cause in causes)] * 2
     there = theirs.take(range(len(both)))
     frame = table_of_pairs(names, ours, there, unsafe.of(ours), unsafe.of(there))
-    endings = (
-        [ending_in_words(*end, contact) for end in zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)]
-        for side in SIDES
-    )
     fails_scaled = unsafe.of(theirs)[len(both) :].reshape(len(settings), -1)
+    endings = [_endings_in_words(frame, side, system.contact) for side in SIDES]
     return frame, _Runs(settings, ours, theirs, fails_scaled, *endings)
+
+
+def _endings_in_words(frame: pd.DataFrame, side: str, contact: float) -> list[str]:
+    """How each row of a frame with `SETTING_COLUMNS` ends on a side."""
+    ends = zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)
+    return [ending_in_words(outcome, degree, contact) for outcome, degree in ends]
 
 
 def _judge(

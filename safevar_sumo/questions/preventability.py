@@ -125,11 +125,10 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     be simulated. The columns are the drivers' names and `point`, the name of the point.
     """
     system = assemble(evaluator.study)
-    worst = np.zeros(len(collisions), dtype=np.intp) if collisions.worst_points is None else collisions.worst_points
     drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(point="")
-    for index in np.unique(worst).tolist():
-        rows = np.flatnonzero(worst == index)
+    for index in np.unique(collisions.points).tolist():
+        rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
         study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
         settings = collisions.settings[rows]

@@ -65,6 +65,11 @@ class Evaluations:
         return self.metrics[SAFETY_DEGREE]
 
     @property
+    def points(self) -> npt.NDArray[np.intp]:
+        """`worst_points`; without a matrix the only point, 0."""
+        return np.zeros(len(self), dtype=np.intp) if self.worst_points is None else self.worst_points
+
+    @property
     def results(self) -> Results:
         """Outcomes and metrics by name."""
         return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
@@ -139,23 +144,21 @@ class Evaluations:
 
         There are `cells` only if all batches have them; the worst point of a batch without `worst_points` is the first.
         """
+        columns = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS}
+        reasons = dict[bytes, str]()
+        names = dict[str, None]()
+        for batch in batches:
+            reasons |= batch.reasons
+            names |= dict.fromkeys(batch.metrics)
+        metrics = {name: np.concatenate([batch.column(name) for batch in batches]) for name in names}
         cells = [batch.cells for batch in batches if batch.cells is not None]
-        points = [
-            np.zeros(len(batch), dtype=np.intp) if batch.worst_points is None else batch.worst_points
-            for batch in batches
-        ]
-        return cls(
-            **{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS},
-            metrics={
-                name: np.concatenate([batch.metrics.get(name, np.full(len(batch), np.nan)) for batch in batches])
-                for name in dict.fromkeys(name for batch in batches for name in batch.metrics)
-            },
-            reasons={setting: reason for batch in batches for setting, reason in batch.reasons.items()},
-            worst_points=None if all(batch.worst_points is None for batch in batches) else np.concatenate(points),
-            cells=None
-            if len(cells) < len(batches)
-            else CellResults._make(map(np.concatenate, zip(*cells, strict=True))),
-        )
+        all_cells = None
+        if len(cells) == len(batches):
+            all_cells = CellResults._make(map(np.concatenate, zip(*cells, strict=True)))
+        worst_points = None
+        if any(batch.worst_points is not None for batch in batches):
+            worst_points = np.concatenate([batch.points for batch in batches])
+        return cls(**columns, metrics=metrics, reasons=reasons, cells=all_cells, worst_points=worst_points)
 
 
 def differences(outputs: Results, others: Results, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:

@@ -27,7 +27,8 @@ Raw = Mapping[str, Any]
 def path_of(name: str, places: Sequence[str]) -> str:
     """The path of a file that a study names, beside the study."""
     for place in places or (os.getcwd(),):
-        if (path := Path(place, name)).is_file():
+        path = Path(place, name)
+        if path.is_file():
             return os.path.abspath(path)
     raise InputError("", f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
 
@@ -41,12 +42,11 @@ def files_of(scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence
         return {}
     points = {}
     for test in tests or (MatrixTest(name=""),):
-        values = {**scenario, **test.parameters}
-        over = {name: column for name, column in test.over.items() if any(isinstance(one, str) for one in column)}
-        numbers = {name: column[0] for name, column in test.over.items() if name not in over}
-        for combination in product(*over.values()):
-            point = {**values, **numbers, **dict(zip(over, combination, strict=True))}
-            points[frozenset(item for item in point.items() if isinstance(item[1], str))] = point
+        axes = [column if any(isinstance(one, str) for one in column) else column[:1] for column in test.over.values()]
+        for combination in product(*axes):
+            point = {**scenario, **test.parameters, **dict(zip(test.over, combination, strict=True))}
+            texts = frozenset(item for item in point.items() if isinstance(item[1], str))
+            points[texts] = point
     files: dict[str, str] = {}
     for point in points.values():
         path = path_of(point["file"], places)
@@ -74,11 +74,12 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
                 "", f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
             )
     name = scenario["file"]
-    values = scenario.get("values", {})
-    search = scenario.get("search", {})
-    for key, value, kind in (("file", name, str), ("values", values, dict), ("search", search, dict)):
-        if not isinstance(value, kind):
-            raise InputError("", f"scenario.{key} = {value!r}", "a path" if kind is str else "a table")
+    if not isinstance(name, str):
+        raise InputError("", f"scenario.file = {name!r}", "a path")
+    for key in ("values", "search"):
+        value = scenario.get(key, {})
+        if not isinstance(value, dict):
+            raise InputError("", f"scenario.{key} = {value!r}", "a table")
     path = path_of(name, places)
     try:
         return _expanded(tables, path, places)
@@ -87,11 +88,13 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
 
 
 def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
+    """The tables of a study with what the file at `path` says; see `with_file`."""
     offered = open_file(path)
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
     search = scenario.get("search", {})
-    for name in (*values, *(name for name in search if name not in WEATHER)):
+    of_file = [*values, *(name for name in search if name not in WEATHER)]
+    for name in of_file:
         if name not in offered.values:
             raise unknown_name("scenario", f"the file declares no parameter {name}", name, offered.values)
     domains = {name: table if name in WEATHER else _domain(name, table, offered) for name, table in search.items()}
@@ -113,12 +116,11 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     if len(points) == 1:
         parameters.update(points[0])
     else:
-        tests = [
-            {"name": Path(scenario["file"]).stem, "over": {name: [value] for name, value in point.items()}}
-            for point in points
-        ]
+        name = Path(scenario["file"]).stem
+        tests = [{"name": name, "over": {key: [value] for key, value in point.items()}} for point in points]
         result["matrix"] = {**(matrix or {}), "tests": tests}
-    if constraints := _constraints(offered, fixed, domains, points):
+    constraints = _constraints(offered, fixed, domains, points)
+    if constraints:
         result["constraints"] = [*tables.get("constraints", []), *constraints]
     return result
 
@@ -211,12 +213,13 @@ def _constraints(
     names = [name for name in domains if name in offered.values]
     if not names:
         return []
-    low, high = (np.array([float(domains[name][end]) for name in names]) for end in ("lower", "upper"))
-    found: dict[str, Parameters] = {}
+    low = np.array([float(domains[name]["lower"]) for name in names])
+    high = np.array([float(domains[name]["upper"]) for name in names])
+    different: dict[str, Parameters] = {}
     for point in points:
         given = {name: text_of(value) for name, value in {**fixed, **point}.items()}
         for bound in constraints_of(offered.concrete, given, names, low, high):
             weights = {name: weight for name, weight in zip(names, bound.weights, strict=True) if weight}
             table = {"sum": weights, bound.kind: bound.limit, "unit": "-", "meaning": bound.text}
-            found[repr(table)] = table
-    return [*found.values()]
+            different[repr(table)] = table
+    return [*different.values()]
