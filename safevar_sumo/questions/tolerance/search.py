@@ -346,7 +346,7 @@ class BoxSearch(BoxGeometry):
         def is_open(box: FloatArray, step: Step) -> bool:
             side, column = step
             known = self.unsafe_inside(box, self.needs(self.unsafe_settings))
-            return not (self.needs(known)[:, side, column] > sides[side, column]).any()
+            return not (self.extents(known)[:, side, column] > sides[side, column]).any()
 
         boxes = [(self.wider(sides, group, WIDENING), group) for group in groups]
         steps = [(box, step) for box, group in boxes for step in group if is_open(box, step)]
