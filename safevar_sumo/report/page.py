@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
-from itertools import count, takewhile
+from itertools import chain, count, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -104,7 +104,8 @@ def report(
         raise InputError("point", "the research questions are about whole studies", "no `paper`, or no `point`")
     paths = [Path(source.directory if isinstance(source, Results) else source) for source in results]
     cases = load_cases(paths)
-    joint = [text for text in ask or ["compare"] * (len(cases) == 2) if parse_question(text)[0].others]
+    usual_joint = ["compare"] if len(cases) == 2 else []
+    joint = [text for text in ask or usual_joint if parse_question(text)[0].others]
     alone = [text for text in ask if text not in joint]
     later_changes = [
         changes_since(path, case, as_it_is_now=as_it_is_now) for path, case in zip(paths, cases, strict=True)
@@ -112,39 +113,36 @@ def report(
     for path, changes in zip(paths, later_changes, strict=True):
         for change in changes:
             warn(f"{path}: {change}")
-    give = answer_to if ask else answer_or_reason
+    answer_question = answer_to if ask else answer_or_reason
     at_point = cases if point is None else [case_at(case, point) for case in cases]
-    subjects = cases_by(at_point, unsafe, jobs, show_no_progress)
+    by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [
-        [with_criterion(text, unsafe) for text in alone or ([] if ask else usual_questions(case, path, point, unsafe))]
-        for case, path in zip(subjects, paths, strict=True)
+        alone if ask else usual_questions(case, path, point, unsafe)
+        for case, path in zip(by_criterion, paths, strict=True)
     ]
-    joint = [with_criterion(text, unsafe) for text in joint]
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
 
-    def answered(text: str, chosen: Sequence[int]) -> Answer:
-        """The answer to the next question about the results with these numbers; progress shows its own number."""
-        within = f"question {next(numbers)} of {total}, {text.split()[0]}"
-        by_criterion = subjects if has_criterion(text, unsafe) else at_point
-        about, directories = zip(*((by_criterion[number], paths[number]) for number in chosen), strict=True)
-        return give(text, about, directories, point, jobs, partial(show_within, show, within))
+    def next_answer(text: str, chosen: slice) -> Answer:
+        """The answer to the next question, about these of the results; progress shows its own number."""
+        question = with_criterion(text, unsafe)
+        subjects = by_criterion if has_criterion(question, unsafe) else at_point
+        show_part = partial(show_within, show, f"question {next(numbers)} of {total}, {question.split()[0]}")
+        return answer_question(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
     with open_progress(progress) as show:
-        studies = [
-            ReportedStudy(
+        studies = []
+        for number, path in enumerate(paths):
+            study = ReportedStudy(
                 directory=path,
-                case=case,
+                case=by_criterion[number],
                 versions=read_manifest(path)["versions"],
-                answers=[answered(text, [number]) for text in texts],
+                answers=[next_answer(text, slice(number, number + 1)) for text in asked[number]],
                 point=point or "",
-                later_changes=changes,
+                later_changes=later_changes[number],
             )
-            for number, (path, case, changes, texts) in enumerate(
-                zip(paths, subjects, later_changes, asked, strict=True)
-            )
-        ]
-        shared = [answered(text, range(len(paths))) for text in joint]
+            studies.append(study)
+        shared = [next_answer(text, slice(None)) for text in joint]
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)
@@ -168,10 +166,14 @@ def usual_questions(case: Case, directory: Path, point: str | None = None, unsaf
         handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
     first, *later = USUAL_QUESTIONS
+    questions = [first]
     speeds = usual_values(case.study, SPEED_DIMENSION) if point is None and unsafe is None else []
-    by_speed = [f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}"] if speeds else []
-    promises = case.study.repair.promise or case.study.limits
-    return [first, *by_speed, *later, *(["repair"] if promises else [])]
+    if speeds:
+        questions.append(f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}")
+    questions += later
+    if case.study.repair.promise or case.study.limits:
+        questions.append("repair")
+    return questions
 
 
 def answer_to(
@@ -217,22 +219,18 @@ def make_page(
     progress: Progress = show_no_progress,
 ) -> str:
     """The page about studies, with answers and pictures about all of them."""
-    page = (
-        template_environment(TEMPLATE_FOLDER)
-        .get_template("report.html.j2")
-        .render(
-            title=f"Safety report: {', '.join(study.case.name for study in studies)}",
-            studies=[_study_parts(number, study, progress) for number, study in enumerate(studies, 1)],
-            shared=list(_sections("all", shared)),
-            pictures=pictures,
-            commands=[
-                *(command for study in studies for command in commands(study)),
-                *((f"The answer {answer.question}", answer.command) for answer in shared if answer.command),
-            ],
-            player=player_files(),
-            css=_web_file("report.css"),
-            js=_web_file("report.js"),
-        )
+    of_studies = chain(*map(commands, studies))
+    of_shared = [(f"The answer {answer.question}", answer.command) for answer in shared if answer.command]
+    template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
+    page = template.render(
+        title=f"Safety report: {', '.join(study.case.name for study in studies)}",
+        studies=[_study_parts(number, study, progress) for number, study in enumerate(studies, 1)],
+        shared=list(_sections("all", shared)),
+        pictures=pictures,
+        commands=[*of_studies, *of_shared],
+        player=player_files(),
+        css=_web_file("report.css"),
+        js=_web_file("report.js"),
     )
     return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
 
