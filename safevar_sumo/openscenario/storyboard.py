@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 
@@ -70,7 +71,14 @@ class Act:
 
 
 def _below(outer: Key, element: Element) -> Key:
+    """The key of an element within another one."""
     return element.tag.lower(), f"{outer[1]}::{attribute(element, 'name')}"
+
+
+def _stop_trigger(element: Element) -> Element | None:
+    """The StopTrigger of a storyboard or an act; None also for an empty one."""
+    stop = element.find("StopTrigger")
+    return stop if stop is not None and len(stop) else None
 
 
 class Player:
@@ -98,8 +106,9 @@ class Player:
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
         self.has_begun = False
+        """Whether Init is over."""
         self._changes = 0
-        """Whether Init is over; how many events have begun or ended."""
+        """How many events have begun or ended."""
         self.stop = math.inf
         self.seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
@@ -165,26 +174,27 @@ class Player:
                 outer = [key, group_key, act_key, story]
                 events += [Event(event, _below(key, event), outer, own) for event in maneuver.findall("Event")]
                 self._remark_repeats(group, maneuver)
-        found = Act(element, act_key, events)
-        self._refuse_reactions(found)
-        return found
+        act_of_story = Act(element, act_key, events)
+        self._refuse_reactions(act_of_story)
+        return act_of_story
 
     def _remark_repeats(self, group: Element, maneuver: Element) -> None:
         for one in (group, *maneuver.findall("Event")):
-            if (times := number(one, "maximumExecutionCount", 1)) > 1:
+            times = number(one, "maximumExecutionCount", 1)
+            if times > 1:
                 kind = "event" if one.tag == "Event" else "group"
                 self.remark(f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times")
 
     def _refuse_reactions(self, one: Act) -> None:
         """Refuse an act that moves somebody and an event that moves somebody, if only a run can begin them."""
         moving = [event.element for event in one.events if event.moves]
-        for element in (one.element, *moving) if moving else ():
+        if not moving:
+            return
+        for element in (one.element, *moving):
             for kind in watched(self, element.find("StartTrigger")):
                 if kind in REACTIONS:
-                    waits = (
-                        f"the {element.tag.lower()} {attribute(element, 'name')} waits for a {kind} of {self.ego.name}"
-                    )
-                    raise unsupported(f"{waits}, which only a run can tell")
+                    waiting = f"the {element.tag.lower()} {attribute(element, 'name')}"
+                    raise unsupported(f"{waiting} waits for a {kind} of {self.ego.name}, which only a run can tell")
 
     def initialise(self) -> None:
         """Class Init: places first, then speeds, then all others, as the order of the list is none in time."""
@@ -201,10 +211,11 @@ class Player:
             except InputError:
                 if leaf_of(action).tag != "TeleportAction" or waiting == 1:
                     raise
-                privates.insert(sum(leaf_of(one[1]).tag == "TeleportAction" for one in privates), (actor, action))
+                places_left = sum(leaf_of(other).tag == "TeleportAction" for _, other in privates)
+                privates.insert(places_left, (actor, action))
                 waiting -= 1
-                continue
-            waiting = len(privates)
+            else:
+                waiting = len(privates)
         for one in init:
             if one.tag != "Private":
                 act(self, one, [])
@@ -230,8 +241,8 @@ class Player:
             actor.note(self.sample)
 
     def _settle_act(self, one: Act, now: slice) -> None:
-        stop = one.element.find("StopTrigger")
-        is_stopped = stop is not None and len(stop) > 0 and bool(holds(self, stop, now)[0])
+        stop = _stop_trigger(one.element)
+        is_stopped = stop is not None and bool(holds(self, stop, now)[0])
         for event in one.events:
             if is_stopped and not event.has_ended:
                 self._cut(event)
@@ -239,7 +250,8 @@ class Player:
                 self._begin(event, one)
             if event.has_begun and not event.has_ended:
                 self._finish(event)
-        for key in dict.fromkeys(key for event in one.events for key in event.outer[:3]):
+        outer_keys = dict.fromkeys(chain(*(event.outer[:3] for event in one.events)))
+        for key in outer_keys:
             self.begun.setdefault(key, self.now)
             if all(event.has_ended for event in one.events if key in event.outer):
                 self.ended.setdefault(key, self.now)
@@ -249,11 +261,8 @@ class Player:
     def _begin(self, event: Event, one: Act) -> None:
         """Begin an event: `override` ends the others of its maneuver, `skip` waits for none."""
         priority = event.element.get("priority", "parallel")
-        others = [
-            other
-            for other in one.events
-            if other is not event and other.outer == event.outer and other.has_begun and not other.has_ended
-        ]
+        under_way = [other for other in one.events if other.has_begun and not other.has_ended]
+        others = [other for other in under_way if other is not event and other.outer == event.outer]
         event.has_begun = True
         self._changes += 1
         self.begun.setdefault(event.key, self.now)
@@ -278,7 +287,8 @@ class Player:
             self._end(event)
 
     def _end(self, event: Event) -> None:
-        event.has_begun = event.has_ended = True
+        event.has_begun = True
+        event.has_ended = True
         self._changes += 1
         self.begun.setdefault(event.key, self.now)
         self.ended.setdefault(event.key, self.now)
@@ -298,37 +308,33 @@ class Player:
 
     def _next(self, last: int) -> int:
         """The first sample up to the last of a block at which something may begin or end."""
-        ends = [
-            one.end for each in self.acts for event in each.events for all_ in event.running.values() for one in all_
-        ]
-        samples = [math.ceil((end - 1e-9) / STEP) for end in ends if self.now < end < math.inf]
-        last = min([last, *(sample for sample in samples if sample > self.sample)])
+        events = [event for one in self.acts for event in one.events]
+        running = chain(*(chain(*event.running.values()) for event in events))
+        ends = [math.ceil((one.end - 1e-9) / STEP) for one in running if self.now < one.end < math.inf]
+        last = min([last, *(sample for sample in ends if sample > self.sample)])
         window = slice(self.sample + 1, last + 1)
-        stop = self._board.find("StopTrigger")
-        triggers = [stop] if stop is not None and len(stop) and math.isinf(self.stop) else []
+        triggers = [_stop_trigger(self._board)] if math.isinf(self.stop) else []
         for one in self.acts:
             if not one.has_begun:
-                start = one.element.find("StartTrigger")
-                triggers += [] if start is None else [start]
+                triggers.append(one.element.find("StartTrigger"))
             elif not one.has_ended:
-                waiting = [event.element.find("StartTrigger") for event in one.events if not event.has_begun]
-                triggers += [trigger for trigger in waiting if trigger is not None]
-                end = one.element.find("StopTrigger")
-                triggers += [end] if end is not None and len(end) else []
+                triggers += [event.element.find("StartTrigger") for event in one.events if not event.has_begun]
+                triggers.append(_stop_trigger(one.element))
         for trigger in triggers:
-            found = holds(self, trigger, window)
-            if found.any():
-                last = min(last, window.start + int(np.argmax(found)))
+            if trigger is not None:
+                is_true = holds(self, trigger, window)
+                if is_true.any():
+                    last = min(last, window.start + int(np.argmax(is_true)))
         return last
 
     def play(self) -> None:
         """Play up to the end."""
         self.initialise()
-        stop = self._board.find("StopTrigger")
+        stop = _stop_trigger(self._board)
         final = len(self.times) - 1
         while True:
             self.settle()
-            is_asked = math.isinf(self.stop) and stop is not None and len(stop) > 0
+            is_asked = stop is not None and math.isinf(self.stop)
             if is_asked and holds(self, stop, slice(self.sample, self.sample + 1))[0]:
                 self.stop = self.now
                 final = min(final, self.sample + round(AFTER / STEP))
@@ -338,20 +344,23 @@ class Player:
             for actor in sorted(self.actors.values(), key=lambda one: one.follows is not None):
                 actor.move(self.sample, last, self.times)
             last = self._next(last)
-            if (end := self._road_end(last)) < last:
-                final = last = end
+            end = self._road_end(last)
+            if end < last:
+                last = end
+                final = end
             for actor in self.actors.values():
                 actor.arrive(last)
             self.sample = last
 
     def _road_end(self, last: int) -> int:
         """The last sample at which all actors are on their roads."""
-        found = last
+        end = last
         for name, actor in self.actors.items():
             path = actor.here.path
             if isinstance(path, Way):
-                beyond = actor.distance[self.sample + 1 : last + 1] > path.length + 1e-6
-                if beyond.any() and self.sample + int(np.argmax(beyond)) < found:
-                    found = self.sample + int(np.argmax(beyond))
-                    self.remark(f"the scene ends at {self.times[found]:.1f} s, when {name} is at the end of its road")
-        return found
+                is_beyond = actor.distance[self.sample + 1 : last + 1] > path.length + 1e-6
+                before = self.sample + int(np.argmax(is_beyond))
+                if is_beyond.any() and before < end:
+                    end = before
+                    self.remark(f"the scene ends at {self.times[end]:.1f} s, when {name} is at the end of its road")
+        return end

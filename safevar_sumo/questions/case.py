@@ -159,11 +159,13 @@ class Case:
     @property
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
-        done = Counter(algorithm for algorithm, _ in self.finished_runs)
+        finished = Counter(algorithm for algorithm, _ in self.finished_runs)
         planned = self.study.search.runs
         labels = self.study.search.labels if self.has_runs else ()
-        missing = ", ".join(f"{name} {done[name]} of {planned} runs" for name in labels if done[name] < planned)
-        return f"{self.name}: unfinished, {missing}; only solutions of finished runs count." if missing else ""
+        unfinished = [f"{name} {finished[name]} of {planned} runs" for name in labels if finished[name] < planned]
+        if not unfinished:
+            return ""
+        return f"{self.name}: unfinished, {', '.join(unfinished)}; only solutions of finished runs count."
 
     @property
     def remarks(self) -> list[str]:
@@ -244,9 +246,12 @@ def build_case(
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
-    solutions, evaluations = (
-        frame.assign(**{name: np.nan for name in columns if name not in frame}) for frame in (solutions, evaluations)
-    )
+
+    def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:
+        return frame.assign(**{name: np.nan for name in columns if name not in frame})
+
+    solutions = with_all_columns(solutions)
+    evaluations = with_all_columns(evaluations)
     if scoring.safe_original is not None:
         evaluations = evaluations.assign(feasible=scoring.feasible_rows(evaluations))
     return Case(

@@ -96,12 +96,11 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
 def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     """The error for an unknown key, with the nearest key of its own table, or of another table in the whole one."""
     own = [name for name in kind.__struct_fields__ if name != NO_KEY]
-    places = {
-        inner: f"{field.name}.{inner}"
-        for field in msgspec.structs.fields(table)
-        if field.name != NO_KEY
-        for inner in getattr(field.type, "__struct_fields__", ())
-    } | {name: name for name in own}
+    places = dict[str, str]()
+    for field in msgspec.structs.fields(table):
+        if field.name != NO_KEY:
+            places |= {inner: f"{field.name}.{inner}" for inner in getattr(field.type, "__struct_fields__", ())}
+    places |= {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
     return InputError("", f"{path}: there is no such key{hint}", one_of(own))
@@ -113,17 +112,16 @@ def _meant(kind: Any, value: Any) -> Any:
         return _meant(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    kinds = [
-        one
-        for one in get_args(kind)
-        if one is not NoneType and (_is_record(one) or get_origin(one) is dict) == isinstance(value, dict)
-    ]
-    tagged = [
-        one
-        for one in kinds
-        if _is_record(one) and value.get(one.__struct_config__.tag_field or "") == one.__struct_config__.tag
-    ]
-    return next(iter(tagged or kinds), kind)
+    kinds = [one for one in get_args(kind) if one is not NoneType and _is_table(one) == isinstance(value, dict)]
+    for one in filter(_is_record, kinds):
+        config = one.__struct_config__
+        if value.get(config.tag_field or "") == config.tag:
+            return one
+    return next(iter(kinds), kind)
+
+
+def _is_table(kind: Any) -> bool:
+    return _is_record(kind) or get_origin(kind) is dict
 
 
 def _is_record(kind: Any) -> bool:

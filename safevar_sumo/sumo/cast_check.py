@@ -91,10 +91,15 @@ def check_start(cast: Sequence[Track], own: Body) -> None:
     bodies = {f"actor {track.name!r}": _first(track) for track in cast if track.kind != SCREEN}
     for (name, body), (other_name, other) in combinations({**bodies, "the vehicle under test": own}.items(), 2):
         n = max(len(body.speed), len(other.speed))
-        pair = (Body._make(np.broadcast_to(column, (n, *column.shape[1:])) for column in one) for one in (body, other))
-        if (depth := find_overlaps(*pair).max()) > TOUCH:
+        depth = find_overlaps(_repeated(body, n), _repeated(other, n)).max()
+        if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
             raise InputError("", f"{CAST_KEY}: {problem}", "bodies that do not overlap at the start")
+
+
+def _repeated(body: Body, n: int) -> Body:
+    """A body of all encounters in columns of N encounters."""
+    return Body._make(np.broadcast_to(column, (n, *column.shape[1:])) for column in body)
 
 
 def _first(track: Track) -> Body:
