@@ -270,6 +270,16 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     assert asked["out"] == "its results-again"
 
 
+@pytest.mark.slow
+def test_on_a_page_about_two_studies_each_is_headed_by_its_name_as_titles_may_be_equal(
+    slippery: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(slippery, tmp_path / "copy")
+    page = page_of(slippery, tmp_path / "copy", ask=["rules --samples 20"], jobs=1)
+    title = read_manifest(slippery)["study"]["title"]
+    assert re.findall(r'<h2 id="study-\d">([^<]*)</h2>', page) == [f"slippery: {title}"] * 2
+
+
 def test_a_picture_on_a_page_has_all_digits_of_its_texts() -> None:
     figure, ((axis,),) = new_figure("rules", 1, 1, (3, 2))
     axis.set_yticks([0.123456], ["brakeResponse above 0.226 s"])
