@@ -274,10 +274,12 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
 def test_on_a_page_about_two_studies_each_is_headed_by_its_name_as_titles_may_be_equal(
     slippery: Path, tmp_path: Path
 ) -> None:
-    shutil.copytree(slippery, tmp_path / "copy")
-    page = page_of(slippery, tmp_path / "copy", ask=["rules --samples 20"], jobs=1)
+    copy = tmp_path / "copy"
+    shutil.copytree(slippery, copy)
+    page = page_of(slippery, copy, ask=["rules --samples 20"], jobs=1)
     title = read_manifest(slippery)["study"]["title"]
-    assert re.findall(r'<h2 id="study-\d">([^<]*)</h2>', page) == [f"slippery: {title}"] * 2
+    heads = [f"slippery ({place}): {title}" for place in (slippery, copy)]
+    assert re.findall(r'<h2 id="study-\d">([^<]*)</h2>', page) == heads
 
 
 def test_a_picture_on_a_page_has_all_digits_of_its_texts() -> None:
