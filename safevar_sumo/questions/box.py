@@ -36,7 +36,7 @@ class Box:
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which settings are in the box, shape (M,)."""
         is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
-        return np.asarray(is_within & self.region.feasible(settings))
+        return is_within & self.region.feasible(settings)
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""

@@ -68,7 +68,7 @@ class Model(NamedTuple):
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
-        return np.asarray(self.left(settings, stage) < 0)
+        return self.left(settings, stage) < 0
 
     def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
         """The model at the points of the study's matrix at which settings are worst; without a matrix, and in a study

@@ -122,7 +122,7 @@ def _rotated(track: Track) -> BoolArray:
 
 def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:
     """The least or largest value of a column from each sample on."""
-    return np.asarray(ufunc.accumulate(column[::-1], axis=0)[::-1])
+    return ufunc.accumulate(column[::-1], axis=0)[::-1]
 
 
 def slim(column: Column) -> Column:

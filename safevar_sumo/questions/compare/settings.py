@@ -64,7 +64,7 @@ class Pairs(NamedTuple):
     @property
     def are_valid(self) -> BoolArray:
         """Which could be simulated in both systems, shape (M,)."""
-        return np.asarray(self.runs[0].valid & self.runs[1].valid)
+        return self.runs[0].valid & self.runs[1].valid
 
     @property
     def number_infeasible(self) -> int:

@@ -148,7 +148,7 @@ def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
     if "feasible" not in evaluations or not {*names} <= {*evaluations}:
         return np.zeros((0, len(names)))
     rows = evaluations[~evaluations["feasible"].to_numpy(dtype=bool) & unsafe.rows(evaluations)]
-    return np.asarray(rows[names].drop_duplicates().to_numpy(dtype=float))
+    return rows[names].drop_duplicates().to_numpy(dtype=float)
 
 
 class Chosen(NamedTuple):
