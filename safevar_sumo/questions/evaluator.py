@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -38,13 +38,41 @@ CANDIDATES = 512
 """Number of encounters over its domain from which they are chosen."""
 
 
-class _Call(NamedTuple):
-    """Progress of a call within a stage: its own stage, what was done when it began, what is done, and its total."""
+class _Stage:
+    """Progress of a stage over several calls: `earlier` settings are done, and about `total` are expected.
 
-    stage: str
-    first: int
-    done: int
-    of: int
+    A call shows a stage of its own; where that begins again, its count may go on.
+    """
+
+    def __init__(self, show: Progress, name: str, earlier: int, total: int | None) -> None:
+        self._show = show
+        self._name = name
+        self._total = None if total is None else earlier + total
+        self._before_call = earlier
+        self._call = ""
+        self._call_total = 0
+        self._done_at_first = 0
+        self.done = earlier
+        show(name, earlier, self._total or 0)
+
+    def show_part(self, call: str, done: int, total: int) -> None:
+        """Show the progress of a call; where its count falls, or its own stage is another, it is the next call."""
+        if call == COMPILING:
+            self._show(call, done, total)
+            return
+        done_in_call = self._done_at_first + self.done - self._before_call
+        if call != self._call or not done or done < done_in_call:
+            self._before_call = self.done
+            self._call = call
+            self._done_at_first = done
+            self._call_total = total
+        self.done = self._before_call + done - self._done_at_first
+        of_all_calls = self._before_call + total - self._done_at_first
+        self._show(self._name, self.done, 0 if self._total is None else max(self._total, of_all_calls))
+
+    def expect(self, left: int) -> None:
+        """Expect so many settings after the call under way."""
+        self._total = self._before_call + self._call_total - self._done_at_first + left
 
 
 class Evaluator:
@@ -117,34 +145,13 @@ class Evaluator:
         left.
         """
         show = self.progress
-        earlier = self._counts.get(name, 0)
-        """Settings of the calls before the one under way, and of the same stage before this one."""
-        call = _Call("", 0, 0, 0)
-        if total is not None:
-            total += earlier
-
-        def show_part(stage: str, done: int, of: int) -> None:
-            nonlocal earlier, call
-            if stage == COMPILING:
-                show(stage, done, of)
-                return
-            if stage != call.stage or not done or done < call.done:
-                earlier += call.done - call.first
-                call = _Call(stage, done, done, of)
-            call = call._replace(done=done)
-            show(name, earlier + done - call.first, 0 if total is None else max(total, earlier + of - call.first))
-
-        def expect(left: int) -> None:
-            nonlocal total
-            total = earlier + call.of - call.first + left
-
-        show(name, earlier, total or 0)
-        self.progress = show_part
+        stage = _Stage(show, name, self._counts.get(name, 0), total)
+        self.progress = stage.show_part
         try:
-            yield expect
+            yield stage.expect
         finally:
             self.progress = show
-            self._counts[name] = earlier + call.done - call.first
+            self._counts[name] = stage.done
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.

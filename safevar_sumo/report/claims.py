@@ -239,7 +239,8 @@ def compare(study: str, claim: Claim) -> tuple[str, ...]:
         return study, claim.name, CANNOT, "", " ".join(str(error).split())
     if claim.packed == here:
         return study, claim.name, SAME, "", ""
-    lines, lines_here = (content.decode().splitlines(keepends=True) for content in (claim.packed, here))
+    lines = claim.packed.decode().splitlines(keepends=True)
+    lines_here = here.decode().splitlines(keepends=True)
     pairs = zip_longest(lines, lines_here, fillvalue="nothing")
     first, second = next((_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1)
     same = next(index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1)

@@ -96,7 +96,8 @@ class Frame(NamedTuple):
             If the other lane does not cross it at right angles.
         """
         crossing = roads.lane(lane)
-        start, end = (self.lane_coordinates(point)[0] for point in (crossing.start, crossing.end))
+        start = self.lane_coordinates(crossing.start)[0]
+        end = self.lane_coordinates(crossing.end)[0]
         if abs(end - start) > MAX_SKEW:
             problem = f"lane {lane!r} leads {abs(end - start):.2f} m along the road"
             raise InputError(NETWORK_KEY, problem, "a crossing at right angles")

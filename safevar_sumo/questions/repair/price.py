@@ -32,7 +32,8 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
     onsets_today, _ = drive_new_cars(today, encounters)
     onsets, deceleration = drive_new_cars(changed, encounters)
     benign = benign_scenes(study, today)
-    before, after = (needless_braking(system, benign) for system in (today, changed))
+    before = needless_braking(today, benign)
+    after = needless_braking(changed, benign)
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
     most = int(braked[np.argmax(metres[braked])]) if len(braked) else None
