@@ -88,7 +88,8 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
     rows = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
-    frame = pd.DataFrame(rows, columns=[*COLUMNS]).sort_values("coverage", ascending=False, kind="stable")
+    frame = pd.DataFrame(rows, columns=[*COLUMNS])
+    frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
     table = tabulate("Where failures lie", COLUMNS, frame)
     low, high = clopper_pearson(failures, total)
     drawn = "drawn as [variation] says" if study.variation or study.correlations else "over the whole domain"
@@ -146,10 +147,8 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
     leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
-    densest = max(density for _, density in leaves)
-    dense_boxes = [box for box, density in leaves if density > 0.5]
-    if not dense_boxes:
-        dense_boxes = [box for box, density in leaves if density == densest][:1]
+    densest, _ = max(leaves, key=lambda leaf: leaf[1])
+    dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
     rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
