@@ -2,17 +2,17 @@
 
 The first counterexamples are corners and Sobol points of the promise, without vehicles that no driving system survives.
 The smallest changes that survive them (`smallest`) are attacked and proved (`attack`); what breaks one is a new
-counterexample. Today's driving system is the change of no parameter.
+counterexample (`survivors`). Today's driving system is the change of no parameter.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import pandas as pd
@@ -29,10 +29,10 @@ from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
-from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE, find_failures, prove_change
+from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
-from safevar_sumo.questions.repair.smallest import Search
+from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -45,14 +45,10 @@ if TYPE_CHECKING:
 
 SOBOL_VEHICLES = 256
 """Sobol points of the promise among the first counterexamples, and corners: the same points rounded."""
-MAX_ROUNDS = 30
-"""Largest number of rounds of attacks."""
 CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
 SHOWN_LIMITS = 3
 """Number of limits of full braking that the verdict names."""
-JOINING_VEHICLES = 64
-"""Number of the worst known vehicles that a change must survive with a fit in which it failed."""
 REPAIRS = {
     "parameters": Column("", "the parameters that change, with their new values", ".10g", is_shown=False),
     "change": Column("", "what changes, in words"),
@@ -149,24 +145,13 @@ def repair(
     survivors = Survivors([], len(problems), ())
     worst = vehicles[0]
     if is_repairable.any():
-        survivors = _find_survivors(problems, vehicles[is_repairable])
+        survivors = find_survivors(problems, vehicles[is_repairable])
         worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
     answer = _answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
-
-
-class Survivors(NamedTuple):
-    """The smallest changes that survive everything, each with its proof; none if no change does.
-
-    They hold in `fits` fits, and not in those with the numbers `broken`.
-    """
-
-    changes: list[tuple[FloatArray, Proof]]
-    fits: int
-    broken: tuple[int, ...]
 
 
 def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray:
@@ -180,57 +165,6 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
         settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
     rows = np.unique(np.concatenate(settings), axis=0)
     return rows[problem.holds(rows)]
-
-
-def _find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
-    """The smallest changes that survive in all fits; where none does, those of the study's own fit, and the fits in
-    which an attack breaks one of them.
-    """
-    changes = _survivors_in(problems, vehicles)
-    if changes or len(problems) == 1:
-        return Survivors(changes, len(problems), ())
-    changes = _survivors_in(problems[:1], vehicles)
-
-    def breaks_one(problem: RepairProblem) -> bool:
-        return any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
-
-    broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
-    return Survivors(changes, len(problems) - len(broken), broken)
-
-
-def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
-    """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
-    search = Search(problems, vehicles)
-    proofs = dict[bytes, Proof]()
-    attacks = 0
-    failed_proofs = 0
-    for _ in range(MAX_ROUNDS):
-        with problems[0].evaluator.stage(SEARCH_STAGE):
-            changes = search.smallest_changes()
-        unproved = [change for change in changes if change.tobytes() not in proofs]
-        if not unproved:
-            return [(change, proofs[change.tobytes()]) for change in changes]
-        for change in unproved:
-            attacks += 1
-            failures = find_failures(problems, change, search.settings, attacks)
-            if not failures:
-                proof, failures = prove_change(problems, change, attacks, failed_proofs)
-                if failures:
-                    failed_proofs += 1
-                else:
-                    proofs[change.tobytes()] = proof
-            for number, settings in failures.items():
-                if number not in search.settings_of:
-                    search.add(number, _worst_with_fit(problems[number], vehicles))
-                search.add(number, settings)
-    return []
-
-
-def _worst_with_fit(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
-    """The worst of known vehicles, shape (L, n), that count with another fit."""
-    worst = vehicles[:JOINING_VEHICLES]
-    promised = worst[problem.holds(worst)]
-    return promised[problem.repairable(promised)]
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:

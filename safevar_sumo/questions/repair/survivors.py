@@ -1,0 +1,79 @@
+"""Search, attack and prove in turns: the smallest changes that survive everything, and in which fits of the vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from safevar_sumo.questions.box import Proof
+from safevar_sumo.questions.repair.attack import SEARCH_STAGE, find_failures, prove_change
+from safevar_sumo.questions.repair.problem import RepairProblem
+from safevar_sumo.questions.repair.smallest import Search
+from safevar_sumo.records import FloatArray
+
+MAX_ROUNDS = 30
+"""Largest number of rounds of attacks."""
+JOINING_VEHICLES = 64
+"""Number of the worst known vehicles that a change must survive with a fit in which it failed."""
+
+
+class Survivors(NamedTuple):
+    """The smallest changes that survive everything, each with its proof; none if no change does.
+
+    They hold in `fits` fits, and not in those with the numbers `broken`.
+    """
+
+    changes: list[tuple[FloatArray, Proof]]
+    fits: int
+    broken: tuple[int, ...]
+
+
+def find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
+    """The smallest changes that survive in all fits; where none does, those of the study's own fit, and the fits in
+    which an attack breaks one of them.
+    """
+    changes = _survivors_in(problems, vehicles)
+    if changes or len(problems) == 1:
+        return Survivors(changes, len(problems), ())
+    changes = _survivors_in(problems[:1], vehicles)
+
+    def breaks_one(problem: RepairProblem) -> bool:
+        return any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
+
+    broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
+    return Survivors(changes, len(problems) - len(broken), broken)
+
+
+def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
+    """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
+    search = Search(problems, vehicles)
+    proofs = dict[bytes, Proof]()
+    attacks = 0
+    failed_proofs = 0
+    for _ in range(MAX_ROUNDS):
+        with problems[0].evaluator.stage(SEARCH_STAGE):
+            changes = search.smallest_changes()
+        unproved = [change for change in changes if change.tobytes() not in proofs]
+        if not unproved:
+            return [(change, proofs[change.tobytes()]) for change in changes]
+        for change in unproved:
+            attacks += 1
+            failures = find_failures(problems, change, search.settings, attacks)
+            if not failures:
+                proof, failures = prove_change(problems, change, attacks, failed_proofs)
+                if failures:
+                    failed_proofs += 1
+                else:
+                    proofs[change.tobytes()] = proof
+            for number, settings in failures.items():
+                if number not in search.settings_of:
+                    search.add(number, _worst_with_fit(problems[number], vehicles))
+                search.add(number, settings)
+    return []
+
+
+def _worst_with_fit(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
+    """The worst of known vehicles, shape (L, n), that count with another fit."""
+    worst = vehicles[:JOINING_VEHICLES]
+    promised = worst[problem.holds(worst)]
+    return promised[problem.repairable(promised)]
