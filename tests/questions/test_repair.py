@@ -19,7 +19,7 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
-from safevar_sumo.questions.repair import attack, full_braking, smallest, write_repair
+from safevar_sumo.questions.repair import attack, full_braking, smallest, survivors, write_repair
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.questions.repair.problem import Parameter, Promise, RepairProblem
 from safevar_sumo.records import FloatArray, differences
@@ -291,8 +291,8 @@ def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
 def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
-    monkeypatch.setattr(question, "find_failures", lambda *_: {})
-    monkeypatch.setattr(question, "prove_change", lambda *_: (attack.Proof(5, 0, 0.45, 0), {}))
+    monkeypatch.setattr(survivors, "find_failures", lambda *_: {})
+    monkeypatch.setattr(survivors, "prove_change", lambda *_: (attack.Proof(5, 0, 0.45, 0), {}))
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     worst = kept.numbers["worst_today"]
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
