@@ -171,11 +171,11 @@ def _drive_both(
     there = theirs.take(range(len(both)))
     frame = table_of_pairs(names, ours, there, unsafe.of(ours), unsafe.of(there))
     fails_scaled = unsafe.of(theirs)[len(both) :].reshape(len(settings), -1)
-    endings = [_endings_in_words(frame, side, system.contact) for side in SIDES]
+    endings = [_endings_of(frame, side, system.contact) for side in SIDES]
     return frame, _Runs(settings, ours, theirs, fails_scaled, *endings)
 
 
-def _endings_in_words(frame: pd.DataFrame, side: str, contact: float) -> list[str]:
+def _endings_of(frame: pd.DataFrame, side: str, contact: float) -> list[str]:
     """How each row of a frame with `SETTING_COLUMNS` ends on a side."""
     ends = zip(frame[f"{side}_outcome"], frame[f"{side}_degree"], strict=True)
     return [ending_in_words(outcome, degree, contact) for outcome, degree in ends]
