@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
@@ -34,7 +36,7 @@ from safevar_sumo.questions.words import (
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
-from safevar_sumo.sumo import settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import assemble, evaluate, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import show_no_progress
@@ -154,7 +156,8 @@ def study(
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
-    following = ", ".join(question_command(name, str(directory)) for name in ("explain", "tolerance"))
+    criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
+    following = ", ".join(question_command(name, str(directory)) + criterion for name in ("explain", "tolerance"))
     verdict = f"{reason or _verdict(results, case, system)} Next: {following}"
     return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
@@ -199,10 +202,10 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
 def _verdict(results: Results, case: Case, system: System) -> str:
     """How many solutions of a case of the results are unsafe, and how little is enough."""
     names = list(system.characteristics.names)
-    original = results.original
-    if original["collision"] and not system.rater and not system.characteristics.scenario:
-        words = ending_in_words(original["outcome"], original[SAFETY_DEGREE], system.contact)
-        return f"The original vehicle itself {words}: no change is needed."
+    if not system.rater and not system.characteristics.scenario:
+        original = evaluate(assemble(case.study), system.characteristics.original[np.newaxis])
+        if case.unsafe.of(original)[0]:
+            return f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is needed."
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
         return "No solution."
