@@ -258,7 +258,7 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
     sentence = f"he original vehicle itself collides at {speed:.2f} m/s: no change is needed"
     assert f"t{sentence}" in searched.stderr
     assert json.loads(searched.stdout)["verdict"].startswith(f"T{sentence}.")
-    demanded = run("study", "late.toml", "--runs", "1", "--evaluations", "10", "--json", "--unsafe", "ave_dece >= 2")
+    demanded = run("study", "smoke", "--runs", "1", "--evaluations", "10", "--json", "--unsafe", "ave_dece >= 2")
     verdict = json.loads(demanded.stdout)["verdict"]
     assert verdict.startswith("The original vehicle itself has ave_dece ")
-    assert verdict.endswith("tolerance results/late --unsafe 'ave_dece >= 2'")
+    assert verdict.endswith("tolerance results/smoke --unsafe 'ave_dece >= 2'")
