@@ -11,20 +11,24 @@ import numpy as np
 import pytest
 
 from safevar_sumo import explain, tolerance
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.attack import Attack, attack, attack_all
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
-from safevar_sumo.questions.tolerance.levels_together import _nested
+from safevar_sumo.questions.tolerance.search import BoxSearch
+from safevar_sumo.questions.tolerance.settlement import Settlement
+from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_promises
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import ROOT, InlinePool, files_of, refused, run
-from tests.questions.conftest import box_of, made_up_study, nowhere
+from tests.questions.conftest import made_up_study
 
 SEARCHED = """
 extends = "wear"
@@ -239,17 +243,83 @@ def test_the_page_on_an_occurrence_says_what_explain_says(tmp_path: Path) -> Non
     assert found.numbers["original_outcome"] == "stopped"
 
 
-def test_limits_together_that_are_cut_have_no_attack_and_no_proof_of_their_own() -> None:
-    """Up to a faster speed the box was found wider in one characteristic than up to the slower one."""
-    found = box_of(2, nowhere, {})
-    assert found.attack is not None
-    assert found.proof is not None
-    region = region_of(made_up_study(2))
-    boxes = [Box(region, np.zeros(2), np.array(upper)) for upper in ([8.0, 9.0], [6.0, 7.0], [7.0, 5.0])]
-    nested = [each for each in _nested([found._replace(box=box) for box in boxes]) if each is not None]
-    assert [each.box and each.box.upper.tolist() for each in nested] == [[8, 9], [6, 7], [6, 5]]
-    assert [each.attack is None for each in nested] == [False, False, True]
-    assert [each.proof is None for each in nested] == [False, False, True]
+def test_a_box_that_is_cut_keeps_the_box_up_to_the_value_above_until_that_fails() -> None:
+    """Of the two limits that could move in before a failure, that which the inner box needs stays, though it would cost
+    less; a failure within the inner box moves a limit of it.
+    """
+    study = made_up_study(2)
+    region = region_of(study)
+    model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    search = BoxSearch(model, [0, 1], {}, np.array([[9.0, 9.5]]))
+    whole = Box(region, np.array([0.0, 0.0]), np.array([10.0, 10.0]))
+    inner = Box(region, np.array([4.0, 4.0]), np.array([6.0, 9.8]))
+    assert Settlement(search).cut(whole).upper.tolist() == pytest.approx([10, 9.4], abs=0.1)
+    settlement = Settlement(search, inner)
+    assert settlement.cut(whole).upper.tolist() == pytest.approx([8.9, 10], abs=0.1)
+    search.unsafe_settings = np.array([[5.5, 9.0]])
+    cut = settlement.cut(whole)
+    assert not cut.holds(search.unsafe_settings).any()
+    assert (cut.upper < inner.upper).any()
+
+
+@pytest.mark.slow
+def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its_margin() -> None:
+    study = load_study("wear_joint")
+    evaluator = Evaluator(study, InlinePool(), verified=0)
+    members = evaluator.characteristics
+    lower = np.where(members.of_vehicle, members.original, members.lower)
+    upper = np.where(members.of_vehicle, members.original, members.upper)
+    model = Model(0, evaluator, Unsafe(keep=0.1))
+    new_car = Box(evaluator.region, lower, upper)
+    worn = Box(evaluator.region, np.where(members.of_vehicle, members.lower, lower), upper)
+    left = model.left(new_car.draw(16, np.random.default_rng(5)), "new car")
+    assert left.min() >= study.scenario.margin - 0.1
+    assert broken_promises(new_car, [model]) == {}
+    assert evaluator.simulated == 16
+    assert not _keeps_its_margin(worn, model)
+    assert not _keeps_its_margin(new_car, model._replace(unsafe=Unsafe(keep=study.scenario.margin + 0.1)))
+
+
+@pytest.fixture(scope="module")
+def together(searched: Study) -> Answer:
+    names = ("brakeTorque,sensorLatency",)
+    return tolerance(searched, by="speed=30,60", fits=2, attack=500, jobs=2, characteristics=names, together=True)
+
+
+@pytest.mark.slow
+def test_no_car_within_limits_together_is_unsafe_up_to_their_speed(searched: Study, together: Answer) -> None:
+    """200 cars a speed, a quarter of them at corners of the box."""
+    characteristics = CharacteristicSet.of(searched)
+    rng = np.random.default_rng(7)
+    names = list(characteristics.names)
+    for speed in (30, 60):
+        rows = [row for row in rows_of(together) if row["by_speed"] == speed]
+        settings = np.tile(characteristics.original, (200, 1))
+        for item in characteristics.scenario:
+            settings[:, names.index(item.name)] = rng.uniform(item.lower, item.upper, 200)
+        settings[:, names.index("speed")] = rng.uniform(10, speed, 200)
+        settings[::2, names.index("speed")] = rng.uniform(speed - 5, speed, 100)
+        for row in rows:
+            ends = [row["together_low"], row["together_high"]]
+            drawn = rng.uniform(ends[0], ends[1], 200)
+            drawn[:50] = rng.choice(ends, 50)
+            settings[:, names.index(row["characteristic"])] = drawn
+        assert not unsafe_cars(searched, together.numbers["margin"], settings).any(), rows
+    assert together.numbers["boxes"] == 2
+    assert together.numbers["attacked"] == 500
+
+
+@pytest.mark.slow
+def test_limits_together_are_wider_up_to_a_slower_speed_and_within_those_alone(together: Answer) -> None:
+    has_room = False
+    for _, rows in itertools.groupby(rows_of(together), key=lambda row: row["characteristic"]):
+        slower, faster = rows
+        has_room |= slower["together_low"] < faster["together_low"] or slower["together_high"] > faster["together_high"]
+        assert slower["together_low"] <= faster["together_low"]
+        assert slower["together_high"] >= faster["together_high"]
+        for row in (slower, faster):
+            assert row["alone_low"] <= row["together_low"] <= row["together_high"] <= row["alone_high"]
+    assert has_room
 
 
 def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> None:

@@ -50,6 +50,8 @@ class Level(NamedTuple):
         The limits of each characteristic alone; None where the original itself is unsafe, or safe in no encounter.
     models
         The fits in which they hold.
+    search
+        The search for the limits alone; None without such limits.
     failures
         How the specified limits fail up to the value; None where they hold, or none is specified.
     attack
@@ -61,6 +63,7 @@ class Level(NamedTuple):
     value: float
     alone: list[AloneLimit] | None
     models: Models
+    search: AloneSearch | None = None
     failures: list[tuple[Model, FloatArray]] | None = None
     attack: Attack | None = None
     together: LimitsTogether | None = None
@@ -126,13 +129,13 @@ class LevelSearch:
         search.run(self.budget)
         alone = search.limits()
         if before is not None and before.alone is not None:
-            alone = [_after(each, earlier) for each, earlier in zip(alone, before.alone, strict=True)]
+            alone = [nested_limit(each, earlier) for each, earlier in zip(alone, before.alone, strict=True)]
         if not self.limits:
-            return Level(value, alone, models)
+            return Level(value, alone, models, search)
         if before is not None and before.failures:
-            return before._replace(value=value, alone=alone, models=models)
+            return before._replace(value=value, alone=alone, models=models, search=search)
         found, failures = self._attack(self._promise(own), judges, self.budget, 0)
-        return Level(value, alone, models, failures, found)
+        return Level(value, alone, models, search, failures, found)
 
     def models(self, low: float | None, high: float) -> Models | None:
         """The fits between two values; None if no test of a matrix drives there."""
@@ -160,6 +163,11 @@ class LevelSearch:
             with_points_between(model, self.unsafe, np.random.default_rng((seed, 5, 0)), cells)[0]
             for model in models.members
         ]
+
+    def up_to(self, value: float, settings: FloatArray) -> FloatArray:
+        """Those of M settings, shape (M, n), whose encounter is up to a value of the searched parameter."""
+        column = self.evaluator.characteristics.names.index(self.by.name)
+        return np.asarray(settings[settings[:, column] <= value])
 
     def _inside(self, known: FloatArray, evaluator: Evaluator) -> FloatArray:
         """Known failures in encounters between two values."""
@@ -233,12 +241,15 @@ class LevelSearch:
         return last
 
 
-def _after(limit: AloneLimit, before: AloneLimit) -> AloneLimit:
-    """A limit up to a value; where it is that up to the value below, what is beyond that one is beyond it, too."""
+def nested_limit(limit: AloneLimit, before: AloneLimit) -> AloneLimit:
+    """A limit up to a value, within that up to the value below; where both are the same, what is beyond that one is
+    beyond it, too.
+    """
     assert limit.safe is not None
     assert before.safe is not None
+    ends = [max(limit.safe[0], before.safe[0]), min(limit.safe[1], before.safe[1])]
     beyond = list[Beyond]()
     for side in (0, 1):
-        is_same = limit.safe[side] == before.safe[side] and limit.beyond[side] is None
-        beyond.append(before.beyond[side] if is_same else limit.beyond[side])
-    return limit._replace(beyond=(beyond[0], beyond[1]))
+        is_before = ends[side] == before.safe[side] and (ends[side] != limit.safe[side] or limit.beyond[side] is None)
+        beyond.append(before.beyond[side] if is_before else limit.beyond[side])
+    return limit._replace(safe=(ends[0], ends[1]), beyond=(beyond[0], beyond[1]))

@@ -208,7 +208,7 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
     fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
     failure = failure_in_words(unsafe, len(members))
     yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {failure}."
-    yield _tried(search)
+    yield _tried(search, is_together=any(level.together is not None for level in levels))
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
         yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
@@ -217,7 +217,7 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
         yield f"No limits together were found up to {join_phrases(without)}{unit_text(by.unit)}."
 
 
-def _tried(search: LevelSearch) -> str:
+def _tried(search: LevelSearch, *, is_together: bool) -> str:
     """What was driven beside scans."""
     if not search.budget:
         return "Not attacked."
@@ -226,6 +226,8 @@ def _tried(search: LevelSearch) -> str:
         texts = [f"{round(ATTACK_SHARE * search.budget):,} aimed at each limit between two values"]
     if search.limits:
         texts.append(f"{search.budget:,} aimed at the specified limits")
+    if is_together:
+        texts.append(f"{search.budget:,} aimed at each of the limits together")
     return f"Tried beside scans: {join_phrases(texts)}."
 
 

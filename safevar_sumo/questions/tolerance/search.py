@@ -362,15 +362,15 @@ class BoxSearch(BoxGeometry):
         settings[:, column] = (box.lower, box.upper)[side][column]
         return settings
 
-    def best(self, start: FloatArray) -> FloatArray | None:
-        """The largest box within `start` in which no search finds anything unsafe, widened as far as it can be; None if
-        every search finds something.
+    def best(self, start: FloatArray, *, widen: bool = True) -> FloatArray | None:
+        """The largest box within `start` in which no search finds anything unsafe, unless told otherwise widened as far
+        as it can be; None if every search finds something.
         """
         sides = start
         for _ in range(MAX_ATTEMPTS):
             sides = self.largest(sides, start)
             found = self.failures_in(sides)
-            if not len(found):
+            if not len(found) and widen:
                 sides = self.widened(sides)
                 found = self.failures_in(sides)
             if not len(found):

@@ -26,10 +26,19 @@ KNOWN_CORNERS = 32
 
 
 class Settlement:
-    """Moves limits as far as they can go, one at a time."""
+    """Moves limits as far as they can go, one at a time, and in no further than to an inner box that is known to hold.
 
-    def __init__(self, search: BoxSearch) -> None:
+    Attributes
+    ----------
+    least
+        The sides of that box, shape (2, n); 0 without one.
+    """
+
+    def __init__(self, search: BoxSearch, inner: Box | None = None) -> None:
         self.search = search
+        self.least = np.zeros_like(search.domain)
+        if inner is not None:
+            self.least = np.where(search.is_free, search.sides_of(inner), self.least)
 
     def of(self, box: Box) -> Box:
         """A box of which no limit can move out alone without meeting something unsafe."""
@@ -94,20 +103,24 @@ class Settlement:
 
     def cut(self, box: Box) -> Box:
         """A box without its known failures: for each, that limit moves in which loses the least volume, by somewhat
-        more than it needs to.
+        more than it needs to. A failure within the inner box refutes that one.
         """
         search = self.search
         while len(inside := search.unsafe_inside(search.sides_of(box))):
             sides = search.sides_of(box)
             extents = search.extents(inside[:1])[0]
             choices = list[FloatArray]()
-            for side, column in np.argwhere(search.is_free & (extents > 0)).tolist():
+            for side, column in np.argwhere(search.is_free & (extents > self.least)).tolist():
                 shorter = sides.copy()
-                shorter[side, column] = max(extents[side, column] - CLEARANCE * LEAST_MOVE * search.width[column], 0.0)
+                end = extents[side, column] - CLEARANCE * LEAST_MOVE * search.width[column]
+                shorter[side, column] = max(end, self.least[side, column])
                 choices.append(shorter)
-            if not choices:
+            if choices:
+                box = search.printed(max(choices, key=search.log_volume))
+            elif self.least.any():
+                self.least = np.zeros_like(self.least)
+            else:
                 return search.printed(search.fixed)
-            box = search.printed(max(choices, key=search.log_volume))
         return box
 
     def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:

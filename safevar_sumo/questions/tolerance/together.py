@@ -97,12 +97,24 @@ def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArr
         [promise.corners(seed, 0)[:MAX_CORNERS], promise.spread_and_corners(PROMISE_POINTS, seed)]
     )
     settings = np.unique(settings, axis=0)
+    models = [model for model in models if not _keeps_its_margin(promise, model)]
     broken = dict[int, FloatArray]()
     for model in models:
         left = model.left(settings, "specified limits with each fit")
         if left.min() < 0:
             broken[model.fit] = settings[np.argmin(left)]
     return broken
+
+
+def _keeps_its_margin(promise: Box, model: Model) -> bool:
+    """Whether a promise is the original vehicle, in a study whose encounters count where that keeps a margin, and
+    nothing but less than it would be unsafe: then no encounter that counts can break it.
+    """
+    members = model.evaluator.characteristics
+    is_original = (promise.lower == members.original) & (promise.upper == members.original)
+    if not len(members.scenario) or not is_original[members.of_vehicle].all():
+        return False
+    return model.unsafe.is_collision and model.unsafe.keep <= model.evaluator.study.scenario.margin
 
 
 def find_limits_together(
@@ -112,10 +124,9 @@ def find_limits_together(
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
     budget: int,
-    inner: Box | None = None,
 ) -> LimitsTogether:
     """The largest box by relative volume in which `columns` vary, in which those of `limits` reach their limits, and
-    that holds none of `unsafe_settings`, shape (K, n); around an `inner` box, if that passes its test.
+    that holds none of `unsafe_settings`, shape (K, n).
 
     Notes
     -----
@@ -125,6 +136,29 @@ def find_limits_together(
     it. What they find becomes part of what later boxes must survive, in that fit. At last each limit, as it is printed,
     moves out as far as it can go, and the box is tested again; a failure then moves one limit in.
     """
+    search, nothing = open_search(models, columns, limits, unsafe_settings)
+    if models.own.fit in nothing.broken:
+        return nothing
+    start = start_of(search, columns, scans)
+    trials = Trials(nothing.members, budget, models.own.evaluator)
+    for number in range(1, MAX_BOXES + 1):
+        with trials.evaluator.stage(SEARCH_STAGE):
+            sides = search.best(start)
+        if sides is None:
+            return without_box(nothing, search, number)
+        box = search.printed(sides)
+        settlement = Settlement(search)
+        if not _learn(search, trials, trials.first(box, number)):
+            passed = _grown(settlement, trials, box, number)
+            if passed is not None:
+                return result(nothing, settlement, passed, number)
+    return without_box(nothing, search, MAX_BOXES)
+
+
+def open_search(
+    models: Models, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
+) -> tuple[BoxSearch, LimitsTogether]:
+    """The search for a box, and the answer before it: the promise, and the fits in which it is broken."""
     own = models.own._replace(evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0))
     # Points at which nothing fails cost as much as the others; the test of a box adds those at which it fails.
     first = own.at_worst_points(unsafe_settings, "worst points") if len(unsafe_settings) else own
@@ -149,25 +183,10 @@ def find_limits_together(
         members,
         search.failures_alone,
     )
-    if own.fit in broken:
-        return nothing
-    start = _start(search, columns, scans)
-    trials = Trials(members, budget, models.own.evaluator)
-    for number in range(1, MAX_BOXES + 1):
-        with trials.evaluator.stage(SEARCH_STAGE):
-            sides = search.best(start) if inner is None or number > 1 else search.sides_of(inner)
-        if sides is None:
-            return _without_box(nothing, search, number)
-        box = search.printed(sides)
-        settlement = Settlement(search)
-        if not _learn(search, trials, trials.first(box, number)):
-            passed = _grown(settlement, trials, box, number)
-            if passed is not None:
-                return _result(nothing, settlement, passed, number)
-    return _without_box(nothing, search, MAX_BOXES)
+    return search, nothing
 
 
-def _without_box(nothing: LimitsTogether, search: BoxSearch, boxes: int) -> LimitsTogether:
+def without_box(nothing: LimitsTogether, search: BoxSearch, boxes: int) -> LimitsTogether:
     """No limits together, and what the search met."""
     searched = (*nothing.members, *search.models)
     return nothing._replace(boxes=boxes, searched=searched, failures_alone=search.failures_alone)
@@ -213,7 +232,7 @@ def _grown(settlement: Settlement, trials: Trials, box: Box, number: int) -> Tri
     return passed
 
 
-def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:
+def start_of(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:
     """The box of what is safe alone; its corner where every characteristic has gone towards its smaller margin becomes
     the first that the search knows.
     """
@@ -230,13 +249,10 @@ def _start(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATime
     return start
 
 
-def _result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int) -> LimitsTogether:
+def result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int) -> LimitsTogether:
     """The limits together from a box that passed its trial; a box that leaves no characteristic any room is none."""
     search = settlement.search
     box = trial.box
-    of_vehicle = search.characteristics.of_vehicle
-    is_open = search.is_free & of_vehicle
-    has_room = not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())
     least = [np.nan, np.nan]
     if trial.attack is not None:
         judges = [trial.judges[judge] for judge in trial.attack.judges]
@@ -247,7 +263,7 @@ def _result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, numbe
     points = [len(model.evaluator.study.matrix.tests) for model in trial.judges[:1] if model.evaluator.study.matrix]
     own_tests = nothing.members[0].evaluator.study.matrix
     return nothing._replace(
-        box=box if has_room else None,
+        box=box if has_room(search, box) else None,
         proof=trial.proof,
         attack=trial.attack,
         least=(least[0], least[1]),
@@ -259,3 +275,9 @@ def _result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, numbe
         searched=(*nothing.members, *search.models, *trial.judges),
         failures_alone=search.failures_alone,
     )
+
+
+def has_room(search: BoxSearch, box: Box) -> bool:
+    """Whether a box leaves any characteristic room, if one may vary."""
+    is_open = search.is_free & search.characteristics.of_vehicle
+    return not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
 FIRST_SHARE = 0.2
 """Share of the attack's budget of a first trial, before limits have moved out."""
+QUICK_CORNERS = 1024
+"""Number of corners of a quick trial, in each fit."""
 TRIAL_STAGE = "test of the limits together"
 
 
@@ -74,6 +76,19 @@ class Trials:
             lefts = self._left(corners, self._failing)
             return self._failed(box, corners, lefts) or self._attack(box, corners, lefts, budget, attempt)
 
+    def quick(self, box: Box, attempt: int, fits: Collection[int], known: FloatArray) -> Trial:
+        """Try known settings and some corners in some fits, and a short attack in these, which goes on from those that
+        fail: many failures at once spare trials.
+        """
+        corners = np.concatenate([known[box.holds(known)], box.corners(self.seed, attempt)[:QUICK_CORNERS]])
+        budget = round(FIRST_SHARE * self.budget)
+        numbers = [number for number, model in enumerate(self.models) if model.fit in fits]
+        with self.evaluator.stage(TRIAL_STAGE, len(numbers) * len(corners) + budget):
+            lefts = self._left(corners, numbers)
+            failed = self._failed(box, corners, lefts)
+            trial = self._attack(box, corners, lefts, budget, attempt, numbers)
+            return trial._replace(failures=[*(failed.failures if failed else ()), *trial.failures])
+
     def whole(self, box: Box, attempt: int) -> Trial:
         """Try all corners in all models, the whole attack, and settings drawn at random; the first part that finds
         failures is the last.
@@ -116,23 +131,29 @@ class Trials:
         return Trial(box, failures) if failures else None
 
     def _attack(
-        self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], budget: int, attempt: int
+        self,
+        box: Box,
+        corners: FloatArray,
+        lefts: Mapping[int, FloatArray],
+        budget: int,
+        attempt: int,
+        numbers: Sequence[int] | None = None,
     ) -> Trial:
-        """Attack a box, beginning at its worst corners in each model, or in the first."""
+        """Attack a box in all models, or those of some numbers, beginning at its worst corners in each, or in the
+        first.
+        """
         if not budget:
             return Trial(box, judges=self.models)
+        numbers = range(len(self.models)) if numbers is None else numbers
         own = self.models[0]
         judges = list[Model]()
         left_out = list[int]()
-        for model in self.models:
+        for model in [self.models[number] for number in numbers]:
             denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
             judges.append(denser)
             left_out.append(number)
         orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
-        worst = [
-            corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
-            for number in range(len(self.models))
-        ]
+        worst = [corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]] for number in numbers]
         rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
         found = attack(box, rows, worst, budget, np.random.default_rng((self.seed, 4, attempt)))
         failures = [
