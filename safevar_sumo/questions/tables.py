@@ -148,8 +148,14 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         for labels, group in frame.groupby([*wide.labels], sort=False):
             by_head = group.set_index(wide.by)[of_value].reindex(heads)
             rows.append((*labels, *by_head.to_numpy().ravel()))
-        heading = title if len(wide.values) == 1 else f"{title}: {column.meaning}"
+        heading = title if len(wide.values) == 1 else f"{title}: {_meaning_of([columns[end] for end in of_value])}"
         yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
+
+
+def _meaning_of(ends: Sequence[Column]) -> str:
+    """What a column means, or a pair of them that differ in the first word: `lowest and highest value`."""
+    firsts = [column.meaning.partition(" ")[0] for column in ends]
+    return f"{' and '.join(firsts)} {ends[0].meaning.partition(' ')[2]}"
 
 
 class _ReaderColumn(NamedTuple):

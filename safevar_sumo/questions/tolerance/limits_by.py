@@ -19,7 +19,7 @@ from safevar_sumo.questions.tolerance.levels import Level, LevelSearch, Reach
 from safevar_sumo.questions.tolerance.levels_together import levels_with_together
 from safevar_sumo.questions.tolerance.rows import LIMITS, NOWHERE, Failure, describe
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.tolerance.words import failure_in_words
+from safevar_sumo.questions.tolerance.words import failure_in_words, trial_in_words
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit, unit_text
@@ -208,7 +208,10 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
     fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
     failure = failure_in_words(unsafe, len(members))
     yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {failure}."
-    yield _tried(search, is_together=any(level.together is not None for level in levels))
+    yield _tried(search)
+    for level in levels:
+        if level.together is not None and level.together.box is not None:
+            yield f"Together up to {by.text(level.value)}: {trial_in_words(level.together, search.budget)}."
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
         yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
@@ -217,8 +220,8 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
         yield f"No limits together were found up to {join_phrases(without)}{unit_text(by.unit)}."
 
 
-def _tried(search: LevelSearch, *, is_together: bool) -> str:
-    """What was driven beside scans."""
+def _tried(search: LevelSearch) -> str:
+    """What was driven beside scans for limits alone."""
     if not search.budget:
         return "Not attacked."
     texts = ["points between those of the study"]
@@ -226,8 +229,6 @@ def _tried(search: LevelSearch, *, is_together: bool) -> str:
         texts = [f"{round(ATTACK_SHARE * search.budget):,} aimed at each limit between two values"]
     if search.limits:
         texts.append(f"{search.budget:,} aimed at the specified limits")
-    if is_together:
-        texts.append(f"{search.budget:,} aimed at each of the limits together")
     return f"Tried beside scans: {join_phrases(texts)}."
 
 

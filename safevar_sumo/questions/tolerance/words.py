@@ -87,11 +87,16 @@ def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, bu
     if has_limits:
         decision = "The limits together below hold" if together.broken else "Keeps all limits"
     yield f"{decision} {where}: within them no vehicle that was tried {failure_in_words(unsafe, count)}."
-    searched = len(models.own.evaluator.characteristics.scenario) > 0
-    met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
-    yield f"Tried: all corners{met}; {_attack_in_words(together, budget)}; {_proof_in_words(together)}."
+    yield f"Tried: {trial_in_words(together, budget)}."
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
+
+
+def trial_in_words(together: LimitsTogether, budget: int) -> str:
+    """What limits together were tested with: corners, an attack, vehicles drawn at random."""
+    searched = len(together.members[0].evaluator.characteristics.scenario) > 0
+    met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
+    return f"all corners{met}; {_attack_in_words(together, budget)}; {_proof_in_words(together)}"
 
 
 def failure_in_words(unsafe: Unsafe, fits: int) -> str:
@@ -99,7 +104,7 @@ def failure_in_words(unsafe: Unsafe, fits: int) -> str:
     if not unsafe.keep:
         return f"is unsafe ({unsafe.description}){f' in any of {fits} fits' if fits > 1 else ''}"
     between = " between bumpers" if unsafe.contact else ""
-    others = f" with the study's own fit, and none collides with {fits - 1} others" if fits > 1 else ""
+    others = f" with the study's own fit, and none collides with {number_of(fits - 1, 'other')}" if fits > 1 else ""
     return f"keeps less than {unsafe.keep:.3g} m{between}{others}"
 
 
