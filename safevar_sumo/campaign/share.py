@@ -83,6 +83,7 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
     refuse_other_inputs(task, share)
     with about(task.study.source), ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
+        # Each search goes on until it asks for settings that are in no journal; a run's settings are neighbours.
         while missing := [(run, setting) for run in runs for setting in run.look_up()]:
             for rows in np.array_split(np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)):
                 if not has_caller():

@@ -130,16 +130,18 @@ def _steps(
         generations_left -= int((found.left < 0).any())
         if not generations_left:
             break
-        settings = _children(box, found, rng)
+        settings = _children(box, found, max(size, GENERATION), rng)
         generation += 1
+        # Of two neighbours one is mutated and one moved: each judge gets both.
         numbers = _pair(least, generation)[np.arange(len(settings)) // 2 % 2]
     return found
 
 
 def _pair(least: FloatArray, generation: int) -> Rows:
     """The judges of a generation: that with the least left, and another one in turn."""
-    order = np.argsort(least, kind="stable")
-    return order[[0, 1 + (generation - 1) % (len(order) - 1) if len(order) > 1 else 0]]
+    first, *others = np.argsort(least, kind="stable").tolist()
+    second = others[(generation - 1) % len(others)] if others else first
+    return np.array([first, second])
 
 
 def _new_ones(
@@ -151,7 +153,7 @@ def _new_ones(
     seen: set[tuple[int, bytes]],
     rng: np.random.Generator,
 ) -> tuple[FloatArray, Rows]:
-    """Up to `size` settings of the box that no judge has met; random ones where there are too few."""
+    """Up to `size` settings of the box that their judges have not met; random ones where there are too few."""
     is_held = box.holds(settings)
     random = box.draw(size, rng)
     settings = np.concatenate([settings[is_held], random])
@@ -177,19 +179,20 @@ def _worst(found: Attack, settings: FloatArray, numbers: Rows, left: FloatArray)
     )
 
 
-def _children(box: Box, found: Attack, rng: np.random.Generator) -> FloatArray:
-    """A generation of children; none before a setting counts."""
+def _children(box: Box, found: Attack, number: int, rng: np.random.Generator) -> FloatArray:
+    """A number of children; none before a setting counts."""
     parents = found.settings[:PARENTS]
     if not len(parents):
         return parents
-    shape = (GENERATION, len(box.lower))
-    first, second, third, fourth = rng.integers(len(parents), size=(4, GENERATION))
+    shape = (number, len(box.lower))
+    first, second, third, fourth = rng.integers(len(parents), size=(4, number))
     mixed = np.where(rng.random(shape) < 0.5, parents[first], parents[second])
     random = box.at(rng.random(shape))
     ends = np.where(rng.random(shape) < 0.5, box.lower, box.upper)
+    # Of a child's values, 0.4 on average are drawn anew, 0.4 make a step, and 0.4 go to an end.
     draw = rng.random(shape) * max(int(np.count_nonzero(box.lower < box.upper)), 1)
     mutated = np.select([draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed)
-    worse = parents[np.minimum(first, second)]
+    worse = parents[np.minimum(first, second)]  # the worst parents come first
     moved = parents[first] + PULL * (worse - parents[first]) + DIFFERENCE * (parents[third] - parents[fourth])
-    is_moved = (np.arange(GENERATION) % 2 == 1)[:, np.newaxis]
+    is_moved = (np.arange(number) % 2 == 1)[:, np.newaxis]
     return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))

@@ -189,7 +189,7 @@ class Constraint(Table, frozen=True, kw_only=True):
         return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
 
     def allows(self, values: Mapping[str, float]) -> bool:
-        """Whether the sum is within its bounds at these values, or has other terms."""
+        """Whether the sum is within its bounds at these values, or one of its terms has no value among them."""
         if not self.sum.keys() <= values.keys():
             return True
         total = sum(weight * values[name] for name, weight in self.sum.items())

@@ -104,7 +104,9 @@ def evaluate(
     if len(settings) > size:
         starts = range(0, len(settings), size)
         batches = [settings[start : start + size] for start in starts]
-        return Evaluations.concatenate([evaluate(system, each, engine, with_originals=takes_pairs) for each in batches])
+        return Evaluations.concatenate(
+            [evaluate(system, each, engine, with_originals=with_originals) for each in batches]
+        )
     vehicles = settings
     if takes_pairs:  # a variant and the original take turns: they share scenes
         originals = system.characteristics.with_original_vehicle(settings)
@@ -174,7 +176,8 @@ def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]
 def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n).
 
-    In a matrix, all settings run at the worst point of the last setting. Raises the errors of `drive_all`.
+    In a matrix, all settings run at the worst point of the last one: others may stand before it, such as the original.
+    Raises the errors of `drive_all`.
     """
     return drive_all(system.at(worst_point(system, settings[-1])), settings, engine)
 
@@ -226,9 +229,11 @@ def at_point(study: Study, name: str) -> Study:
         similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
         raise InputError("point", repr(name), legal if points else "a study with a matrix")
-    search = replace_in(study.search, objectives=[*OBJECTIVES]) if study.matrix.protocol else study.search
-    matrix = replace_in(study.matrix, point=name)
-    origin = replace_in(study.origin, point=name)
+    search = study.search
+    if study.matrix.protocol:  # one point has no rating points to search by
+        search = replace_in(search, objectives=[*OBJECTIVES])
+    matrix = replace_in(study.matrix, point=name)  # decides what is simulated
+    origin = replace_in(study.origin, point=name)  # is what commands name
     return replace_in(study, matrix=matrix, origin=origin, search=search)
 
 
@@ -242,7 +247,7 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
         one = point.scenario
         key: Hashable = point.name
         if isinstance(one, TrackScenario):
-            n_bodies = 0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))
+            n_bodies = 0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))  # at time 0
             key = one.vut_length, one.vut_width, one.sensor_setback, n_bodies, one.network
         groups.setdefault(key, []).append(point)
     for group in groups.values():
@@ -267,7 +272,7 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
     has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
     values = safety_degrees
     if system.aggregate != WORST:
-        name, direction = system.aggregate.split()
+        name, direction = system.aggregate.split()  # such as "drac >"
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
         measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
         values = np.where(has_collided, safety_degrees, measures)

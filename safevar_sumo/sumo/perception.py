@@ -15,8 +15,12 @@ from safevar_sumo.study import Weather
 from safevar_sumo.sumo.bodies import Motion, SceneWorld
 
 OCCLUDED = {
-    **{"gap": np.inf, "lateral": np.inf, "lateral_speed": 0.0, "obstacle_speed": 0.0},
-    **{"obstacle_width": 0.0, "obstacle": 0.0},
+    "gap": np.inf,
+    "lateral": np.inf,
+    "lateral_speed": 0.0,
+    "obstacle_speed": 0.0,
+    "obstacle_width": 0.0,
+    "obstacle": 0.0,
 }
 """What is observed of an occluded obstacle [m, m/s]."""
 _UNSEEN = np.array([*OCCLUDED.values()])[:, np.newaxis]
@@ -52,7 +56,7 @@ class Perception:
         An occluded obstacle appears at rest, infinitely far away.
         """
         values = np.empty((len(OCCLUDED) + 1, len(speed)))
-        values[-1] = speed
+        values[-1] = speed  # for the closing speed of then
         for row, quantity in enumerate(OCCLUDED):
             values[row] = getattr(scene, quantity)
         if scene.visible is not ALL_TRUE:
@@ -61,7 +65,7 @@ class Perception:
         for k, (vehicles, line) in enumerate(self._lines):
             seen[:, vehicles], next_line = line.delayed(values[:, vehicles])
             self._lines[k] = vehicles, next_line
-        obstacle = dict(zip(OCCLUDED, seen, strict=False))
+        obstacle = dict(zip(OCCLUDED, seen[:-1], strict=True))
         closing_speed = seen[-1] - obstacle["obstacle_speed"]
         return Observation(time=time, speed=speed, closing_speed=closing_speed, visibility=self._visibility, **obstacle)
 

@@ -224,7 +224,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         wheel_speed = rim / p.radius
         gear = zeros + 1
         for lower_ratio in GEAR_RATIOS[:-1]:
-            gear += p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S) > SHIFT_UP * p.largest_rpm
+            rpm = p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S)
+            is_too_fast = rpm > SHIFT_UP * p.largest_rpm
+            gear += is_too_fast
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
@@ -275,6 +277,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         curvature = angle / WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
         lateral = s.lateral + s.speed * p.step * HALF * (s.heading + heading)
+        # The lateral force m v^2 curvature, of which the share `angle` points back, over v.
         return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
 
 
@@ -304,7 +307,8 @@ def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
 
 
 def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: FloatArray) -> LgsvlState:
-    """One implicit Euler step of engine speed, wheel and body, linear in the new speeds.
+    """One implicit Euler step of engine speed, wheel and body, linear in the new speeds; the wheel's equation is solved
+    with the body's speed eliminated.
 
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
@@ -357,7 +361,7 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     speed.
     """
     grip_share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
-    slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
+    slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))  # grip_share = x (2 - x), x = slip / PEAK_SLIP
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
     return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim))
@@ -369,10 +373,11 @@ def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed
     """
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator
-    friction = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
+    friction_by_slip = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
     is_sliding = slip >= PEAK_SLIP
     if np.count_nonzero(is_sliding):
         sliding_share = np.minimum((slip - PEAK_SLIP) / SLIDING_RANGE, ONE)
-        friction = np.where(is_sliding, (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP), friction)
+        sliding = (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP)
+        friction_by_slip = np.where(is_sliding, sliding, friction_by_slip)
     load = p.weight + DOWNFORCE * speed * speed
-    return np.asarray(p.friction * load * friction / denominator)
+    return np.asarray(p.friction * load * friction_by_slip / denominator)

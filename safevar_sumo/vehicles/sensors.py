@@ -27,8 +27,7 @@ class DelayedSignal:
     samples
         The last L samples, newest first, shape (L, ..., N).
     newer
-        For every value of a sample, its number in the newer sample, counted over all values of `samples`; shape
-        (..., N).
+        For every value of a sample, its index in `samples.ravel()` where that is the newer sample, shape (..., N).
     share
         The older sample's share, shape (N,).
     """
@@ -113,14 +112,15 @@ def sensed_observation(
     past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
     then = dict(zip(DELAYED, past.delayed(), strict=True))
     is_detected = then["gap"] <= reach * seen.visibility
-    return seen._replace(**then | {"gap": np.where(is_detected, then["gap"], np.inf)}), past
+    then["gap"] = np.where(is_detected, then["gap"], np.inf)
+    return seen._replace(**then), past
 
 
 class SensingState(NamedTuple):
     """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
 
     `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation. `frame` is what the
-    sensors last reported, in the order of `DELAYED`, where they may lose frames.
+    sensors last reported, in the order of `DELAYED`, in vehicles whose sensors may lose frames.
     """
 
     speed: FloatArray
@@ -160,18 +160,22 @@ class SensingVehicle(Vehicle):
         """The steady state: the pedals balance the slope, the only resistance."""
         rest = self.at_rest(prepared)
         back = prepared.slope.back
-        throttle, brake = (
-            np.minimum(np.maximum(pedal, 0.0), 1.0) for pedal in (back / prepared.drive, -back / prepared.brake)
+        throttle = np.minimum(np.maximum(back / prepared.drive, 0.0), 1.0)
+        brake = np.minimum(np.maximum(-back / prepared.brake, 0.0), 1.0)
+        return rest._replace(
+            speed=speed,
+            throttle=throttle,
+            brake=brake,
+            brake_commands=DelayedSignal.of(brake, prepared.brake_delay, prepared.step),
+            acceleration=rest.acceleration + back,  # shape (N,)
         )
-        commands = DelayedSignal.of(brake, prepared.brake_delay, prepared.step)
-        return SensingState(speed, throttle, brake, rest.gear, None, commands, rest.acceleration + back)
 
     def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
         p = prepared
         commands = state.brake_commands.extended(command.brake)
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
-        highest_speed = np.maximum(p.max_speed, state.speed)
+        highest_speed = np.maximum(p.max_speed, state.speed)  # who is faster is not slowed down
         speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed)
         return state._replace(
             speed=speed,

@@ -80,7 +80,7 @@ class _Ends:
         self.beyond: list[Beyond] = [None, None]
         for side, last in enumerate((item.lower, item.upper)):
             values = [value for pair in scan.of_state("unsafe") for value in pair]
-            outside = [value for value in values if (value < self.ends[0], value > self.ends[1])[side]]
+            outside = [value for value in values if (value < self.ends[0] if side == 0 else value > self.ends[1])]
             if self.ends[side] != last and outside:
                 nearest = min(outside, key=lambda value: abs(value - item.original))
                 self.beyond[side] = members.setting({item.name: nearest}), own
@@ -151,8 +151,9 @@ class AloneSearch:
         self.scans = scans
         self.models = models
         self.values = values
-        is_safe = all(scan.safe is not None for scan in scans)
-        self.ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True) if is_safe]
+        self.ends = list[_Ends]()  # none where the original is unsafe
+        if all(scan.safe is not None for scan in scans):
+            self.ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True)]
 
     def run(self, budget: int) -> None:
         """Try values in all models, in the encounters that the scans met and in those of an attack on the limits."""
@@ -160,13 +161,13 @@ class AloneSearch:
         encounters = np.concatenate([[evaluator.characteristics.original], evaluator.critical_encounters])
         for model in self.models if self.ends else ():
             _move_before(self.ends, model, encounters, self.values)
-            while _move_before(self.ends, model, encounters, 2):
+            while _move_before(self.ends, model, encounters, 2):  # the ends alone, until all are safe
                 pass
         if len(evaluator.characteristics.scenario) and budget:
             _attack_alone(self.ends, self.models, round(ATTACK_SHARE * budget))
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
-        """Move the limits before failures of one characteristic, shape (K, n), that another search met."""
+        """Move the limits before failures that another search met, each of one characteristic, shape (K, n)."""
         for model in models if len(failures) and self.ends else ():
             _move(self.ends, model, [_alone_in(each, failures, model) for each in self.ends])
 
@@ -253,7 +254,7 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
             lower[each.column], upper[each.column] = limit
             boxes.append(Box(models[0].evaluator.region, lower, upper))
             at_limit = boxes[-1].draw(size, rng)
-            at_limit[:, each.column] = np.resize(limit, len(at_limit))
+            at_limit[:, each.column] = np.resize(limit, len(at_limit))  # both ends in turn
             known.append(np.array_split(at_limit, len(models)))
         found = attack_all(boxes, judges, known, budget, rngs, size)
         for judge, model in enumerate(models):

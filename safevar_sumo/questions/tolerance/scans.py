@@ -84,7 +84,7 @@ def scan(
     number: int | None = None,
 ) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, or intervals within them, one at a time; at `number` values, by default
-    `SCAN_VALUES`.
+    `SCAN_VALUES`, in a rated study always `RATED_SCAN_VALUES`.
     """
     scanned = [evaluator.characteristics.members[column] for column in columns]
     number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (number or SCAN_VALUES, ROUNDS)
