@@ -198,9 +198,9 @@ class Evaluator:
             metrics={**metrics, ORIGINAL_DEGREE: evaluations.column(ORIGINAL_DEGREE)},
         )
 
-    def evaluate_over_encounters(self, settings: FloatArray, stage: str) -> Evaluations:
-        """Evaluate M settings, shape (M, n); in a study that searches its scenario, at the worst of its critical
-        encounters and of the original one.
+    def evaluate_over_encounters(self, settings: FloatArray, unsafe: Unsafe, stage: str) -> Evaluations:
+        """Evaluate M settings, shape (M, n); in a study that searches its scenario, in that of its critical encounters
+        and the original one which is worst by the criterion.
         """
         if not len(self.characteristics.scenario):
             return self.evaluate(settings, stage)
@@ -208,8 +208,7 @@ class Evaluator:
         encounters = np.concatenate([self.characteristics.original[np.newaxis], self.critical_encounters])
         pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(-1, settings.shape[1])
         evaluations = self.evaluate(pairs, stage)
-        degrees = np.where(np.isnan(evaluations.f_safe), np.inf, evaluations.f_safe)
-        worst = np.argmin(degrees.reshape(-1, len(encounters)), axis=1)
+        worst = np.argmin(unsafe.left(evaluations).reshape(-1, len(encounters)), axis=1)
         first_rows = np.arange(len(settings)) * len(encounters)
         return evaluations.take(first_rows + worst)
 

@@ -166,7 +166,7 @@ def tolerance(
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
         everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
-        known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, scans)]
+        known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, criterion, scans)]
         all_limits = {**specified, **everywhere}
         while found_together is None or _is_refuted(found_together, search_alone.failures):
             unsafe_settings = np.concatenate([*known, search_alone.failures])
@@ -264,13 +264,13 @@ def _limits_of(study: Study, texts: Sequence[str], columns: Sequence[int]) -> di
         return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
 
 
-def _unsafe_alone(evaluator: Evaluator, scans: Sequence[OneAtATimeScan]) -> FloatArray:
+def _unsafe_alone(evaluator: Evaluator, unsafe: Unsafe, scans: Sequence[OneAtATimeScan]) -> FloatArray:
     """The ends of the unsafe intervals as settings, shape (K, n), each in its worst encounter."""
     characteristics = evaluator.characteristics
     ends = [(one.characteristic.name, end) for one in scans for interval in one.of_state("unsafe") for end in interval]
     settings = [characteristics.setting({name: end}) for name, end in ends]
     ends_of_intervals = np.array(settings).reshape(-1, len(characteristics))
-    return evaluator.evaluate_over_encounters(ends_of_intervals, "ends of what is unsafe alone").settings
+    return evaluator.evaluate_over_encounters(ends_of_intervals, unsafe, "ends of what is unsafe alone").settings
 
 
 def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Unsafe) -> FloatArray:

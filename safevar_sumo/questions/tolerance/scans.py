@@ -120,7 +120,7 @@ def _evaluate_profiles(
     ends = np.cumsum(sizes)[:-1]
     settings = np.tile(evaluator.characteristics.original, (sum(sizes), 1))
     settings[np.arange(len(settings)), np.repeat(columns, sizes)] = np.concatenate(values)
-    evaluations = evaluator.evaluate_over_encounters(settings, SCAN_STAGE)
+    evaluations = evaluator.evaluate_over_encounters(settings, unsafe, SCAN_STAGE)
     state = np.select(
         [evaluations.infeasible, ~evaluations.valid, unsafe.of(evaluations)],
         ["infeasible", "not_simulated", "unsafe"],
