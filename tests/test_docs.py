@@ -219,7 +219,7 @@ def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("lines", sorted({tuple(one.commands) for one in MARKED}), ids=lambda lines: lines[-1])
 def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ...], in_tmp: Path) -> None:
-    """Shares are given in whole per cent, other numbers with two decimals and their unit."""
+    """Shares are given in whole per cent, limits as they are rounded, others with two decimals and their unit."""
     for command in lines:
         done = CliRunner().invoke(commands, shlex.split(command.removeprefix(PROGRAM)), catch_exceptions=False)
         assert done.exit_code == 0, f"{command}\n{done.output}"
@@ -234,4 +234,5 @@ def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ..
             else:
                 result = result[int(key) if isinstance(result, list) else key]
         unit = value.partition(" ")[2]
-        assert value == (f"{100 * result:.0f} %" if unit == "%" else f"{result:.2f} {unit}".strip()), f"{page}: {path}"
+        text = f"{result:.10g}" if path.startswith("tables.limits.") else f"{result:.2f} {unit}".strip()
+        assert value == (f"{100 * result:.0f} %" if unit == "%" else text), f"{page}: {path}"
