@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.sampling import CONFIDENCE as CONFIDENCE, Interval as Interval, sobol_settings
+from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.system import assemble

@@ -10,8 +10,8 @@ import numpy as np
 
 from safevar_sumo.questions.attack import attack_all
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.evaluator import Interval
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic

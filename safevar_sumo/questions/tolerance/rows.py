@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Interval
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether

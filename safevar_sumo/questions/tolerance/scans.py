@@ -11,7 +11,8 @@ import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.evaluator import Evaluator, Interval
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic

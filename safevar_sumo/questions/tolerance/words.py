@@ -7,8 +7,8 @@ from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS
-from safevar_sumo.questions.evaluator import CONFIDENCE
 from safevar_sumo.questions.models import Models, fit_names
+from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether
