@@ -18,24 +18,21 @@ from safevar_sumo import tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import search
-from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
+from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
-from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Limit, load_study
+from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import run
 from tests.made_up import case_of
-from tests.questions.conftest import Plant, Region, box_of, made_up_study, nowhere, two_islands
+from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_islands
 
 
 def degrees(rows: FloatArray) -> FloatArray:
@@ -205,118 +202,6 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
     answer = answer_of(2, two_islands, unsafe="collision", limits=(limit,))
     assert answer.verdict.startswith(said)
     assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
-
-
-LINEAR = np.array([1.0, 2.0, 3.0])
-"""Weights of a region whose largest box has sides at 10, 7.5 and 5."""
-
-
-def relative_volume(found: LimitsTogether) -> float:
-    assert found.box is not None
-    return float(np.prod(found.box.upper - found.box.lower)) / 10 ** len(found.box.lower)
-
-
-def linear(rows: FloatArray) -> BoolArray:
-    return np.asarray((rows - 5) @ LINEAR > 10)
-
-
-@pytest.mark.parametrize(("limits", "largest"), [({}, 0.375), ({"c": Limit(at_most=7)}, 0.315)])
-def test_the_box_with_limits_is_nearly_the_largest(limits: dict[str, Limit], largest: float) -> None:
-    found = box_of(3, linear, limits)
-    assert found.box is not None
-    assert found.proof is not None
-    assert 0.97 * largest < relative_volume(found) <= largest
-    assert (found.box.upper - 5) @ LINEAR <= 10
-    assert found.proof.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / found.proof.samples))
-    assert all(found.box.upper["abc".index(name)] == limit.at_most for name, limit in limits.items())
-
-
-def test_no_limit_of_the_box_can_move_out_alone() -> None:
-    """By a 50th of its range, or it meets the failure that is named."""
-    found = box_of(3, linear, {})
-    assert found.box is not None
-    ends = [column for column in range(3) if found.box.upper[column] < 10]
-    assert len(ends) >= 2
-    for column in ends:
-        setting = found.beyond[1, column]
-        assert linear(setting[np.newaxis])[0]
-        assert found.box.upper[column] < setting[column] <= found.box.upper[column] + 10 / 50
-        others = [other for other in range(3) if other != column]
-        assert (setting[others] <= found.box.upper[others]).all()
-
-
-def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together_met() -> None:
-    """A pocket between two values of the scan, in one of two fits, which no value of a limit alone hits."""
-
-    def pocket(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7.01) & (rows[:, 0] < 7.04))
-
-    study = made_up_study(2)
-    own, other = (Model(k, Evaluator(study, Plant(study, one)), Unsafe()) for k, one in enumerate((nowhere, pocket)))
-    scans = scan(own.evaluator, [0, 1], Unsafe())
-    alone = AloneSearch(scans, [0, 1], [own, other])
-    alone.run(0)
-    assert [each.safe for each in alone.limits()] == [(0.0, 10.0), (0.0, 10.0)]
-    alone.meet([other], np.array([[7.02, 5.0]]))
-    assert [each.safe for each in alone.limits()] == [(0.0, pytest.approx(7.01, abs=0.01)), (0.0, 10.0)]
-    assert alone.limits()[0].safe[1] <= 7.01
-    assert pocket(alone.failures).all()
-
-
-def test_a_tooth_between_corners_is_found_and_left_out() -> None:
-    """No corner and no value alone is unsafe: from 6 to 6.5 of the first with the others below 6."""
-
-    def tooth(rows: FloatArray) -> BoolArray:
-        return np.asarray((np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1))
-
-    found = box_of(3, tooth, {"a": Limit(at_least=3, at_most=7)})
-    assert found.box is not None
-    points = found.box.at(np.random.default_rng(1).random((20_000, 3)))
-    assert not tooth(points).any()
-    assert relative_volume(found) > 0.02
-    assert found.attack is not None
-    assert found.attack.simulated == 2000
-    region = region_of(made_up_study(3))
-    whole = Box(region, np.zeros(3), np.full(3, 10.0))
-    hit = attack(
-        whole,
-        [lambda rows: np.where(tooth(rows), -1.0, np.abs(rows - 6.3).max(axis=1))],
-        [],
-        2000,
-        np.random.default_rng(0),
-    )
-    assert hit.left[0] == -1
-    assert hit.simulated < 2000, "it ends soon after"
-
-
-def test_the_box_holds_in_every_fit() -> None:
-    """A second fit collides in one corner alone, between the corners of the first."""
-
-    def second(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7) & (rows[:, 1] < 4) & (rows[:, 2] > 6))
-
-    found = box_of(3, linear, {}, [second])
-    assert found.box is not None
-    assert [model.fit for model in found.members] == [0, 1]
-    settings = np.concatenate([found.box.corners(0, 0), found.box.at(np.random.default_rng(2).random((5000, 3)))])
-    assert not linear(settings).any()
-    assert not second(settings).any()
-    assert {*found.corners} == {0, 1}
-
-
-def test_a_promise_that_a_fit_breaks_is_named_and_the_box_holds_in_the_others() -> None:
-    found = box_of(2, nowhere, {"a": Limit(at_most=9)}, [lambda rows: rows[:, 0] > 8, lambda rows: rows[:, 1] > 7])
-    assert [*found.broken] == [1]
-    assert [model.fit for model in found.members] == [0, 2]
-    assert found.box is not None
-    assert found.box.upper.tolist() == [9, pytest.approx(7, abs=0.11)]
-
-
-def test_limits_that_the_own_fit_breaks_have_no_box() -> None:
-    found = box_of(2, lambda rows: rows[:, 0] > 7, {"a": Limit(at_most=9)})
-    assert found.box is None
-    assert found.broken.keys() == {0}
-    assert found.promise.upper.tolist() == [9, 5]
 
 
 def test_a_refusal_says_what_would_do() -> None:
