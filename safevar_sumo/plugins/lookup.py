@@ -51,8 +51,8 @@ _user_modules: set[str] = set()
 class Lookup:
     """Looks up the names of a study, each class once.
 
-    `folders`, searched first, are those of the study's file and of the files that it extends; `files` are the paths of
-    its data files by the names that it gives them.
+    `folders`, searched before the working directory, are those of the study's file and of the files that it extends;
+    `files` are the paths of its data files by the names that it gives them.
     """
 
     def __init__(self, folders: Sequence[str] = (), files: Mapping[str, str] = MappingProxyType({})) -> None:
