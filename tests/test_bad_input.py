@@ -44,6 +44,8 @@ TYPED = [
     ("study smoke --evaluations 99999999999999999999", "--evaluations"),
     ("study smoke --algorithms os:system", "os:system"),
     ("study smoke --algorithms mine.py:Mine", "its module: 'mine:Mine'"),
+    ("study smoke --algorithms far/mine.py:Mine", "its module: 'far.mine:Mine'"),
+    ("study smoke --algorithms mine.py", "package.module:Name"),
     ("study smoke --cluster nowhere", "tcp://host:8786"),
     ("study smoke --cluster tcp://127.0.0.1:9", "no scheduler answers at 'tcp://127.0.0.1:9'"),
     ("study heavy.toml", "heavy.toml: the original vehicle: violates a constraint: mass = 2404 kg"),

@@ -79,8 +79,9 @@ class Lookup:
             return Member(shipped[name])
         expected = f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
         module_name, colon, attribute = name.partition(":")
-        if module_name.endswith(".py"):
-            raise InputError("", f"{key} = {name!r} names a file", f"its module: {name.replace('.py:', ':')!r}")
+        if colon and module_name.endswith(".py"):
+            dotted = module_name.removesuffix(".py").replace("/", ".")
+            raise InputError("", f"{key} = {name!r} names a file", f"its module: '{dotted}:{attribute}'")
         if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
         code = UserCode(f"{key} = {name!r}")

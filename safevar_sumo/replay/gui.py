@@ -65,12 +65,13 @@ def show_in_gui(
     runs = comparison.runs
     samples = count()
     pauses = {moments.nearest for moments in comparison.moments} | {max(moments.end for moments in comparison.moments)}
-    start = time.monotonic()
+    start = 0.0
 
     def watch(world: SumoWorld) -> None:
         nonlocal start
         sample = next(samples)
-        if sample == 0:
+        if sample == 0:  # to open the window took a while
+            start = time.monotonic()
             for row in comparison.rows:
                 world.api.vehicle.setColor(copied_id(row, VUT), (*bytes.fromhex(COLOURS[row][1:]), 255))
         _look_at(world)

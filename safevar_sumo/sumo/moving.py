@@ -66,8 +66,8 @@ class Moving(NamedTuple):
     faces_along: bool
 
     @classmethod
-    def of(cls, track: Track, step: float, path: float) -> Moving:
-        """What follows from a track with columns; `path` is the width of the vehicle [m]."""
+    def of(cls, track: Track, step: float, vehicle_width: float) -> Moving:
+        """What follows from a track with columns; `vehicle_width` is that of the vehicle under test [m]."""
         cosine = np.abs(track.along)
         sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
@@ -76,10 +76,10 @@ class Moving(NamedTuple):
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
-            edge = np.where(is_lengthwise, first_in_strip(track, path / 2), rear)
+            edge = np.where(is_lengthwise, first_in_strip(track, vehicle_width / 2), rear)
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
-        is_in_path = slim((np.abs(track.y) < path / 2 + half_width + TIE) & (track.kind != SCREEN))
+        is_in_path = slim((np.abs(track.y) < vehicle_width / 2 + half_width + TIE) & (track.kind != SCREEN))
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)

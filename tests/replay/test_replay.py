@@ -8,8 +8,11 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -18,7 +21,7 @@ from PIL import Image
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
-from safevar_sumo.replay import animation
+from safevar_sumo.replay import animation, gui
 from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene
 from safevar_sumo.replay.comparison import COLOURS, Comparison, comparison_of, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
@@ -120,6 +123,32 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(comparison: Compa
     assert np.ptp([original[0].min(), changed[0].min()]) <= 2, "one upon the other"
     assert original[1].max() < changed[1].max(), "the original keeps its distance"
     assert of_colour(picture, "#ff3300").shape[1] > 20, "the changed vehicle's brake lights"
+
+
+def test_the_window_plays_from_the_moment_that_it_is_there(
+    comparison: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long it takes to open."""
+    now = 0.0
+    waits = []
+
+    def sleep(seconds: float) -> None:
+        nonlocal now
+        waits.append(seconds)
+        now += seconds
+
+    def drive_again(
+        system: object, settings: object, runs: object, watch: Callable[[Any], None], start: object
+    ) -> None:
+        nonlocal now
+        now += 5.0
+        for _ in range(3):
+            watch(MagicMock(vehicle_positions=lambda name: np.zeros((2, 2))))
+
+    monkeypatch.setattr(gui, "drive_again", drive_again)
+    monkeypatch.setattr(gui, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    show_in_gui(comparison, slower=2.0)
+    assert waits == pytest.approx([2.0 * comparison.runs.trace.step] * 3)
 
 
 def frame(scene: FlatScene, sample: int) -> np.ndarray:

@@ -150,7 +150,7 @@ def _broken_in_words(
                 break
         words = "the car is unsafe" if failure is None else failure.words
         value = end if failure is None else failure.setting[members.names.index(item.name)]
-        shown = f"{value:.10g}{item.suffix}" if value == end else _beyond(item, value)
+        shown = f"{value:.10g}{item.suffix}" if value == end else _text_beyond(item, value)
         return f"{item.name} {shown}: {words} (outside by {by:.10g}{item.suffix})"
     assert together is not None
     fits = {model.fit: model for model in models}
@@ -246,19 +246,19 @@ def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet
     is_corner = bool((np.isclose(values, box.lower[others]) | np.isclose(values, box.upper[others])).all())
     value = failure.setting[members.names.index(item.name)]
     named = [
-        f"{members.members[number].name} {_nearest(members.members[number], failure.setting[number])}"
+        f"{members.members[number].name} {_limit_text(members.members[number], failure.setting[number])}"
         for number in others
         if failure.setting[number] != members.original[number]
     ]
     rest = "" if is_corner else ", ".join(named)
-    return f"at {_beyond(item, value)}{f', with {rest}' if rest else ''}"
+    return f"at {_text_beyond(item, value)}{f', with {rest}' if rest else ''}"
 
 
-def _nearest(item: Characteristic, value: float) -> str:
+def _limit_text(item: Characteristic, value: float) -> str:
     """A value with the digits of a limit: limits are rounded once, and written without further zeros, as in tables."""
     return f"{round(value, item.digits):.10g}{item.suffix}"
 
 
-def _beyond(item: Characteristic, value: float) -> str:
+def _text_beyond(item: Characteristic, value: float) -> str:
     """A value beyond a limit with the digits of the limit, which it does not become by rounding."""
-    return _nearest(item, item.rounded(value, upwards=value > item.original))
+    return _limit_text(item, item.rounded(value, upwards=value > item.original))

@@ -363,8 +363,8 @@ class BoxSearch(BoxGeometry):
         return settings
 
     def best(self, start: FloatArray, *, widen: bool = True) -> FloatArray | None:
-        """The largest box within `start` in which no search finds anything unsafe, unless told otherwise widened as far
-        as it can be; None if every search finds something.
+        """The largest box within `start` in which no search finds anything unsafe, with `widen` moved out as far as it
+        can be; None if every search finds something.
         """
         sides = start
         for _ in range(MAX_ATTEMPTS):
