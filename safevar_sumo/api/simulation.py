@@ -107,38 +107,49 @@ class Simulation:
     ----------
     study
         The study that the setting was simulated in.
-    setting
-        The simulated value of every characteristic in its table unit, after the filter.
-    reset_values
-        Requested values that the filter reset to the original, by name.
-    evaluation
-        Outcome, metrics and objectives as arrays of one row.
-    runs
-        The trajectory and outcome of the only vehicle.
-    scoring
-        The metrics, and the objectives that a search of the study minimises.
     pair
-        The original vehicle and this one on the road.
+        The original vehicle and a changed one on the road.
+    row
+        The row of this vehicle in the pair: 0 is the original.
     no_verdict
         Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
-    original
-        The simulation of the original vehicle in the same encounter, at the same point of a matrix; for the original
-        vehicle, the simulation itself.
+    reset_values
+        Requested values that the filter reset to the original, by name.
     """
 
     study: Study
-    setting: Mapping[str, float]
-    evaluation: Evaluations
-    runs: SimulationRuns
-    scoring: Scoring
     pair: Pair
+    row: int
     no_verdict: str
     reset_values: Mapping[str, float] = field(default_factory=dict)
-    _original: Simulation | None = None
+
+    @cached_property
+    def original(self) -> Simulation:
+        """The simulation of the original vehicle in the same encounter, at the same point of a matrix; for the original
+        vehicle, the simulation itself.
+        """
+        return self if self.row == 0 else replace(self, row=0, reset_values={})
 
     @property
-    def original(self) -> Simulation:
-        return self._original or self
+    def setting(self) -> dict[str, float]:
+        """The simulated value of every characteristic in its table unit, after the filter."""
+        names = self.pair.system.characteristics.names
+        return dict(zip(names, self.evaluation.settings[0].tolist(), strict=True))
+
+    @cached_property
+    def evaluation(self) -> Evaluations:
+        """Outcome, metrics and objectives as arrays of one row."""
+        return self.pair.evaluations.take([self.row])
+
+    @cached_property
+    def runs(self) -> SimulationRuns:
+        """The trajectory and outcome of the only vehicle."""
+        return self.pair.runs.of(slice(self.row, self.row + 1))
+
+    @property
+    def scoring(self) -> Scoring:
+        """The metrics, and the objectives that a search of the study minimises."""
+        return self.pair.system.measuring.scoring
 
     @property
     def outcome(self) -> Outcome:
@@ -181,7 +192,7 @@ class Simulation:
     @cached_property
     def trace(self) -> pd.DataFrame:
         """One row per step, units in the columns' names; NaN where a value does not exist."""
-        return trace_frame(self.runs, self.pair.observations, 0 if self._original is None else 1)
+        return trace_frame(self.runs, self.pair.observations, self.row)
 
     @property
     def gap(self) -> float:
@@ -292,24 +303,14 @@ def simulate_with_original(study: Study, system: System, requested: FloatArray, 
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
     pair = _drive_pair(system, setting)
-    names = characteristics.names
-    original, *changed = (
-        Simulation(
-            study=study,
-            setting=dict(zip(names, values, strict=True)),
-            evaluation=pair.evaluations.take([row]),
-            runs=pair.runs.of(slice(row, row + 1)),
-            scoring=system.measuring.scoring,
-            pair=pair,
-            no_verdict=why_no_verdict(system),
-        )
-        for row, values in enumerate(pair.evaluations.settings.tolist())
+    values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
+    return Simulation(
+        study=study,
+        pair=pair,
+        row=len(pair.evaluations) - 1,
+        no_verdict=why_no_verdict(system),
+        reset_values={name: value for name, value, simulated in values if value != simulated},
     )
-    values = zip(names, requested.tolist(), setting.tolist(), strict=True)
-    reset_values = {name: value for name, value, simulated in values if value != simulated}
-    if not changed:
-        return replace(original, reset_values=reset_values)
-    return replace(changed[0], _original=original, reset_values=reset_values)
 
 
 def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
