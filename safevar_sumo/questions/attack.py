@@ -40,6 +40,14 @@ class Attack(NamedTuple):
     left: FloatArray
     simulated: int
 
+    def merged(self, other: Attack) -> Attack:
+        """Both attacks as one."""
+        left = np.concatenate([self.left, other.left])
+        worst = np.argsort(left, kind="stable")
+        settings = np.concatenate([self.settings, other.settings])[worst]
+        judges = np.concatenate([self.judges, other.judges])[worst]
+        return Attack(settings, judges, left[worst], self.simulated + other.simulated)
+
 
 def attack(
     box: Box, judges: Sequence[Judge], known: Sequence[FloatArray], budget: int, rng: np.random.Generator

@@ -13,8 +13,9 @@ CELLS = 16
 WIDTH, HEIGHT = 120, 14
 """Size of a bar on a page [px]."""
 LEGEND = {
-    "text": "bar: █ together, ▒ alone, · domain, o original, | specified",
-    "html": "range: strong together, faint alone, outline the domain, dot the original, tick the specified limit",
+    "text": "bar: █ together, ▒ alone (all others as new), · domain, o original, | specified",
+    "html": "range: strong together, faint alone (all others as new), outline the domain, dot the original, "
+    "tick the specified limit",
 }
 
 

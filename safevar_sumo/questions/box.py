@@ -42,6 +42,12 @@ class Box:
         """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
         return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
 
+    def with_ends(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """Random settings with half of their values at ends, shape (number, n); fewer where not all are feasible."""
+        points = rng.random((number, len(self.lower)))
+        settings = self.at(np.where(rng.random(points.shape) < 0.5, np.round(points), points))
+        return np.asarray(settings[self.region.feasible(settings)])
+
     def spread_and_corners(self, number: int, seed: int) -> FloatArray:
         """Settings at Sobol points, and at as many corners, where all changes of the vehicle add up."""
         points = sobol_points(number, len(self.lower), seed)

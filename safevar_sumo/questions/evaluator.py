@@ -219,11 +219,27 @@ class Evaluator:
         """
         if not len(self.characteristics.scenario):
             return np.zeros((0, len(self.characteristics)))
-        drawn = sobol_settings(self.characteristics, CANDIDATES)
-        originals = self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
+        originals = self._originals
         valid = originals.take(originals.valid)
         least_safe_first = np.argsort(valid.f_safe, kind="stable")  # NaN is last
         return valid.settings[least_safe_first[:ENCOUNTERS]]
+
+    @cached_property
+    def share_left_out(self) -> float:
+        """The share of the encounters over the domain in which the original vehicle is not safe, so that they do not
+        count; 0 if the study searches no scenario.
+        """
+        if not len(self.characteristics.scenario):
+            return 0.0
+        originals = self._originals
+        is_possible = self.region.feasible(originals.settings)
+        return float(np.mean(~originals.valid[is_possible])) if is_possible.any() else 0.0
+
+    @cached_property
+    def _originals(self) -> Evaluations:
+        """Evaluations of the original vehicle in encounters over the domain."""
+        drawn = sobol_settings(self.characteristics, CANDIDATES)
+        return self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
 
     def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly.

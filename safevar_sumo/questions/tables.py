@@ -36,14 +36,15 @@ LATEX_CODES = str.maketrans(
 
 
 class Column(NamedTuple):
-    """A column of a table: its unit, its meaning, and how its numbers are written for readers, or whether JSON and CSV
-    alone have it.
+    """A column of a table: its unit, its meaning, how its numbers are written for readers, whether readers see it or
+    JSON and CSV alone have it, and its heading, by default its name.
     """
 
     unit: str
     meaning: str
     number_format: str = ".4g"
     is_shown: bool = True
+    head: str = ""
 
 
 Columns = dict[str, Column | str]
@@ -200,7 +201,7 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
                 texts = [text if exact or text == "-" else f"{text} ({interval})" for text, interval, exact in behind]
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
-        yield _ReaderColumn(f"{base.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
+        yield _ReaderColumn(f"{column.head or base.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:

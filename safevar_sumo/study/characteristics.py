@@ -297,4 +297,6 @@ def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], table:
                 if row.lower <= value <= row.upper:
                     why = f": the original, {row.original:g}{unit}, does not keep it"
                 legal = f"a number in [{lower:g}, {upper:g}]{unit}"
+                if row.lower <= value <= row.upper:
+                    legal += f"; did you mean {'<=' if side == 'at_least' else '>='} {value:g}?"
                 raise InputError("", f"{table}{name}.{side} = {value:g}{why}", legal)

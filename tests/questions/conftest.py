@@ -18,7 +18,7 @@ from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.questions import models, scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance import rows, search
+from safevar_sumo.questions.tolerance import counterexamples, search
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -44,7 +44,7 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (models, scope, rows, search):
+    for module in (models, scope, counterexamples, search):
         monkeypatch.setattr(module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
 
 

@@ -14,6 +14,7 @@ from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.tolerance.trial import CONFIRMATIONS
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
@@ -87,7 +88,7 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
     assert not tooth(points).any()
     assert relative_volume(found) > 0.02
     assert found.attack is not None
-    assert found.attack.simulated == 2000
+    assert found.attack.simulated == (1 + CONFIRMATIONS) * 2000
     region = region_of(made_up_study(3))
     whole = Box(region, np.zeros(3), np.full(3, 10.0))
     hit = attack(

@@ -32,6 +32,7 @@ from safevar_sumo.questions.compare.differences import (
     compare_originals,
     compare_values,
     limits_of_both,
+    new_collision_in_words,
 )
 from safevar_sumo.questions.compare.settings import (
     LINE,
@@ -83,7 +84,8 @@ def compare(
 ) -> Answer:
     """Compare two studies or results, A and B: what is better in B, and what is worse.
 
-    One criterion counts for both. Where the original vehicles differ, the same changes of each are compared. The filter
+    A version B whose original vehicle collides where A's does not is not to be released: exit code 3. One criterion
+    counts for both. Where the original vehicles differ, the same changes of each are compared. The filter
     of small changes, whose thresholds are a search's, does not act.
 
     Parameters
@@ -141,7 +143,9 @@ def compare(
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
         **originals_numbers,
     }
+    refusal = new_collision_in_words(evaluators, titles)
     sentences = [
+        *([f"{refusal}."] if refusal else []),
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         *_verdict(difference, titles, criteria[0], is_measured=bool(numbers["benign_scenes"])),
         _test_in_words(tested),
@@ -154,6 +158,7 @@ def compare(
         verdict=" ".join(sentences),
         numbers=numbers,
         tables={"limits": limits_table, "settings": _settings_table(common, settings)},
+        failures=(refusal,) if refusal else (),
         draw=partial(draw_pairs, titles=titles),
     )
 

@@ -19,10 +19,12 @@ from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.questions.tolerance.counterexamples import where_in_words
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic
 
@@ -41,6 +43,8 @@ UNDEFINED = (np.nan, np.nan)
 """The ends of no interval."""
 MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
+OF_OWN_FIT = "with the study's own fit"
+"""In which of the vehicle models that fit the published data the limits are."""
 LEAST_METRES = 0.05
 """A smaller distance by which a vehicle brakes earlier or later is not told [m]."""
 
@@ -87,8 +91,8 @@ def compare_values(quantity: str, p: float, a12: float) -> Difference:
 def limits_of_both(
     evaluators: Sequence[Evaluator], criteria: Sequence[Unsafe], limits: Mapping[str, Limit]
 ) -> pd.DataFrame:
-    """The table of limits alone, rounded as `tolerance` rounds them, within the user's limits; no interval where the
-    original is unsafe.
+    """The table of limits alone with the study's own fit, rounded as `tolerance` rounds them, within the user's limits;
+    no interval where the original is unsafe.
     """
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     scans = [scan(one, columns, unsafe) for one, unsafe in zip(evaluators, criteria, strict=True)]
@@ -100,7 +104,7 @@ def limits_of_both(
         ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
         ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
         rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
-    return tabulate("Limits of each alone, rounded to the safe side", LIMIT_COLUMNS, rows)
+    return tabulate(f"Limits of each alone {OF_OWN_FIT}, rounded to the safe side", LIMIT_COLUMNS, rows)
 
 
 def _within(one: OneAtATimeScan, ends: Interval) -> Interval | None:
@@ -135,7 +139,7 @@ def _moved_limits(limits: pd.DataFrame, members: Sequence[Characteristic], chang
     texts = [_limit_in_words(limits.iloc[number], members[number]) for number in numbers[:MAX_LIMITS_NAMED]]
     if len(numbers) > MAX_LIMITS_NAMED:
         texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
-    return [f"has limits that {verb}: {join_phrases(texts)}"] if texts else []
+    return [f"has limits {OF_OWN_FIT} that {verb}: {join_phrases(texts)}"] if texts else []
 
 
 def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
@@ -173,6 +177,32 @@ def compare_originals(
     if phrases:
         parts.append(Difference(facts=[f"brakes {join_phrases(phrases)}"]))
     return numbers, Difference.joined(parts)
+
+
+def new_collision_in_words(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> str:
+    """A sentence on the fastest collision of B's original vehicle at a point where A's does not collide; "" without
+    one. A point that A does not have counts unless A's original vehicle collides anywhere.
+    """
+    systems = [assemble(one.study) for one in evaluators]
+    in_a, in_b = (
+        {result.point.name: result for result in simulate_all_points(system, one.characteristics.original[np.newaxis])}
+        for system, one in zip(systems, evaluators, strict=True)
+    )
+    collides_in_a = {name: bool(result.evaluations.collided[0]) for name, result in in_a.items()}
+    new = [
+        (float(-result.evaluations.f_safe[0]), result.point)
+        for name, result in in_b.items()
+        if result.evaluations.collided[0] and not collides_in_a.get(name, any(collides_in_a.values()))
+    ]
+    if not new:
+        return ""
+    speed, point = max(new, key=lambda pair: pair[0])
+    where = where_in_words(systems[1].points, point, point.scenario, {})
+    more = f" ({number_of(len(new), 'such point')})" if len(in_b) > 1 else ""
+    a, b = titles
+    return (
+        f"Do not release {b}: its original vehicle collides at {speed:.2f} m/s{where}, where that of {a} does not{more}"
+    )
 
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:

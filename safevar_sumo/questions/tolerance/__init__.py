@@ -25,6 +25,7 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneSearch
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
+from safevar_sumo.questions.tolerance.left_out import Contacts, contacts_left_out
 from safevar_sumo.questions.tolerance.levels import LevelSearch
 from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
@@ -34,7 +35,7 @@ from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.questions.tolerance.trial import TRIAL_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE, wider_rows
-from safevar_sumo.questions.tolerance.words import verdict_sentences
+from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED, USUAL_BUDGET, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE, Limit, Study, limits_of
@@ -85,7 +86,8 @@ NEAREST: Columns = {
 
 @question
 @contents(
-    *("unsafe", "margin", "kept", "scope", "boxes", "up_to", *OF_BOX),
+    *("unsafe", "margin", "kept", "rough", "scope", "boxes", "contacts_left_out", *OF_BOX),
+    *("up_to", "original_keeps_up_to", "original_safe_up_to"),
     limits=(*LIMITS, "by_{by}", "scope"),
     intervals=INTERVALS,
     uncertainty=UNCERTAINTY,
@@ -103,7 +105,7 @@ def tolerance(
     margin: Margin = None,
     unsafe: Criterion = None,
     fits: Annotated[int | None, Range(0, 1000)] = None,
-    attack: Annotated[int, Range(0, 100_000_000)] = 5000,
+    attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     by: Annotated[str | None, "NAME=V1,V2,..."] = None,
     together: bool = False,
 ) -> Answer:
@@ -130,7 +132,8 @@ def tolerance(
         Number of vehicle models that fit the published data about as well (sets of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
     attack
-        Number of simulations that are aimed at the limits together, over all fits; 0 leaves the attack out.
+        Number of simulations that search for a counterexample to the limits together, over all fits, at least 1,000; 0
+        leaves this search out, and then no limit is called kept. With fewer than by default the answer is rough.
     by
         A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits alone that hold up
         to each, and up to which value the specified limits hold.
@@ -154,9 +157,11 @@ def tolerance(
     is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
     if is_sought:
         _check_drawable(evaluator)
-    with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(columns)):
-        scans = scan(evaluator, columns, criterion)
     is_safe = not criterion.of(original)[0]
+    # Around an unsafe original there is nothing to scan.
+    within = None if is_safe else [(members.original[column],) * 2 for column in columns]
+    with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(columns)):
+        scans = scan(evaluator, columns, criterion, within, None if is_safe else 1)
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
     judges = _denser(models, attack) if is_sought else models.members
     search_alone = AloneSearch(scans, columns, judges)
@@ -173,7 +178,12 @@ def tolerance(
             found_together = find_limits_together(models, all_columns, all_limits, scans, unsafe_settings, attack)
             search_alone.meet(found_together.searched, found_together.failures_alone)
     alone = search_alone.limits()
-    found = limit_rows(alone, found_together, specified, models.members)
+    contacts = None
+    if found_together is not None and attack and len(members.scenario):
+        contacts = contacts_left_out(models.members, [found_together.box or found_together.promise])
+    found = limit_rows(alone, found_together, specified, models.members, scope_of(study, between=attack > 0))
+    if not attack:
+        found = found.without_kept()
     tables = {
         "limits": tabulate(LIMITS_TITLE, LIMITS, found.rows),
         "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
@@ -194,29 +204,38 @@ def tolerance(
         tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
     refusal = "" if is_safe else f"the original itself {criterion.breach_in_words(original)}: no limit can be kept"
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in found.broken)
+    is_kept = None if not failures and specified and not attack else not failures
     sentences = verdict_sentences(
-        models, alone, found_together, specified, found.broken, attack, nearest, wider, refusal
+        models, alone, found_together, specified, found.broken, attack, nearest, wider, refusal, contacts
     )
     return Answer(
         question="tolerance",
         study=study,
         verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
-        numbers=_numbers(study, criterion, models, found_together, not failures, attack),
+        numbers=_numbers(study, criterion, models, found_together, is_kept, attack, contacts),
         tables=tables,
-        failures=failures,
+        failures=(NOT_FALSIFIED,) if is_kept is None else failures,
         draw=partial(_draw, scans=scans),
     )
 
 
 def _numbers(
-    study: Study, criterion: Unsafe, models: Models, together: LimitsTogether | None, is_kept: bool, attack: int
+    study: Study,
+    criterion: Unsafe,
+    models: Models,
+    together: LimitsTogether | None,
+    is_kept: bool | None,
+    attack: int,
+    contacts: Contacts | None,
 ) -> dict[str, Any]:
     """The numbers of the answer; without limits together those about them are undefined."""
     numbers: dict[str, Any] = {
         "unsafe": str(criterion),
         "margin": criterion.keep,
         "kept": is_kept,
+        "rough": attack < USUAL_BUDGET,
         "scope": scope_of(study, between=attack > 0),
+        "contacts_left_out": None if contacts is None else contacts.number,
     }
     if together is None:
         return {**numbers, **dict.fromkeys(OF_BOX), "boxes": 0}

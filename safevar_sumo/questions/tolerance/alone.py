@@ -9,22 +9,20 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.attack import attack_all
+from safevar_sumo.questions.boundary import Move, find_boundaries
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import Characteristic
 
 VALUES = 17
 """Number of values of what is safe alone in the study's own fit that are simulated in each model."""
-PARTS, ROUNDS = 8, 4
-"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts."""
-MOVED_BEFORE = 8
-"""Number of failures, the nearest to the original, in whose encounters a limit is safe at once."""
-ATTACKS, ATTACK_SHARE, GENERATIONS = 8, 0.1, 5
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each, and its
-number of generations, the first at the limit itself.
+ATTACKS, ATTACK_SHARE, GENERATIONS = 20, 0.1, 5
+"""Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each, though
+never less than `LEAST_SIMULATIONS`, and its number of generations, the first at the limit itself.
 """
 ALONE_STAGE = "limits alone with each fit"
 Beyond = tuple[FloatArray, Model] | None
@@ -68,76 +66,29 @@ class AloneLimit(NamedTuple):
 class _Ends:
     """The ends of what is safe of one characteristic, which failures move towards the original."""
 
-    def __init__(self, scan: OneAtATimeScan, column: int, own: Model) -> None:
-        item = scan.characteristic
+    def __init__(self, scan: OneAtATimeScan, column: int) -> None:
         assert scan.safe is not None
-        self.item = item
+        self.item = scan.characteristic
         self.column = column
         self.scan = scan
         self.ends = [*scan.safe]
-        members = own.evaluator.characteristics
         self.failures = list[FloatArray]()
         self.beyond: list[Beyond] = [None, None]
-        for side, last in enumerate((item.lower, item.upper)):
-            values = [value for pair in scan.of_state("unsafe") for value in pair]
-            outside = [value for value in values if (value < self.ends[0] if side == 0 else value > self.ends[1])]
-            if self.ends[side] != last and outside:
-                nearest = min(outside, key=lambda value: abs(value - item.original))
-                self.beyond[side] = members.setting({item.name: nearest}), own
+
+    def first_unsafe(self, side: int) -> float | None:
+        """The unsafe value of the scan that is nearest beyond an end; None without one."""
+        end = self.ends[side]
+        values = [value for pair in self.scan.of_state("unsafe") for value in pair]
+        outside = [value for value in values if (value < end if side == 0 else value > end)]
+        return min(outside, key=lambda value: abs(value - self.item.original), default=None)
+
+    def give_up(self) -> None:
+        """Leave no room around the original."""
+        self.ends = [self.item.original, self.item.original]
 
     def limit(self) -> AloneLimit:
         safe = self.item.rounded_inwards((self.ends[0], self.ends[1]))
         return AloneLimit(self.scan, safe, (self.beyond[0], self.beyond[1]))
-
-
-class Move:
-    """The move of an end of one column between a safe value and the nearest of some failures, shape (K, n): to the last
-    value before it that is safe in the encounters of them all.
-
-    Attributes
-    ----------
-    safe, failure
-        The last safe value, and the failure just beyond it, shape (n,).
-    """
-
-    def __init__(self, column: int, start: float, failures: FloatArray) -> None:
-        self.column = column
-        self.safe = start
-        order = np.argsort(np.abs(failures[:, column] - start), kind="stable")
-        self.encounters = failures[order[:MOVED_BEFORE]]
-        self.failure = self.encounters[0]
-
-    @property
-    def _values(self) -> FloatArray:
-        """The values of a round."""
-        return np.asarray(self.safe + (self.failure[self.column] - self.safe) * np.arange(1, PARTS) / PARTS)
-
-    @property
-    def settings(self) -> FloatArray:
-        """The settings of a round, shape (K (`PARTS` - 1), n)."""
-        settings = np.repeat(self.encounters, PARTS - 1, axis=0)
-        settings[:, self.column] = np.tile(self._values, len(self.encounters))
-        return settings
-
-    def narrow(self, are_unsafe: BoolArray) -> None:
-        """Take what a round gave."""
-        is_unsafe = are_unsafe.reshape(len(self.encounters), PARTS - 1)
-        values = self._values
-        first = int(np.argmax(np.append(is_unsafe.any(axis=0), True)))
-        self.safe = self.safe if first == 0 else float(values[first - 1])
-        if first < len(values):
-            self.failure = self.encounters[np.argmax(is_unsafe[:, first])].copy()
-            self.failure[self.column] = values[first]
-
-
-def carry_out(moves: Sequence[Move], model: Model) -> None:
-    """Carry out moves before failures in a model, side by side."""
-    for _ in range(ROUNDS):
-        settings = [each.settings for each in moves]
-        are_unsafe = model.are_unsafe(np.concatenate(settings), ALONE_STAGE)
-        parts = np.split(are_unsafe, np.cumsum([*map(len, settings)])[:-1])
-        for each, part in zip(moves, parts, strict=True):
-            each.narrow(part)
 
 
 class AloneSearch:
@@ -153,18 +104,25 @@ class AloneSearch:
         self.values = values
         self.ends = list[_Ends]()  # none where the original is unsafe
         if all(scan.safe is not None for scan in scans):
-            self.ends = [_Ends(scan, column, models[0]) for scan, column in zip(scans, columns, strict=True)]
+            self.ends = [_Ends(scan, column) for scan, column in zip(scans, columns, strict=True)]
+            _find_beyond(self.ends, models[0])
 
-    def run(self, budget: int) -> None:
-        """Try values in all models, in the encounters that the scans met and in those of an attack on the limits."""
+    def run(self, budget: int, further: Sequence[Model] = (), attacked: Models | None = None) -> None:
+        """Try values in all models, in the encounters that the scans met and in those of an attack on the limits; the
+        ends alone in `further` models, which have other points between those of a matrix. The attack may be in models
+        with more encounters.
+        """
         evaluator = self.models[0].evaluator
         encounters = np.concatenate([[evaluator.characteristics.original], evaluator.critical_encounters])
         for model in self.models if self.ends else ():
             _move_before(self.ends, model, encounters, self.values)
-            while _move_before(self.ends, model, encounters, 2):  # the ends alone, until all are safe
-                pass
+        # The ends as they are printed, until all are safe in all models: where one moves, it is new to the others.
+        all_models = [*self.models, *further] if self.ends else []
+        while any([_move_before(self.ends, model, encounters, 2) for model in all_models]):
+            pass
         if len(evaluator.characteristics.scenario) and budget:
-            _attack_alone(self.ends, self.models, round(ATTACK_SHARE * budget))
+            models = self.models if attacked is None else attacked.members
+            _attack_alone(self.ends, models, budget_alone(budget))
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
         """Move the limits before failures that another search met, each of one characteristic, shape (K, n)."""
@@ -181,6 +139,22 @@ class AloneSearch:
         return [each.limit() for each in self.ends] or [AloneLimit(scan, None) for scan in self.scans]
 
 
+def budget_alone(budget: int) -> int:
+    """Number of simulations of an attack on one limit."""
+    return max(round(ATTACK_SHARE * budget), LEAST_SIMULATIONS)
+
+
+def _find_beyond(ends: Sequence[_Ends], own: Model) -> None:
+    """Find what is just beyond the ends of scans: their first unsafe values, each in its worst encounter."""
+    members = own.evaluator.characteristics
+    places = [(each, side, each.first_unsafe(side)) for each in ends for side in (0, 1)]
+    found = [(each, side, value) for each, side, value in places if value is not None]
+    settings = np.array([members.setting({each.item.name: value}) for each, _, value in found])
+    worst = own.evaluator.evaluate_over_encounters(settings.reshape(-1, len(members)), own.unsafe, ALONE_STAGE)
+    for (each, side, _), setting in zip(found, worst.settings, strict=True):
+        each.beyond[side] = setting, own
+
+
 def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, number: int) -> bool:
     """Move ends before the failures at some values between them, the ends among them, in each of some encounters;
     whether one has moved.
@@ -191,8 +165,8 @@ def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, nu
 
 
 def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatArray:
-    """Settings at values between the ends, in each of some encounters, shape (K, n)."""
-    low, high = ends.ends
+    """Settings at values between the ends as they are printed, in each of some encounters, shape (K, n)."""
+    low, high = ends.limit().safe or ends.ends
     values = np.linspace(low, high, number)
     settings = np.repeat(encounters, len(values), axis=0)
     settings[:, ends.column] = np.tile(values, len(encounters))
@@ -217,7 +191,7 @@ def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -
         for side, of_side in enumerate(_by_side(each, rows))
         if len(of_side)
     }:
-        carry_out([*moves.values()], model)
+        find_boundaries([*moves.values()], model, ALONE_STAGE)
         for (number, side), move in moves.items():
             ends[number].ends[side] = move.safe
             ends[number].beyond[side] = move.failure, model
@@ -261,4 +235,6 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
             _move(waiting, model, [one.settings[(one.left < 0) & (one.judges == judge)] for one in found])
         waiting = [each for each, one in zip(waiting, found, strict=True) if (one.left < 0).any()]
         if not waiting:
-            break
+            return
+    for each in waiting:
+        each.give_up()

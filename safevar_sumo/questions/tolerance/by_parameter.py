@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -209,3 +210,10 @@ def _number(text: str, whole: str) -> float:
     if not math.isfinite(number):
         raise InputError("by", f"{whole!r}: {text!r} is no number", FORM)
     return number
+
+
+def largest_tried(by: Parameter, points: Sequence[tuple[Point, bool]]) -> float | None:
+    """The largest value of an axis such that all points up to it, and those that lack it, hold; None without one."""
+    values = [(_value_at(point, by.name), holds) for point, holds in points]
+    reached = [value for value in by.values if all(holds for at, holds in values if not at > value)]
+    return reached[-1] if reached else None

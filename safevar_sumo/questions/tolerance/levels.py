@@ -5,22 +5,30 @@ below, and simulates only what is between the two.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.attack import Attack, attack
+from safevar_sumo.questions.attack import Attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import Falsification, Reach, enough, falsify, reach
 from safevar_sumo.questions.models import Model, Models, models_of, with_points_between
-from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond, Move, carry_out
+from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond
 from safevar_sumo.questions.tolerance.by_parameter import (
     Parameter,
     cells_between,
     study_between,
     with_feasible_encounter,
+)
+from safevar_sumo.questions.tolerance.left_out import (
+    STAGE as LEFT_OUT_STAGE,
+    Contacts,
+    OriginalReach,
+    contacts_left_out,
+    original_reach,
 )
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxGeometry
@@ -32,12 +40,8 @@ SEARCHED_VALUES, VALUES_OF_FITS = 51, 5
 """Numbers of values, over what is safe up to the value below, at which a characteristic is scanned in many encounters:
 with the study's own fit, and with each.
 """
-PROMISE_POINTS = 128
-"""Number of Sobol points, and of corners, at which specified limits are tried in each fit."""
-KNOWN = 16
-"""Number of the worst of these with which the attack on specified limits begins in each fit."""
-REACHES = 12
-"""Largest number of attacks that seek the value up to which specified limits hold."""
+FURTHER_SEEDS = ((5, 1), (5, 2))
+"""Seeds of further points between those of a matrix, at which limits alone are tried as they are printed."""
 STAGE = "specified limits up to a value"
 
 
@@ -64,16 +68,9 @@ class Level(NamedTuple):
     alone: list[AloneLimit] | None
     models: Models
     search: AloneSearch | None = None
-    failures: list[tuple[Model, FloatArray]] | None = None
+    failures: Sequence[tuple[Model, FloatArray]] | None = None
     attack: Attack | None = None
     together: LimitsTogether | None = None
-
-
-class Reach(NamedTuple):
-    """The value up to which specified limits hold, None if they hold up to none, and the attack that found nothing."""
-
-    value: float | None = None
-    attack: Attack | None = None
 
 
 class LevelSearch:
@@ -97,7 +94,36 @@ class LevelSearch:
         self.fits = fits
         self.budget = budget
         self.is_searched = by.name in evaluator.study.scenario.search
+        self.column = evaluator.characteristics.names.index(by.name) if self.is_searched else -1
         self.whole = models_of(evaluator, unsafe, fits) if evaluator.study.scenario.search else None
+
+    @cached_property
+    def original(self) -> OriginalReach:
+        """How far the original vehicle itself keeps its margin."""
+        with self.evaluator.stage(LEFT_OUT_STAGE):
+            return original_reach(self.evaluator, self.by, self.unsafe)
+
+    def contacts(self, levels: Sequence[Level]) -> Contacts | None:
+        """Contacts, in encounters that do not count, of vehicles within the specified limits, or without such limits
+        within each limit alone up to the greatest value; None if no scenario is searched, or nothing was falsified.
+        """
+        alone = levels[-1].alone
+        if self.whole is None or not self.budget or alone is None:
+            return None
+        members = self.evaluator.characteristics
+        box = self._promise(self.whole.own)
+        if self.is_searched:
+            box.upper[self.column] = self.by.values[-1]
+        boxes = [box]
+        if not self.limits:
+            boxes = []
+            for column, limit in zip(self.columns, alone, strict=True):
+                lower = np.where(members.of_vehicle, members.original, box.lower)
+                upper = np.where(members.of_vehicle, members.original, box.upper)
+                lower[column], upper[column] = limit.safe or (members.original[column],) * 2
+                boxes.append(Box(box.region, lower, upper))
+        with self.evaluator.stage(LEFT_OUT_STAGE):
+            return contacts_left_out(self.whole.members, boxes, self.by.name if self.is_searched else "")
 
     def levels(self, known: FloatArray) -> list[Level]:
         """The limits up to each value, the least value first; before known failures of one characteristic, too."""
@@ -106,7 +132,25 @@ class LevelSearch:
             before = levels[-1] if levels else None
             with self.evaluator.stage(f"limits up to {self.by.text(value)}"):
                 levels.append(self._level(value, self.by.values[number - 1] if number else None, before, known))
-        return levels
+        return self._nested(levels)
+
+    def _nested(self, levels: Sequence[Level]) -> list[Level]:
+        """The levels with limits alone before all failures up to their values that the search of any of them met."""
+        searches = [level.search for level in levels if level.search is not None]
+        if not self.is_searched or not searches:
+            return [*levels]
+        failures = np.concatenate([search.failures for search in searches])
+        nested = list[Level]()
+        for level in levels:
+            if level.search is not None:
+                level.search.meet(level.models.members, self.up_to(level.value, failures))
+                alone = level.search.limits()
+                before = nested[-1].alone if nested else None
+                if before is not None:
+                    alone = [nested_limit(limit, earlier) for limit, earlier in zip(alone, before, strict=True)]
+                level = level._replace(alone=alone)
+            nested.append(level)
+        return nested
 
     def _level(self, value: float, low: float | None, before: Level | None, known: FloatArray) -> Level:
         models = self.models(low, value)
@@ -122,11 +166,12 @@ class LevelSearch:
         scans = scan(own.evaluator, self.columns, self.unsafe, within, numbers[0])
         if any(one.safe is None for one in scans):
             return Level(value, None, models)
-        judges = self._judges(models, low, value)
+        judges, *further = [self._judges(models, low, value, seed) for seed in ((5, 0), *FURTHER_SEEDS)]
         inside = self._inside(known, own.evaluator)
         search = AloneSearch(scans, self.columns, judges, numbers[1])
         search.meet([own], inside)
-        search.run(self.budget)
+        whole = self.models(None, value) if self.is_searched else None
+        search.run(self.budget, [model for each in further for model in each if model not in judges], whole)
         alone = search.limits()
         if before is not None and before.alone is not None:
             alone = [nested_limit(each, earlier) for each, earlier in zip(alone, before.alone, strict=True)]
@@ -134,8 +179,8 @@ class LevelSearch:
             return Level(value, alone, models, search)
         if before is not None and before.failures:
             return before._replace(value=value, alone=alone, models=models, search=search)
-        found, failures = self._attack(self._promise(own), judges, self.budget, 0)
-        return Level(value, alone, models, search, failures, found)
+        found = self._falsify(models, judges, value)
+        return Level(value, alone, models, search, found.failures or None, found.attack)
 
     def models(self, low: float | None, high: float) -> Models | None:
         """The fits between two values; None if no test of a matrix drives there."""
@@ -153,14 +198,14 @@ class LevelSearch:
             members.append(model._replace(evaluator=model.evaluator.for_study(of_fit, verified=0)))
         return self.whole._replace(members=tuple(members))
 
-    def _judges(self, models: Models, low: float | None, high: float) -> Sequence[Model]:
+    def _judges(self, models: Models, low: float | None, high: float, seeds: tuple[int, int]) -> Sequence[Model]:
         """The models, with further points between those of a matrix if there is an attack."""
         if not self.budget or self.whole is not None:
             return models.members
         cells = cells_between(self.evaluator.study, self.by, low, high)
         seed = self.evaluator.study.search.seed
         return [
-            with_points_between(model, self.unsafe, np.random.default_rng((seed, 5, 0)), cells)[0]
+            with_points_between(model, self.unsafe, np.random.default_rng((seed, *seeds)), cells)[0]
             for model in models.members
         ]
 
@@ -184,60 +229,41 @@ class LevelSearch:
         geometry = BoxGeometry(region, columns, {**self.limits, **everywhere})
         return geometry.printed(geometry.fixed)
 
-    def _attack(
-        self, promise: Box, judges: Sequence[Model], budget: int, number: int
-    ) -> tuple[Attack | None, list[tuple[Model, FloatArray]] | None]:
-        """An attack on specified limits; how they fail, None if they hold."""
+    def _falsify(self, models: Models, judges: Sequence[Model], value: float) -> Falsification[Model]:
+        """The falsification of the specified limits between two values, up to one that is printed."""
+        box = self._promise(models.own)
+        tested = (self.column, value) if self.is_searched else None
         seed = self.evaluator.study.search.seed
-        settings = np.unique(promise.spread_and_corners(PROMISE_POINTS, seed + number), axis=0)
-        lefts = [model.left(settings, STAGE) for model in judges]
-        failures = [(model, settings[left < 0]) for model, left in zip(judges, lefts, strict=True)]
-        found = None
-        if budget:
-            worst = [settings[np.argsort(left, kind="stable")[:KNOWN]] for left in lefts]
-            lefts_of = [partial(model.left, stage=STAGE) for model in judges]
-            found = attack(promise, lefts_of, worst, budget, np.random.default_rng((seed, 11, number)))
-            is_unsafe = found.left < 0
-            failures += [
-                (judges[judge], found.settings[is_unsafe & (found.judges == judge)])
-                for judge in np.unique(found.judges[is_unsafe])
-            ]
-        return found, [(model, rows) for model, rows in failures if len(rows)] or None
+        return falsify(box, judges, enough(self.budget), (seed, 11, 0), STAGE, tested)
 
-    def reach(self, levels: Sequence[Level]) -> Reach:
-        """The value up to which the specified limits hold: between two values of a searched parameter, the last at
-        which an attack finds nothing; of an axis, one of its values.
+    def reach(self, levels: Sequence[Level]) -> Reach[Model]:
+        """The value up to which the specified limits hold, at most that up to which the original keeps its margin:
+        between two values of a searched parameter, the last at which a falsification finds nothing; of an axis, one of
+        its values.
         """
-        if not self.limits:
-            return Reach()
-        kept = [level for level in levels if level.alone is not None and not level.failures]
-        last = Reach(kept[-1].value, kept[-1].attack) if kept else Reach()
-        if len(kept) == len(levels) or not self.is_searched or levels[len(kept)].alone is None:
+        last = Reach[Model]()
+        if not self.limits or not self.budget:
             return last
-        level = levels[len(kept)]
-        low = self.by.lowest if last.value is None else last.value
-        own = level.models.own
-        judges = level.models.members
-        column = own.evaluator.characteristics.names.index(self.by.name)
-        item = self.evaluator.characteristics.members[column]
-        promise = self._promise(own)
-        failures = level.failures
-        high = level.value
-        for number in range(1, REACHES + 1):
-            for model, rows in failures or ():
-                inside = rows[rows[:, column] <= high]
-                if len(inside):
-                    move = Move(column, low, inside)
-                    carry_out([move], model)
-                    high = move.safe
-            high = item.rounded(high, upwards=False)
-            if high <= low:
+        end = -np.inf if self.original.keeps_up_to is None else self.original.keeps_up_to
+        low = self.by.lowest
+        for level in levels:
+            high = min(level.value, end)
+            if level.alone is None or high <= low:
                 break
-            upper = promise.upper.copy()
-            upper[column] = high
-            found, failures = self._attack(Box(promise.region, promise.lower, upper), judges, self.budget, number)
-            if failures is None:
-                return Reach(high, found)
+            if not level.failures and high == level.value:
+                last = Reach(level.value, level.attack)
+                low = level.value
+                continue
+            if self.is_searched:
+                box = self._promise(level.models.own)
+                upper = box.upper.copy()
+                upper[self.column] = high
+                box = Box(box.region, box.lower, upper)
+                seed = self.evaluator.study.search.seed
+                failures = level.failures or ()
+                found = reach(box, self.column, level.models.members, enough(self.budget), (seed, 12), STAGE, failures)
+                last = last if found.value is None else found
+            break
         return last
 
 

@@ -11,15 +11,25 @@ import pandas as pd
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.falsify import Reach, enough
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
-from safevar_sumo.questions.tolerance.alone import ATTACK_SHARE, AloneLimit
+from safevar_sumo.questions.tolerance.alone import AloneLimit, budget_alone
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
-from safevar_sumo.questions.tolerance.levels import Level, LevelSearch, Reach
+from safevar_sumo.questions.tolerance.counterexamples import Failure, describe
+from safevar_sumo.questions.tolerance.left_out import Contacts
+from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
 from safevar_sumo.questions.tolerance.levels_together import levels_with_together
-from safevar_sumo.questions.tolerance.rows import LIMITS, NOWHERE, Failure, describe
+from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.tolerance.words import failure_in_words, trial_in_words
+from safevar_sumo.questions.tolerance.words import (
+    NOT_FALSIFIED,
+    USUAL_BUDGET,
+    contacts_in_words,
+    failure_in_words,
+    rough_in_words,
+    trial_in_words,
+)
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit, unit_text
@@ -38,42 +48,64 @@ def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answ
     of one characteristic that results hold, shape (K, n).
     """
     by = search.by
-    unsafe = search.unsafe
-    limits = search.limits
     study = search.evaluator.study
     levels = levels_with_together(search, known) if is_together else search.levels(known)
     with search.evaluator.stage("specified limits between two values"):
         reach = search.reach(levels)
+    contacts = search.contacts(levels)
     scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
-    is_safe = levels[0].alone is not None
-    is_kept = all(level.alone is not None and not level.failures for level in levels) if limits else is_safe
-    values = ["alone", *(["together"] if is_together else []), *(["kept"] if limits else [])]
+    is_kept = _is_kept(search, levels, reach)
+    values = ["alone", *(["together"] if is_together else []), *(["kept"] if search.limits else [])]
     frame = tabulate(
-        _title(by),
+        _title(by, is_together),
         columns_by(by),
         _rows(search, levels, scopes),
         wide=Wide(["characteristic", "unit", "original"], f"by_{by.name}", values, f"to {{:g}}{unit_text(by.unit)}"),
     )
-    sentences = [*_sentences(search, levels, frame, reach), f"Scope: {scopes[-1]}."]
+    sentences = [*_sentences(search, levels, frame, reach, contacts), f"Scope: {scopes[-1]}."]
     return Answer(
         question="tolerance",
         study=study,
         verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
         numbers={
-            "unsafe": str(unsafe),
-            "margin": unsafe.keep,
+            "unsafe": str(search.unsafe),
+            "margin": search.unsafe.keep,
             "kept": is_kept,
+            "rough": search.budget < USUAL_BUDGET,
             "scope": scopes[-1],
-            **_numbers(levels, reach, unsafe),
+            **_numbers(levels, reach, search.unsafe),
             "up_to": reach.value,
+            "original_keeps_up_to": search.original.keeps_up_to,
+            "original_safe_up_to": search.original.safe_up_to,
+            "contacts_left_out": None if contacts is None else contacts.number,
         },
         tables={"limits": frame},
-        failures=() if is_kept else (f"the limits hold up to {_text(by, reach.value)}, not {by.text(by.values[-1])}",),
+        failures=_failed(search, reach, is_kept),
         draw=lambda answer: _draw(answer, search),
     )
 
 
-def _numbers(levels: Sequence[Level], reach: Reach, unsafe: Unsafe) -> JsonObject:
+def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach[Model]) -> bool | None:
+    """Whether the specified limits hold up to the greatest value; without any, whether the original does. None where
+    that was not tested.
+    """
+    if not search.limits:
+        return levels[0].alone is not None
+    if any(level.alone is None or level.failures for level in levels):
+        return False
+    return reach.value == search.by.values[-1] if search.budget else None
+
+
+def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> tuple[str, ...]:
+    """What makes the command end with exit code 3."""
+    if is_kept:
+        return ()
+    if is_kept is None:
+        return (NOT_FALSIFIED,)
+    return (f"the limits hold up to {_text(search.by, reach.value)}, not {search.by.text(search.by.values[-1])}",)
+
+
+def _numbers(levels: Sequence[Level], reach: Reach[Model], unsafe: Unsafe) -> JsonObject:
     """Numbers about the limits up to the greatest value, and about the attack on the specified limits up to the value
     that they reach; `boxes` counts the values that have limits together.
     """
@@ -103,8 +135,9 @@ def columns_by(by: Parameter) -> Columns:
     return {**{name: LIMITS[name] for name in first}, **own, **{name: LIMITS[name] for name in rest}, **texts}
 
 
-def _title(by: Parameter) -> str:
-    return f"Limits up to each {by.name.replace('_', ' ')}, rounded to the safe side"
+def _title(by: Parameter, is_together: bool) -> str:
+    alone = "" if is_together else f" {ALONE}"
+    return f"Limits{alone} up to each {by.name.replace('_', ' ')}, rounded to the safe side"
 
 
 def _text(by: Parameter, value: float | None) -> str:
@@ -125,6 +158,7 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
             box = None if level.together is None else level.together.box
             failure = failures.get((level.value, number))
             kept = None if limit is None else not level.failures and _holds(alone, limit)
+            kept = None if kept and not search.budget else kept
             rows.append(
                 (
                     *(item.name, item.unit, item.original, level.value),
@@ -133,11 +167,20 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
                     *(*specified, kept),
                     UNSAFE_ORIGINAL if alone is None else None if failure is None else failure.words,
                     None if failure is None else _setting(members, failure),
-                    f"Up to {search.by.text(level.value)}, {_keep(item, alone, level.together, column)}.",
+                    f"Up to {search.by.text(level.value)}{_of_counted(search, level.value)}, "
+                    f"{_keep(item, alone, level.together, column)}. Scope: {scope}.",
                     scope,
                 )
             )
     return rows
+
+
+def _of_counted(search: LevelSearch, value: float) -> str:
+    """Which encounters a claim up to a value is about, where the original does not keep its margin in all of them."""
+    end = search.original.keeps_up_to
+    if not search.is_searched or (end is not None and value <= end):
+        return ""
+    return f", of the encounters in which the original keeps {search.evaluator.study.scenario.margin:g} m"
 
 
 def _setting(members: CharacteristicSet, failure: Failure) -> JsonObject:
@@ -187,27 +230,36 @@ def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
                 settings.setdefault(place[0], {})[place[1]] = setting
                 places[level.value, number] = place
     found = {number: describe(model, settings[number]) for number, model in models.items()}
-    return {key: found[model][name] for key, (model, name) in places.items()}
+    return {key: found[model][name] for key, (model, name) in places.items() if name in found[model]}
 
 
-def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame, reach: Reach) -> Iterator[str]:
-    """The sentences of the verdict, the allowed value first."""
+def _sentences(
+    search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame, reach: Reach[Model], contacts: Contacts | None
+) -> Iterator[str]:
+    """The sentences of the verdict, the allowed value first, then the original's own limit and what does not count."""
     by = search.by
     unsafe = search.unsafe
     study = search.evaluator.study
     names = dict.fromkeys(point.weather.name.replace("_", " ") for point in assemble(study).points)
-    where = f"On a {' or '.join(names)} road"
-    if search.limits:
+    where = f"{rough_in_words(search.budget)}On a {' or '.join(names)} road"
+    if search.limits and search.budget:
         what = join_phrases(_limit_texts(search))
         yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."
+    elif search.limits:
+        yield f"{where}, up to which value the specified limits hold was not tested: {NOT_FALSIFIED}."
     else:
         yield f"{where}, each alone, all others as in the original: {'; '.join(_allowed(search, frame))}."
+    yield _original_in_words(search)
+    if contacts is not None:
+        yield from contacts_in_words(search.evaluator, contacts)
     values = f"{join_phrases(f'{value:g}' for value in by.values)}{unit_text(by.unit)}"
     members, left_out = levels[-1].models
     tried = len(members) + len(left_out)
     fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
     failure = failure_in_words(unsafe, len(members))
-    yield f"Limits up to {values} hold {fits}: within them no vehicle that was tried {failure}."
+    counted = _of_counted(search, by.values[-1])
+    of_counted = f"{counted}," if counted else ""
+    yield f"Limits up to {values}{of_counted} hold {fits}: within them no vehicle that was tried {failure}."
     yield _tried(search)
     for level in levels:
         if level.together is not None and level.together.box is not None:
@@ -220,15 +272,27 @@ def _sentences(search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame
         yield f"No limits together were found up to {join_phrases(without)}{unit_text(by.unit)}."
 
 
+def _original_in_words(search: LevelSearch) -> str:
+    """Up to which value the original vehicle itself keeps its margin, and touches nobody."""
+    by = search.by
+    study = search.evaluator.study
+    keeps, safe = search.original
+    margin = study.scenario.margin if search.is_searched else search.unsafe.keep
+    if keeps == by.values[-1]:
+        return f"The original vehicle keeps {margin:g} m up to {by.text(keeps)}."
+    touches = "" if safe == keeps else f" and touches nobody up to {_text(by, safe)}"
+    return f"The original vehicle itself keeps {margin:g} m only up to {_text(by, keeps)}{touches}."
+
+
 def _tried(search: LevelSearch) -> str:
     """What was driven beside scans for limits alone."""
     if not search.budget:
         return "Not attacked."
     texts = ["points between those of the study"]
     if search.evaluator.study.scenario.search:
-        texts = [f"{round(ATTACK_SHARE * search.budget):,} aimed at each limit between two values"]
+        texts = [f"{budget_alone(search.budget):,} aimed at each limit"]
     if search.limits:
-        texts.append(f"{search.budget:,} aimed at the specified limits")
+        texts.append(f"{enough(search.budget):,} aimed at the specified limits")
     return f"Tried beside scans: {join_phrases(texts)}."
 
 

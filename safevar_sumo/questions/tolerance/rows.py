@@ -7,29 +7,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.alone import AloneLimit
+from safevar_sumo.questions.tolerance.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
-from safevar_sumo.scenarios import FROM_CENTRES, Scenario
+from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.study import Limit
-from safevar_sumo.sumo.encounters import encounter
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
+ALONE = "alone (only if all other parts are as new)"
+"""Heading of the limits of one characteristic alone, which do not hold together."""
 CHARACTERISTIC: Columns = {"characteristic": "characteristic of the vehicle", "unit": "unit of its values"}
 LIMITS: Columns = {
     **CHARACTERISTIC,
     "original": Column("", "value of the original vehicle", ".6g"),
     **{
-        f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g")
-        for name, meaning in (
-            ("alone", "that is safe with all others as in the original, with every fit"),
-            ("together", "that is safe with all others within theirs, with every fit"),
-            ("specified", "that the user's limit allows"),
+        f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g", head=head)
+        for name, meaning, head in (
+            ("alone", "that is safe with all others as in the original, with every fit", ALONE),
+            ("together", "that is safe with all others within theirs, with every fit", ""),
+            ("specified", "that the user's limit allows", ""),
         )
         for end in ("low", "high")
     },
@@ -53,14 +53,6 @@ Ends = tuple[float | None, float | None]
 NOWHERE: Ends = None, None
 
 
-class Failure(NamedTuple):
-    """An unsafe setting, how it fails, in words, and the parameters of the point of the matrix where it does."""
-
-    setting: FloatArray
-    words: str
-    point: JsonObject
-
-
 class LimitRows(NamedTuple):
     """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept.
 
@@ -70,11 +62,21 @@ class LimitRows(NamedTuple):
     rows: list[tuple[Any, ...]]
     broken: list[str]
 
+    def without_kept(self) -> LimitRows:
+        """The rows of limits that nothing searched for a counterexample: none of them is called kept."""
+        place = [*LIMITS].index("kept")
+        rows = [(*row[:place], None if row[place] else row[place], *row[place + 1 :]) for row in self.rows]
+        return self._replace(rows=rows)
+
 
 def limit_rows(
-    alone: Sequence[AloneLimit], together: LimitsTogether | None, limits: Mapping[str, Limit], models: Sequence[Model]
+    alone: Sequence[AloneLimit],
+    together: LimitsTogether | None,
+    limits: Mapping[str, Limit],
+    models: Sequence[Model],
+    scope: str,
 ) -> LimitRows:
-    """The rows of the table of limits.
+    """The rows of the table of limits, whose sentences carry their scope.
 
     `together` is None in a rated study, and around an unsafe original.
     """
@@ -102,7 +104,7 @@ def limit_rows(
                 is_kept,
                 None if failure is None else failure.words,
                 None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True)),
-                None if together is None else _sentence(item, box, members, beyond.get(name)),
+                None if together is None else _sentence(item, box, members, beyond.get(name), scope),
             )
         )
     return LimitRows(rows, broken)
@@ -140,22 +142,24 @@ def _broken_in_words(
     """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`."""
     item = alone.characteristic
     by, end = _outside(alone, specified)
-    name = f"{item.name} {next(value for value in specified if value is not None):.10g}{item.suffix}"
     if by:
         members = models[0].evaluator.characteristics
-        setting = members.setting({item.name: end})
+        # At the specified value itself the original encounter may be safe; then what fails beyond the limit is said.
         for model in models:
-            if model.are_unsafe(setting[np.newaxis], "what fails first")[0]:
-                failure = describe(model, {item.name: setting})[item.name]
+            setting = members.setting({item.name: end})
+            if found := describe(model, {item.name: setting}, Box(model.evaluator.region, setting, setting)):
+                failure = found[item.name]
                 break
         words = "the car is unsafe" if failure is None else failure.words
         value = end if failure is None else failure.setting[members.names.index(item.name)]
-        shown = f"{value:.10g}{item.suffix}" if value == end else _text_beyond(item, value)
-        return f"{item.name} {shown}: {words} (outside by {by:.10g}{item.suffix})"
+        return f"{item.name} {limit_text(item, value)}: {words} (outside by {limit_text(item, by)})"
     assert together is not None
     fits = {model.fit: model for model in models}
     fit, setting = next(iter(together.broken.items()))
-    return f"{name}: with all specified limits, {describe(fits[fit], {'': setting})[''].words}"
+    found = describe(fits[fit], {item.name: setting}, together.promise)
+    words = found[item.name].words if found else "the car is unsafe"
+    specified_value = next(value for value in specified if value is not None)
+    return f"{item.name} {limit_text(item, specified_value)}: with all specified limits, {words}"
 
 
 def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:
@@ -178,47 +182,14 @@ def _failures_beyond(together: LimitsTogether, models: Sequence[Model]) -> dict[
             break
         is_unsafe = model.are_unsafe(np.array([*waiting.values()]), "what fails first")
         of_model = {name: setting for (name, setting), fails in zip(waiting.items(), is_unsafe, strict=True) if fails}
-        failures |= describe(model, of_model)
+        failures |= describe(model, of_model, together.box)
         waiting = {name: setting for name, setting in waiting.items() if name not in of_model}
     return failures
 
 
-def describe(model: Model, settings: Mapping[str, FloatArray]) -> dict[str, Failure]:
-    """How unsafe settings of a model fail at their worst points, by the same names."""
-    if not settings:
-        return {}
-    points = assemble(model.evaluator.study).points
-    members = model.evaluator.characteristics
-    points = tuple(points[number] for number in model.points) or points
-    runs = model.evaluate(np.array(list(settings.values())), "what fails first")
-    worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
-    fit = f" (fit {model.fit} of the vehicle)" if model.fit else ""
-    failures = {}
-    rows = zip(settings.items(), worst.tolist(), runs.collided, runs.f_safe, strict=True)
-    for (name, setting), point, collided, degree in rows:
-        values = dict(zip(members.scenario.names, setting[~members.of_vehicle].tolist(), strict=True))
-        scenario = encounter(points[point], values).scenario
-        words = _failure_in_words(scenario, model.unsafe, bool(collided), degree) + fit
-        failures[name] = Failure(setting, words, dict(points[point].parameters))
-    return failures
-
-
-def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
-    """A failure at a safety degree, such as `the car hits a pedestrian with 12 km/h in the test at 40 km/h`."""
-    if unsafe.is_of_points:  # points are of the whole matrix
-        return f"the car {unsafe.in_words}"
-    test = "" if scenario.test_speed is None else f" in the test at {KMH_PER_MS * scenario.test_speed:.3g} km/h"
-    if unsafe.bound is not None and not collided:
-        return f"the car {unsafe.in_words}{test}"
-    if collided:
-        impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-        impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
-        return f"the car hits {scenario.obstacle()}{impact}{test}"
-    measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
-    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from {scenario.obstacle()}{test}"
-
-
-def _sentence(item: Characteristic, box: Any, members: CharacteristicSet, failure: Failure | None) -> str:
+def _sentence(
+    item: Characteristic, box: Box | None, members: CharacteristicSet, failure: Failure | None, scope: str
+) -> str:
     """A sentence for a maintenance manual: all of these may be obeyed together."""
     name = item.short_name[:1].upper() + item.short_name[1:]
     if box is None:
@@ -227,38 +198,28 @@ def _sentence(item: Characteristic, box: Any, members: CharacteristicSet, failur
     ends: Interval = float(box.lower[column]), float(box.upper[column])
     domain = (item.lower, item.upper)
     if ends[0] == ends[1]:
-        return f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for it."
+        return (
+            f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for it. Scope: {scope}."
+        )
     keep = " and ".join(
         f"{word} {end:.10g}{item.suffix}"
         for word, end, last in zip(("at least", "at most"), ends, domain, strict=True)
         if end != last
     )
     if not keep:
-        return f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}."
+        return f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope: {scope}."
     beyond = "" if failure is None else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
-    return f"{name}: keep {keep}{beyond}."
+    return f"{name}: keep {keep}{beyond}. Scope: {scope}."
 
 
-def _vehicle_in_words(item: Characteristic, box: Any, members: CharacteristicSet, failure: Failure) -> str:
+def _vehicle_in_words(item: Characteristic, box: Box, members: CharacteristicSet, failure: Failure) -> str:
     """The vehicle that fails just beyond a limit: `at 0.81`, with what the table's title does not say of the others."""
-    others = [number for number, member in enumerate(members) if not member.is_scenario and member.name != item.name]
-    values = failure.setting[others]
-    is_corner = bool((np.isclose(values, box.lower[others]) | np.isclose(values, box.upper[others])).all())
+    named = list[str]()
+    for other, value, low, high in zip(members, failure.setting, box.lower, box.upper, strict=True):
+        # Others are at their limit, if they have one, and as in the original, if they have none.
+        limits = [end for end, last in ((low, other.lower), (high, other.upper)) if end != last] or [other.original]
+        is_said = len(set(limits)) == 1 and np.isclose(value, limits[0])
+        if other.name != item.name and not other.is_scenario and not is_said:
+            named.append(f"{other.name} {limit_text(other, value)}")
     value = failure.setting[members.names.index(item.name)]
-    named = [
-        f"{members.members[number].name} {_limit_text(members.members[number], failure.setting[number])}"
-        for number in others
-        if failure.setting[number] != members.original[number]
-    ]
-    rest = "" if is_corner else ", ".join(named)
-    return f"at {_text_beyond(item, value)}{f', with {rest}' if rest else ''}"
-
-
-def _limit_text(item: Characteristic, value: float) -> str:
-    """A value with the digits of a limit: limits are rounded once, and written without further zeros, as in tables."""
-    return f"{round(value, item.digits):.10g}{item.suffix}"
-
-
-def _text_beyond(item: Characteristic, value: float) -> str:
-    """A value beyond a limit with the digits of the limit, which it does not become by rounding."""
-    return _limit_text(item, item.rounded(value, upwards=value > item.original))
+    return f"at {limit_text(item, value)}{f', with {join_phrases(named)}' if named else ''}"

@@ -85,10 +85,11 @@ def scan(
     number: int | None = None,
 ) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, or intervals within them, one at a time; at `number` values, by default
-    `SCAN_VALUES`, in a rated study always `RATED_SCAN_VALUES`.
+    `SCAN_VALUES`, in a rated study `RATED_SCAN_VALUES`.
     """
     scanned = [evaluator.characteristics.members[column] for column in columns]
-    number, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (number or SCAN_VALUES, ROUNDS)
+    usual, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    number = number or usual
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [np.union1d(np.linspace(*end, number), item.original) for item, end in zip(scanned, ends, strict=True)]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)

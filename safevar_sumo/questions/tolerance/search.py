@@ -225,15 +225,16 @@ class BoxSearch(BoxGeometry):
         found = points[self.are_unsafe(points)]
         return found
 
-    def learn(self, settings: FloatArray) -> bool:
-        """Add corners that are unsafe, from some of these unsafe settings; whether there is a new one.
+    def learn(self, settings: FloatArray, model: Model | None = None) -> bool:
+        """Add corners that are unsafe, from some settings that are unsafe in a model, or in any; whether there is a new
+        one.
 
         One by one, as many changes of a setting as possible are undone while it stays unsafe; the directions of the
         remaining changes are the corner. All combinations of the next few are simulated at once. Without a new corner,
         boxes keep off all failures more.
         """
         number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
-        causes = self._causes(settings[:: len(settings) // number][:number])
+        causes = self._causes(settings[:: len(settings) // number][:number], model)
         known = {corner.tobytes(): corner for corner in [*self.corners, *self._corners_of(causes)]}
         is_new = len(known) > len(self.corners)
         self.corners = list(known.values())
@@ -258,8 +259,8 @@ class BoxSearch(BoxGeometry):
             self.unsafe_settings = self.unsafe_settings[is_kept]
         self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
 
-    def _causes(self, settings: FloatArray) -> FloatArray:
-        """Unsafe settings with as few changes as possible, from K unsafe ones, shape (K, n)."""
+    def _causes(self, settings: FloatArray, model: Model | None) -> FloatArray:
+        """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in any."""
         causes = settings.copy()
         columns = np.flatnonzero(self.is_free.any(axis=0))
         for start in range(0, len(columns), UNDONE_AT_ONCE):
@@ -268,7 +269,12 @@ class BoxSearch(BoxGeometry):
             is_undone = np.zeros((2 ** len(group), len(self.original)), dtype=bool)
             is_undone[:, group] = np.arange(2 ** len(group))[:, np.newaxis] & bits
             variants = np.where(is_undone, self.original, causes[:, np.newaxis])
-            for cause, of_cause, is_unsafe in zip(causes, variants, self.are_unsafe(variants), strict=True):
+            if model is None:
+                are_unsafe = self.are_unsafe(variants)
+            else:
+                rows = variants.reshape(-1, len(self.original))
+                are_unsafe = model.are_unsafe(rows, SEARCH_STAGE).reshape(variants.shape[:-1])
+            for cause, of_cause, is_unsafe in zip(causes, variants, are_unsafe, strict=True):
                 chosen = 0
                 for bit in bits:
                     chosen += bit * is_unsafe[chosen + bit]

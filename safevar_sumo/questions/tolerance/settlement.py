@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.questions.attack import attack
-from safevar_sumo.questions.box import MAX_CORNERS, Box
+from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Step
 from safevar_sumo.records import FloatArray
 
@@ -15,8 +15,12 @@ LEAST_MOVE = 1 / 50
 """A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
 STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
-CLEARANCE = 0.8
-"""Share of such a move by which a limit keeps off a failure that an attack found between corners."""
+ORDERS = 31
+"""Number of random orders in which failures are cut off."""
+CLEARANCE, RETREAT = 0.8, 0.15
+"""Share of such a move by which a limit keeps off a failure that an attack found between corners; and by how much more
+after each box that failed.
+"""
 SLAB_ATTACK = 512
 """Number of simulations of an attack on the room beyond a limit."""
 SLAB_CORNERS = 512
@@ -89,7 +93,7 @@ class Settlement:
         for values in ends:
             values[column] = end
         slab = Box(wider.region, *ends).corners(search.seed, 1)
-        slab = slab[: MAX_CORNERS if len(slab) <= MAX_CORNERS else SLAB_CORNERS]
+        slab = np.random.default_rng(search.seed).permutation(slab)[:SLAB_CORNERS]
         settings = np.concatenate([slab, search.settings_at_end(sides, step)])
         if search.have_unsafe(settings[np.newaxis])[0]:
             return True
@@ -101,27 +105,47 @@ class Settlement:
         search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
         return bool((found.left < 0).any())
 
-    def cut(self, box: Box) -> Box:
-        """A box without its known failures: for each, that limit moves in which loses the least volume, by somewhat
-        more than it needs to. A failure within the inner box refutes that one.
+    def cut(self, box: Box, attempts: int = 0) -> Box:
+        """The largest box within a box without its known failures that was found: they are cut off in several orders,
+        first those that leave the least choice of a limit to move in. A failure within the inner box refutes that one.
+
+        After more `attempts` that failed, limits keep off failures by more: where the response is not monotone, others
+        lie beside them.
         """
         search = self.search
-        while len(inside := search.unsafe_inside(search.sides_of(box))):
-            sides = search.sides_of(box)
-            extents = search.extents(inside[:1])[0]
-            choices = list[FloatArray]()
-            for side, column in np.argwhere(search.is_free & (extents > self.least)).tolist():
-                shorter = sides.copy()
-                end = extents[side, column] - CLEARANCE * LEAST_MOVE * search.width[column]
-                shorter[side, column] = max(end, self.least[side, column])
-                choices.append(shorter)
-            if choices:
-                box = search.printed(max(choices, key=search.log_volume))
-            elif self.least.any():
-                self.least = np.zeros_like(self.least)
-            else:
-                return search.printed(search.fixed)
-        return box
+        sides = search.sides_of(box)
+        failures = search.extents(search.unsafe_inside(sides))
+        if not len(failures):
+            return box
+        if self.least.any() and (failures <= self.least).all(axis=(1, 2)).any():
+            self.least = np.zeros_like(self.least)
+        choices = np.count_nonzero(search.is_free & (failures > self.least), axis=(1, 2))
+        if not choices.all():
+            return search.printed(search.fixed)
+        rng = np.random.default_rng((search.seed, 16))
+        orders = [np.argsort(choices, kind="stable"), *(rng.permutation(len(failures)) for _ in range(ORDERS))]
+        cuts = [
+            self._cut_off(sides, failures[order], CLEARANCE + RETREAT * attempts)
+            for order in orders[: len(failures) * ORDERS]
+        ]
+        return search.printed(max(cuts, key=search.log_volume))
+
+    def _cut_off(self, sides: FloatArray, failures: FloatArray, clearance: float) -> FloatArray:
+        """Sides without failures, given by their extents, shape (K, 2, n), which are cut off in turn: each by that side
+        which loses the least volume, by a `clearance` more than it needs to, as a share of a move.
+        """
+        search = self.search
+        sides = sides.copy()
+        while len(failures):
+            ends = np.maximum(failures[0] - clearance * LEAST_MOVE * search.width, self.least)
+            is_choice = search.is_free & (failures[0] > self.least)
+            lengths = sides.sum(axis=0)
+            left = np.maximum(lengths - sides + ends, 1e-9 * search.width + 1e-300)
+            kept = np.where(is_choice, left / np.maximum(lengths, 1e-300), -np.inf)
+            place = np.unravel_index(np.argmax(kept), kept.shape)
+            sides[place] = ends[place]
+            failures = failures[(failures <= sides).all(axis=(1, 2))]
+        return sides
 
     def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
         """For each limit that could move out further, a known failure that it then meets."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from safevar_sumo.questions.attack import Attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
+from safevar_sumo.questions.falsify import enough
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
@@ -17,8 +18,8 @@ from safevar_sumo.questions.tolerance.trial import Trial, Trials
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
-MAX_BOXES, MAX_GROWTHS = 40, 12
-"""Maximum number of boxes that are tested; and of tests of one whose limits have moved out."""
+MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 6, 3
+"""Maximum number of boxes that are tested; of those that a random search seeks; and of times that limits move out."""
 PROMISE_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
 
@@ -132,27 +133,53 @@ def find_limits_together(
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone. Causes of what is
     unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds anything.
-    Then all corners with each fit, an attack with `budget` simulations over all fits, and settings drawn at random test
-    it. What they find becomes part of what later boxes must survive, in that fit. At last each limit, as it is printed,
-    moves out as far as it can go, and the box is tested again; a failure then moves one limit in.
+    Then all corners with each fit, a search for counterexamples with `budget` simulations over all fits, and settings
+    drawn at random test it. What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
+    boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can go, at most
+    `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box is confirmed by further
+    searches for counterexamples. After `MAX_BOXES` boxes the largest that passed is confirmed, or none is found.
     """
     search, nothing = open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
         return nothing
     start = start_of(search, columns, scans)
-    trials = Trials(nothing.members, budget, models.own.evaluator)
+    trials = Trials(nothing.members, enough(budget), models.own.evaluator)
+    settlement = Settlement(search)
+    passed: Trial | None = None
+    outer: Box | None = None  # the box from which failures are cut off
+    growths = MAX_GROWTHS
+    failed = 0  # boxes since one passed
     for number in range(1, MAX_BOXES + 1):
-        with trials.evaluator.stage(SEARCH_STAGE):
-            sides = search.best(start)
-        if sides is None:
-            return without_box(nothing, search, number)
-        box = search.printed(sides)
-        settlement = Settlement(search)
-        if not _learn(search, trials, trials.first(box, number)):
-            passed = _grown(settlement, trials, box, number)
-            if passed is not None:
-                return result(nothing, settlement, passed, number)
-    return without_box(nothing, search, MAX_BOXES)
+        if outer is None or (growths == MAX_GROWTHS and number <= EXPLORED):
+            with trials.evaluator.stage(SEARCH_STAGE):
+                sides = search.best(start)
+            if sides is None:
+                break
+            outer = search.printed(sides)
+        box = settlement.cut(outer, failed)
+        # A box that is no larger than the one that passed ends the search, if further searches confirm that one.
+        is_last = passed is not None and (number == MAX_BOXES or volume(search, box) <= volume(search, passed.box))
+        trial = trials.confirmed(passed, number) if passed and is_last else trials.whole(box, number)
+        if _learn(search, trials, trial):
+            is_refuted = passed is not None and bool(len(search.unsafe_inside(search.sides_of(passed.box))))
+            passed = None if is_refuted else passed
+            failed += 1
+        elif is_last:
+            return result(nothing, settlement, trial, number)
+        else:
+            passed = trial
+            outer = box
+            failed = 0
+            if growths:
+                growths -= 1
+                with trials.evaluator.stage(SEARCH_STAGE):
+                    outer = settlement.of(box)
+    return without_box(nothing, search, number)
+
+
+def volume(search: BoxSearch, box: Box) -> float:
+    """The logarithm of a box's volume, as a share of the domain's."""
+    return float(search.log_volume(search.sides_of(box)))
 
 
 def open_search(
@@ -198,38 +225,8 @@ def _learn(search: BoxSearch, trials: Trials, trial: Trial) -> bool:
         for failures in trial.failures:
             search.join(failures.model)
             search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
-            search.learn(failures.settings)
+            search.learn(failures.settings, failures.model)
     return bool(trial.failures)
-
-
-def _grown(settlement: Settlement, trials: Trials, box: Box, number: int) -> Trial | None:
-    """The trial that a box passes whose limits have moved out as far as they can; None if too many boxes fail.
-
-    Where a box fails, a limit of it moves in, or of the box from which it grew, whichever stays larger.
-    """
-    search = settlement.search
-    passed = None
-
-    def volume(one: Box) -> float:
-        return float(search.log_volume(search.sides_of(one)))
-
-    with trials.evaluator.stage(SEARCH_STAGE):
-        wider = settlement.of(box)
-    for growth in range(1, MAX_GROWTHS + 1):
-        trial = trials.whole(wider, number + growth)
-        if _learn(search, trials, trial):
-            rest = settlement.cut(box)
-            passed = passed if rest is box else None
-            box = rest
-            wider = max(settlement.cut(wider), box, key=volume)
-        else:
-            passed = trial
-            box = wider
-            with trials.evaluator.stage(SEARCH_STAGE):
-                wider = settlement.of(box)
-        if passed is not None and volume(wider) <= volume(box):
-            break
-    return passed
 
 
 def start_of(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:

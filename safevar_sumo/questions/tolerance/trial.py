@@ -19,7 +19,9 @@ MAX_UNSAFE_SHARE = 0.003
 KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
 FIRST_SHARE = 0.2
-"""Share of the attack's budget of a first trial, before limits have moved out."""
+"""Share of the attack's budget of a quick trial."""
+CONFIRMATIONS, STARTS = 3, 256
+"""Number of further attacks on a box that is to be printed, and of settings with which each begins."""
 QUICK_CORNERS = 1024
 """Number of corners of a quick trial, in each fit."""
 TRIAL_STAGE = "test of the limits together"
@@ -67,14 +69,6 @@ class Trials:
         self._proofs = 0
         self._failing = {0}
         """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
-
-    def first(self, box: Box, attempt: int) -> Trial:
-        """Try the corners in the models in which earlier boxes failed, and a short attack."""
-        corners = box.corners(self.seed, attempt)[:MAX_CORNERS]
-        budget = round(FIRST_SHARE * self.budget)
-        with self.evaluator.stage(TRIAL_STAGE, len(self._failing) * len(corners) + budget):
-            lefts = self._left(corners, self._failing)
-            return self._failed(box, corners, lefts) or self._attack(box, corners, lefts, budget, attempt)
 
     def quick(self, box: Box, attempt: int, fits: Collection[int], known: FloatArray) -> Trial:
         """Try known settings and some corners in some fits, and a short attack in these, which goes on from those that
@@ -145,13 +139,7 @@ class Trials:
         if not budget:
             return Trial(box, judges=self.models)
         numbers = range(len(self.models)) if numbers is None else numbers
-        own = self.models[0]
-        judges = list[Model]()
-        left_out = list[int]()
-        for model in [self.models[number] for number in numbers]:
-            denser, number = with_points_between(model, own.unsafe, np.random.default_rng((self.seed, 5, attempt)))
-            judges.append(denser)
-            left_out.append(number)
+        judges, left_out = self._denser([self.models[number] for number in numbers], attempt)
         orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
         worst = [corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]] for number in numbers]
         rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
@@ -161,7 +149,35 @@ class Trials:
             for number, model in enumerate(judges)
             for one in failures_of(model, found.settings[found.judges == number], found.left[found.judges == number])
         ]
-        return Trial(box, failures, judges=judges, attack=found, left_out=left_out[0])
+        return Trial(box, failures, judges=judges, attack=found, left_out=left_out)
+
+    def confirmed(self, trial: Trial, attempt: int) -> Trial:
+        """A trial that passed, with `CONFIRMATIONS` more attacks of as many simulations, which begin anew elsewhere."""
+        if trial.attack is None:
+            return trial
+        box = trial.box
+        with self.evaluator.stage(TRIAL_STAGE, CONFIRMATIONS * self.budget):
+            found = trial.attack
+            for number in range(CONFIRMATIONS):
+                rng = np.random.default_rng((self.seed, 15, attempt, number))
+                judges, _ = self._denser(self.models, attempt + number)
+                starts = [box.with_ends(STARTS // len(judges), rng) for _ in judges]
+                rows = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
+                found = found.merged(attack(box, rows, starts, self.budget, rng))
+                if (found.left < 0).any():
+                    break
+        failures = [
+            one
+            for number, model in enumerate(judges)
+            for one in failures_of(model, found.settings[found.judges == number], found.left[found.judges == number])
+        ]
+        return trial._replace(attack=found, failures=failures)
+
+    def _denser(self, models: Sequence[Model], attempt: int) -> tuple[list[Model], int]:
+        """Models with further points between those of a matrix, and the number of such points that do not count."""
+        own = self.models[0].unsafe
+        found = [with_points_between(model, own, np.random.default_rng((self.seed, 5, attempt))) for model in models]
+        return [model for model, _ in found], found[0][1]
 
     def _prove(self, trial: Trial, attempt: int) -> Trial:
         self._proofs += 1

@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.attack import Rows, attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Models, limit_criterion, models_of
+from safevar_sumo.questions.falsify import Falsification, falsify, reach
+from safevar_sumo.questions.models import Model, Models, limit_criterion, models_of
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
-from safevar_sumo.questions.tolerance.rows import describe
+from safevar_sumo.questions.tolerance.counterexamples import Failure, describe
+from safevar_sumo.questions.tolerance.left_out import leading_parameter
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.words import encounter_in_words
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit, Study, load_study
 
 WIDER_STAGE = "attack in the wider scope"
+MOST_COMPARED = 64
+"""Largest number of failures of which the worst is printed."""
 WIDER: Columns = {
     "study": "the wider study",
     "scope": Column("", "what it covers", is_shown=False),
     "kept": "whether the limits above hold there with every fit",
-    "verdict": "what an attack found there",
+    "verdict": "what a search for counterexamples found there",
+    "fails_at": Column("", "the vehicle that fails first, and its encounter", is_shown=False),
 }
 
 
@@ -72,18 +74,20 @@ def wider_rows(
     if together.box is None and not limits:
         return []
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
-    judges = [partial(model.left, stage=WIDER_STAGE) for model in models.members]
-    with evaluator.stage(WIDER_STAGE, budget):
-        found = attack(box, judges, [], budget, np.random.default_rng((study.search.seed, 9)))
-    is_kept = not (found.left < 0).any()
-    return [
-        (
-            study.name,
-            scope_of(study),
-            is_kept,
-            _verdict(models, found.settings, found.judges, found.left, found.simulated),
-        )
-    ]
+    seed = study.search.seed, 9
+    with other.stage(WIDER_STAGE, budget):
+        found = falsify(box, models.members, budget, seed, WIDER_STAGE)
+    lowest = None
+    if found.failures and study.scenario.search:
+        column = other.characteristics.names.index(leading_parameter(study))
+        with other.stage(WIDER_STAGE):
+            below = reach(box, column, models.members, budget, seed, WIDER_STAGE, found.failures)
+        failing = [(model, row) for model, rows in below.failures for row in rows]
+        lowest = min(failing, key=lambda pair: float(pair[1][column]))
+    verdict, failure = _verdict(models, box, found, lowest)
+    members = other.characteristics
+    fails_at = None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True))
+    return [(study.name, scope_of(study), not found.failures, verdict, fails_at)]
 
 
 def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
@@ -100,17 +104,28 @@ def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
     return Box(models.own.evaluator.region, lower, upper)
 
 
-def _verdict(models: Models, settings: FloatArray, judges: Rows, left: FloatArray, simulated: int) -> str:
-    """What the attack found, in words."""
-    if not len(left):
-        return f"none of {simulated:,} simulations met an encounter that counts."
-    model = models.members[int(judges[0])]
-    members = model.evaluator.characteristics
-    values = dict(zip(members.names, settings[0].tolist(), strict=True))
-    where = encounter_in_words(members, values)
-    if left[0] >= 0:
-        keeps = model.unsafe.value_in_words(model.unsafe.value(left[0]))
-        return f"they hold: the worst of {simulated:,} aimed at them {keeps}{where}."
-    words = describe(model, {"": settings[0]})[""].words
-    new_car = ", where the new car is safe" if where else ""  # other encounters of a searched scenario do not count
-    return f"they do not hold: {words}{where}{new_car}."
+def _verdict(
+    models: Models, box: Box, found: Falsification[Model], lowest: tuple[Model, FloatArray] | None
+) -> tuple[str, Failure | None]:
+    """What the falsification found, in words: the failure at the lowest speed, then the worst; and the former."""
+    attack = found.attack
+    assert attack is not None
+    if not found.failures:
+        if not len(attack.left):
+            return f"none of {attack.simulated:,} simulations met an encounter that counts.", None
+        model = models.members[int(attack.judges[0])]
+        keeps = model.unsafe.value_in_words(model.unsafe.value(attack.left[0]))
+        return f"they hold: the worst of {attack.simulated:,} aimed at them {keeps}.", None
+    candidates = [(model, row) for model, rows in found.failures for row in rows]
+    lefts = [float(model.left(row[np.newaxis], WIDER_STAGE)[0]) for model, row in candidates[:MOST_COMPARED]]
+    worst = candidates[int(np.argmin(lefts))]
+    described = [
+        failure
+        for pair in (lowest, worst)
+        if pair is not None
+        for failure in describe(pair[0], {"": pair[1]}, box).values()
+    ]
+    new_car = ", where the new car is safe" if lowest is not None else ""
+    first = described[0].words if described else "a car within them is unsafe"
+    last = f"; at worst, {described[-1].words}" if len({each.words for each in described}) > 1 else ""
+    return f"they do not hold: {first}{new_car}{last}.", described[0] if described else None

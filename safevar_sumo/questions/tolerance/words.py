@@ -7,13 +7,40 @@ from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
+from safevar_sumo.questions.tolerance.counterexamples import limit_text
+from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import join_phrases, number_of, share_in_words
 from safevar_sumo.study import Limit, unit_text
+
+USUAL_BUDGET = 5000
+"""Number of simulations that search for a counterexample unless an option says otherwise."""
+NOT_FALSIFIED = "with --attack 0, no simulation searched for a counterexample"
+
+
+def rough_in_words(budget: int) -> str:
+    """The beginning of a verdict for which fewer simulations than usual searched for a counterexample."""
+    if budget >= USUAL_BUDGET:
+        return ""
+    return f"Rough answer, with {budget:,} instead of {USUAL_BUDGET:,} simulations that search for a counterexample. "
+
+
+def contacts_in_words(evaluator: Evaluator, contacts: Contacts) -> Iterator[str]:
+    """What vehicles within the limits do in encounters that do not count; nothing where they touch nobody."""
+    if contacts.number:
+        members = evaluator.characteristics
+        item = members.members[members.names.index(contacts.name)]
+        margin = evaluator.study.scenario.margin
+        yield (
+            f"Where the original touches nobody but keeps less than {margin:g} m, which does not count, vehicles "
+            f"within these limits touch somebody: {number_of(contacts.number, 'such contact')} found, the lowest at "
+            f"{item.name.replace('_', ' ')} {limit_text(item, round(contacts.lowest, item.digits + 1))}."
+        )
 
 
 def verdict_sentences(
@@ -26,6 +53,7 @@ def verdict_sentences(
     nearest: Sequence[tuple[Any, ...]],
     wider: Sequence[tuple[Any, ...]],
     refusal: str,
+    contacts: Contacts | None,
 ) -> Iterator[str]:
     """The sentences of the verdict, the decision first; a `refusal` says why no limit can be kept."""
     unsafe = models.own.unsafe
@@ -33,8 +61,14 @@ def verdict_sentences(
     if refusal:
         yield f"{refusal[:1].upper()}{refusal[1:]}. {unsafe.smaller_demand}".strip()
         return
-    if broken:
-        yield f"Do not release: {'; '.join(broken)}."
+    decision = f"Do not release: {'; '.join(broken)}." if broken else ""
+    if rough := f"{rough_in_words(budget)}{decision}".strip():
+        yield rough
+    if contacts is not None:
+        share = share_in_words(models.own.evaluator.share_left_out)
+        margin = f"in which the original keeps less than {study.scenario.margin:g} m"
+        yield f"Of the encounters over the domain {share} are left out, {margin}."
+        yield from contacts_in_words(models.own.evaluator, contacts)
     if together is not None:
         yield from _fits_in_words(models, together, bool(limits))
         yield from _nearest_in_words(nearest)
@@ -86,6 +120,7 @@ def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, bu
     decision = "All may go to their limits together"
     if has_limits:
         decision = "The limits together below hold" if together.broken else "Keeps all limits"
+        decision = decision if budget else "The specified limits were not tested; those together below hold"
     yield f"{decision} {where}: within them no vehicle that was tried {failure_in_words(unsafe, count)}."
     yield f"Tried: {trial_in_words(together, budget)}."
     if names := _without_room(models, together):

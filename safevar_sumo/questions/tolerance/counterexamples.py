@@ -1,0 +1,140 @@
+"""Counterexamples in sentences: unsafe vehicles with the values that are printed, simulated again with these values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
+from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
+from safevar_sumo.study import unit_text
+from safevar_sumo.sumo.encounters import encounter
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import Characteristic
+
+FURTHER_DIGITS = (0, 1, 2, 4, 7)
+"""Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is unsafe."""
+OF_ENCOUNTER = ("test", "weather")
+"""Keys of a point's parameters that are no numbers of its scenario."""
+STAGE = "what fails first"
+
+
+class Failure(NamedTuple):
+    """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with the encounter, and
+    the parameters of the point of the matrix where it does.
+    """
+
+    setting: FloatArray
+    words: str
+    point: JsonObject
+
+
+def describe(model: Model, settings: Mapping[str, FloatArray], within: Box | None = None) -> dict[str, Failure]:
+    """How unsafe settings of a model fail at their worst points, by the same names.
+
+    Values are rounded as they are printed, away from the original, and simulated again; where the rounded vehicle is
+    safe, with further digits. A setting that is safe with all of them is left out. A value that lies `within` a box
+    stays there.
+    """
+    failures = dict[str, Failure]()
+    waiting = dict(settings)
+    for further in FURTHER_DIGITS:
+        if not waiting:
+            break
+        rows = np.array([_printed(model, setting, within, further) for setting in waiting.values()])
+        found = _failing(model, rows)
+        failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
+        waiting = {name: setting for name, setting in waiting.items() if name not in failures}
+    return failures
+
+
+def limit_text(item: Characteristic, value: float) -> str:
+    """A value as it is printed, without further zeros, as in tables."""
+    return f"{value:.10g}{item.suffix}"
+
+
+def _printed(model: Model, setting: FloatArray, within: Box | None, further: int) -> FloatArray:
+    """A setting with its values rounded to the digits of limits and some further ones: the vehicle's away from the
+    original, those of the encounter to the nearest.
+    """
+    members = model.evaluator.characteristics
+    printed = setting.copy()
+    for column, item in enumerate(members):
+        value = setting[column]
+        lower = item.lower
+        upper = item.upper
+        if within is not None and within.lower[column] <= value <= within.upper[column]:
+            lower = within.lower[column]
+            upper = within.upper[column]
+        if value not in (item.original, lower, upper):
+            scale = 10.0 ** (item.digits + further)
+            away = np.round if item.is_scenario else np.ceil if value > item.original else np.floor
+            # What is a rounding error of the scaled value is none of the value.
+            scaled = away(np.round(value * scale, 6))
+            printed[column] = min(max(scaled / scale, lower), upper)
+    return printed
+
+
+def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
+    """How those of M settings fail that are unsafe, by their row."""
+    points = assemble(model.evaluator.study).points
+    points = tuple(points[number] for number in model.points) or points
+    members = model.evaluator.characteristics
+    runs = model.evaluate(settings, STAGE)
+    is_unsafe = model.evaluator.region.feasible(settings) & (model.left_by(runs) < 0)
+    worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
+    fit = f" (fit {model.fit} of the vehicle)" if model.fit else ""
+    failures = dict[int, Failure]()
+    for row in np.flatnonzero(is_unsafe).tolist():
+        point = points[worst[row]]
+        values = dict(zip(members.scenario.names, settings[row, ~members.of_vehicle].tolist(), strict=True))
+        scenario = encounter(point, values).scenario
+        how = _failure_in_words(scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row]))
+        where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
+        failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters))
+    return failures
+
+
+def where_in_words(points: Sequence[Point], point: Point, scenario: Scenario, values: Mapping[str, float]) -> str:
+    """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`, from one of the
+    points of a matrix, the values of searched parameters, and the scenario with them; empty where there is but one.
+    """
+    own = dict(point.parameters)
+    numbers = {**{name: value for name, value in own.items() if name not in OF_ENCOUNTER}, **values}
+    units = searchable_in(point.scenario)
+    texts = {
+        name: f"{value:.10g}{unit_text(units[name].unit) if name in units else ''}"
+        if isinstance(value, int | float)
+        else str(value)
+        for name, value in numbers.items()
+    }
+    speed = texts.pop(SPEED_DIMENSION, "")
+    if not speed and scenario.test_speed is not None:
+        speed = f"{KMH_PER_MS * scenario.test_speed:.4g} km/h"
+    test = own.get("test", "") if len(points) > 1 else ""
+    at = f" at {speed}" if speed else ""
+    rest = [f"{name.replace('_', ' ')} {text}" for name, text in texts.items()]
+    if len({each.weather.name for each in points}) > 1:
+        rest.append(f"weather {point.weather.name.replace('_', ' ')}")
+    beside = f" with {join_phrases(rest)}" if rest else ""
+    if test:
+        return f" in the test {test}{at}{beside}"
+    return f" in an encounter{at}{beside}" if at or beside else ""
+
+
+def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
+    """A failure at a safety degree, such as `the car hits a pedestrian with 12 km/h`."""
+    if unsafe.is_of_points or (unsafe.bound is not None and not collided):
+        return f"the car {unsafe.in_words}"
+    if collided:
+        impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
+        impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
+        return f"the car hits {scenario.obstacle()}{impact}"
+    measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
+    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from {scenario.obstacle()}"
