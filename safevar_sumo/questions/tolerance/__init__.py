@@ -138,7 +138,7 @@ def tolerance(
         A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits alone that hold up
         to each, and up to which value the specified limits hold.
     together
-        With `by`, the limits together that hold up to each value as well, which takes long; without, they always are.
+        Joint limits, which hold all at the same time; they are always sought without `by`, and never beside it.
     """
     study = evaluator.study
     members = evaluator.characteristics
@@ -153,7 +153,7 @@ def tolerance(
         solutions = _unsafe_solutions(subject, range(len(members)), criterion)
         is_alone = np.count_nonzero((solutions != members.original) & members.of_vehicle, axis=1) == 1
         search = LevelSearch(evaluator, parameter, criterion, columns, specified, fits, attack)
-        return answer_by(search, solutions[is_alone], together)
+        return answer_by(search, solutions[is_alone])
     is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
     if is_sought:
         _check_drawable(evaluator)

@@ -32,7 +32,6 @@ from safevar_sumo.questions.tolerance.left_out import (
 )
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxGeometry
-from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit
 
@@ -60,8 +59,6 @@ class Level(NamedTuple):
         How the specified limits fail up to the value; None where they hold, or none is specified.
     attack
         The attack on the specified limits.
-    together
-        The limits together; None if they were not sought.
     """
 
     value: float
@@ -70,7 +67,6 @@ class Level(NamedTuple):
     search: AloneSearch | None = None
     failures: Sequence[tuple[Model, FloatArray]] | None = None
     attack: Attack | None = None
-    together: LimitsTogether | None = None
 
 
 class LevelSearch:

@@ -19,16 +19,13 @@ from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.counterexamples import Failure, describe
 from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
-from safevar_sumo.questions.tolerance.levels_together import levels_with_together
 from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE
-from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.tolerance.words import (
     NOT_FALSIFIED,
     USUAL_BUDGET,
     contacts_in_words,
     failure_in_words,
     rough_in_words,
-    trial_in_words,
 )
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
@@ -43,21 +40,21 @@ if TYPE_CHECKING:
 UNSAFE_ORIGINAL = "the original vehicle itself is unsafe, or safe in no encounter"
 
 
-def answer_by(search: LevelSearch, known: FloatArray, is_together: bool) -> Answer:
-    """Limits that hold up to each value of a parameter, alone, and if they are wanted, together; `known` are failures
-    of one characteristic that results hold, shape (K, n).
+def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
+    """Limits of each characteristic alone that hold up to each value of a parameter; `known` are failures of one
+    characteristic that results hold, shape (K, n).
     """
     by = search.by
     study = search.evaluator.study
-    levels = levels_with_together(search, known) if is_together else search.levels(known)
+    levels = search.levels(known)
     with search.evaluator.stage("specified limits between two values"):
         reach = search.reach(levels)
     contacts = search.contacts(levels)
     scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
     is_kept = _is_kept(search, levels, reach)
-    values = ["alone", *(["together"] if is_together else []), *(["kept"] if search.limits else [])]
+    values = ["alone", *(["kept"] if search.limits else [])]
     frame = tabulate(
-        _title(by, is_together),
+        _title(by),
         columns_by(by),
         _rows(search, levels, scopes),
         wide=Wide(["characteristic", "unit", "original"], f"by_{by.name}", values, f"to {{:g}}{unit_text(by.unit)}"),
@@ -107,18 +104,14 @@ def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> t
 
 def _numbers(levels: Sequence[Level], reach: Reach[Model], unsafe: Unsafe) -> JsonObject:
     """Numbers about the limits up to the greatest value, and about the attack on the specified limits up to the value
-    that they reach; `boxes` counts the values that have limits together.
+    that they reach.
     """
     last = levels[-1]
     found = reach.attack
     least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
     attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
     members, left_out = last.models
-    numbers = {"fits": len(members), "fits_tried": len(members) + len(left_out), **attacked}
-    if last.together is not None:
-        numbers |= last.together.numbers
-    boxes = [level for level in levels if level.together is not None and level.together.box is not None]
-    return {**numbers, "boxes": len(boxes)}
+    return {"fits": len(members), "fits_tried": len(members) + len(left_out), **attacked, "boxes": 0}
 
 
 def columns_by(by: Parameter) -> Columns:
@@ -135,9 +128,8 @@ def columns_by(by: Parameter) -> Columns:
     return {**{name: LIMITS[name] for name in first}, **own, **{name: LIMITS[name] for name in rest}, **texts}
 
 
-def _title(by: Parameter, is_together: bool) -> str:
-    alone = "" if is_together else f" {ALONE}"
-    return f"Limits{alone} up to each {by.name.replace('_', ' ')}, rounded to the safe side"
+def _title(by: Parameter) -> str:
+    return f"Limits {ALONE} up to each {by.name.replace('_', ' ')}, rounded to the safe side"
 
 
 def _text(by: Parameter, value: float | None) -> str:
@@ -155,7 +147,6 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
         specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
         for level, scope in zip(levels, scopes, strict=True):
             alone = None if level.alone is None else level.alone[number]
-            box = None if level.together is None else level.together.box
             failure = failures.get((level.value, number))
             kept = None if limit is None else not level.failures and _holds(alone, limit)
             kept = None if kept and not search.budget else kept
@@ -163,12 +154,11 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
                 (
                     *(item.name, item.unit, item.original, level.value),
                     *(NOWHERE if alone is None or alone.safe is None else alone.safe),
-                    *(NOWHERE if box is None else (float(box.lower[column]), float(box.upper[column]))),
-                    *(*specified, kept),
+                    *(*NOWHERE, *specified, kept),
                     UNSAFE_ORIGINAL if alone is None else None if failure is None else failure.words,
                     None if failure is None else _setting(members, failure),
                     f"Up to {search.by.text(level.value)}{_of_counted(search, level.value)}, "
-                    f"{_keep(item, alone, level.together, column)}. Scope: {scope}.",
+                    f"{_keep(item, alone)}. Scope: {scope}.",
                     scope,
                 )
             )
@@ -196,14 +186,9 @@ def _holds(alone: AloneLimit | None, limit: Limit) -> bool:
     return (limit.at_least is None or limit.at_least >= low) and (limit.at_most is None or limit.at_most <= high)
 
 
-def _keep(item: Characteristic, alone: AloneLimit | None, together: LimitsTogether | None, column: int) -> str:
-    """What limits demand: `with all others as in the original: brake torque at least 0.7`."""
-    others = "with all others as in the original"
+def _keep(item: Characteristic, alone: AloneLimit | None) -> str:
+    """What a limit demands: `with all others as in the original: brake torque at least 0.7`."""
     ends = None if alone is None else alone.safe
-    if together is not None:
-        others = "with all others within theirs"
-        box = together.box
-        ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
     if ends is None:
         return "no limit holds"
     low, high = ends
@@ -212,7 +197,7 @@ def _keep(item: Characteristic, alone: AloneLimit | None, together: LimitsTogeth
         return f"no room for {name}: {low:.10g}{item.suffix}, as in the original"
     sides = (("at least", low, item.lower), ("at most", high, item.upper))
     keep = " and ".join(f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last)
-    return f"{others}: {name} {keep or 'anywhere in its domain'}"
+    return f"with all others as in the original: {name} {keep or 'anywhere in its domain'}"
 
 
 def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
@@ -261,15 +246,9 @@ def _sentences(
     of_counted = f"{counted}," if counted else ""
     yield f"Limits up to {values}{of_counted} hold {fits}: within them no vehicle that was tried {failure}."
     yield _tried(search)
-    for level in levels:
-        if level.together is not None and level.together.box is not None:
-            yield f"Together up to {by.text(level.value)}: {trial_in_words(level.together, search.budget)}."
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
         yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
-    without = [f"{level.value:g}" for level in levels if level.together is not None and level.together.box is None]
-    if without:
-        yield f"No limits together were found up to {join_phrases(without)}{unit_text(by.unit)}."
 
 
 def _original_in_words(search: LevelSearch) -> str:
@@ -359,15 +338,16 @@ def _draw_limits(axis: Axes, rows: pd.DataFrame, by: Parameter) -> None:
 
 
 def check_by(by: str | None, unsafe: str | None, is_together: bool) -> None:
-    """Refuse options that do not go together with limits up to values of a parameter, or with none.
+    """Refuse options that do not go together with limits up to values of a parameter.
 
     Raises
     ------
     InputError
-        If another criterion than the margin stands beside `by`, or limits together are asked for without it.
+        If another criterion than the margin, or joint limits, are asked for beside `by`.
     """
-    if by is None and is_together:
-        raise InputError("together", "limits together are always sought without --by", "--by NAME=V1,V2,... beside it")
+    if by is not None and is_together:
+        legal = "--by for limits alone, or joint limits of a study with a narrower domain, without --by"
+        raise InputError("together", f"joint limits are not sought up to each value of --by {by}", legal)
     if by is not None and unsafe is not None:
         legal = "limits that keep the margin (--margin), or the question without --by"
         raise InputError("by", f"{by!r} beside --unsafe {unsafe!r}", legal)

@@ -368,15 +368,15 @@ class BoxSearch(BoxGeometry):
         settings[:, column] = (box.lower, box.upper)[side][column]
         return settings
 
-    def best(self, start: FloatArray, *, widen: bool = True) -> FloatArray | None:
-        """The largest box within `start` in which no search finds anything unsafe, with `widen` moved out as far as it
-        can be; None if every search finds something.
+    def best(self, start: FloatArray) -> FloatArray | None:
+        """The largest box within `start` in which no search finds anything unsafe, moved out as far as it can be;
+        None if every search finds something.
         """
         sides = start
         for _ in range(MAX_ATTEMPTS):
             sides = self.largest(sides, start)
             found = self.failures_in(sides)
-            if not len(found) and widen:
+            if not len(found):
                 sides = self.widened(sides)
                 found = self.failures_in(sides)
             if not len(found):

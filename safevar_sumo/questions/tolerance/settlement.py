@@ -30,19 +30,10 @@ KNOWN_CORNERS = 32
 
 
 class Settlement:
-    """Moves limits as far as they can go, one at a time, and in no further than to an inner box that is known to hold.
+    """Moves limits as far as they can go, one at a time, and in where something failed."""
 
-    Attributes
-    ----------
-    least
-        The sides of that box, shape (2, n); 0 without one.
-    """
-
-    def __init__(self, search: BoxSearch, inner: Box | None = None) -> None:
+    def __init__(self, search: BoxSearch) -> None:
         self.search = search
-        self.least = np.zeros_like(search.domain)
-        if inner is not None:
-            self.least = np.where(search.is_free, search.sides_of(inner), self.least)
 
     def of(self, box: Box) -> Box:
         """A box of which no limit can move out alone without meeting something unsafe."""
@@ -107,7 +98,7 @@ class Settlement:
 
     def cut(self, box: Box, attempts: int = 0) -> Box:
         """The largest box within a box without its known failures that was found: they are cut off in several orders,
-        first those that leave the least choice of a limit to move in. A failure within the inner box refutes that one.
+        first those that leave the least choice of a limit to move in.
 
         After more `attempts` that failed, limits keep off failures by more: where the response is not monotone, others
         lie beside them.
@@ -117,9 +108,7 @@ class Settlement:
         failures = search.extents(search.unsafe_inside(sides))
         if not len(failures):
             return box
-        if self.least.any() and (failures <= self.least).all(axis=(1, 2)).any():
-            self.least = np.zeros_like(self.least)
-        choices = np.count_nonzero(search.is_free & (failures > self.least), axis=(1, 2))
+        choices = np.count_nonzero(search.is_free & (failures > 0), axis=(1, 2))
         if not choices.all():
             return search.printed(search.fixed)
         rng = np.random.default_rng((search.seed, 16))
@@ -137,8 +126,8 @@ class Settlement:
         search = self.search
         sides = sides.copy()
         while len(failures):
-            ends = np.maximum(failures[0] - clearance * LEAST_MOVE * search.width, self.least)
-            is_choice = search.is_free & (failures[0] > self.least)
+            ends = np.maximum(failures[0] - clearance * LEAST_MOVE * search.width, 0.0)
+            is_choice = search.is_free & (failures[0] > 0)
             lengths = sides.sum(axis=0)
             left = np.maximum(lengths - sides + ends, 1e-9 * search.width + 1e-300)
             kept = np.where(is_choice, left / np.maximum(lengths, 1e-300), -np.inf)

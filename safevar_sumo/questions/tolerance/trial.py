@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -18,12 +18,8 @@ MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
-FIRST_SHARE = 0.2
-"""Share of the attack's budget of a quick trial."""
 CONFIRMATIONS, STARTS = 3, 256
 """Number of further attacks on a box that is to be printed, and of settings with which each begins."""
-QUICK_CORNERS = 1024
-"""Number of corners of a quick trial, in each fit."""
 TRIAL_STAGE = "test of the limits together"
 
 
@@ -70,19 +66,6 @@ class Trials:
         self._failing = {0}
         """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
 
-    def quick(self, box: Box, attempt: int, fits: Collection[int], known: FloatArray) -> Trial:
-        """Try known settings and some corners in some fits, and a short attack in these, which goes on from those that
-        fail: many failures at once spare trials.
-        """
-        corners = np.concatenate([known[box.holds(known)], box.corners(self.seed, attempt)[:QUICK_CORNERS]])
-        budget = round(FIRST_SHARE * self.budget)
-        numbers = [number for number, model in enumerate(self.models) if model.fit in fits]
-        with self.evaluator.stage(TRIAL_STAGE, len(numbers) * len(corners) + budget):
-            lefts = self._left(corners, numbers)
-            failed = self._failed(box, corners, lefts)
-            trial = self._attack(box, corners, lefts, budget, attempt, numbers)
-            return trial._replace(failures=[*(failed.failures if failed else ()), *trial.failures])
-
     def whole(self, box: Box, attempt: int) -> Trial:
         """Try all corners in all models, the whole attack, and settings drawn at random; the first part that finds
         failures is the last.
@@ -98,7 +81,7 @@ class Trials:
             failed = self._failed(box, corners, lefts)
             if failed:
                 return failed
-            trial = self._attack(box, corners, lefts, self.budget, attempt)
+            trial = self._attack(box, corners, lefts, attempt)
             if trial.failures:
                 return trial
             lefts |= self._left(corners, others)
@@ -124,26 +107,18 @@ class Trials:
         self._failing |= {number for number, left in lefts.items() if (left < 0).any()}
         return Trial(box, failures) if failures else None
 
-    def _attack(
-        self,
-        box: Box,
-        corners: FloatArray,
-        lefts: Mapping[int, FloatArray],
-        budget: int,
-        attempt: int,
-        numbers: Sequence[int] | None = None,
-    ) -> Trial:
-        """Attack a box in all models, or those of some numbers, beginning at its worst corners in each, or in the
-        first.
-        """
-        if not budget:
+    def _attack(self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], attempt: int) -> Trial:
+        """Attack a box in all models, beginning at its worst corners in each, or in the first."""
+        if not self.budget:
             return Trial(box, judges=self.models)
-        numbers = range(len(self.models)) if numbers is None else numbers
-        judges, left_out = self._denser([self.models[number] for number in numbers], attempt)
+        judges, left_out = self._denser(attempt)
         orders = {number: np.argsort(left, kind="stable") for number, left in lefts.items()}
-        worst = [corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]] for number in numbers]
+        worst = [
+            corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
+            for number in range(len(self.models))
+        ]
         rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
-        found = attack(box, rows, worst, budget, np.random.default_rng((self.seed, 4, attempt)))
+        found = attack(box, rows, worst, self.budget, np.random.default_rng((self.seed, 4, attempt)))
         failures = [
             one
             for number, model in enumerate(judges)
@@ -160,7 +135,7 @@ class Trials:
             found = trial.attack
             for number in range(CONFIRMATIONS):
                 rng = np.random.default_rng((self.seed, 15, attempt, number))
-                judges, _ = self._denser(self.models, attempt + number)
+                judges, _ = self._denser(attempt + number)
                 starts = [box.with_ends(STARTS // len(judges), rng) for _ in judges]
                 rows = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
                 found = found.merged(attack(box, rows, starts, self.budget, rng))
@@ -173,10 +148,12 @@ class Trials:
         ]
         return trial._replace(attack=found, failures=failures)
 
-    def _denser(self, models: Sequence[Model], attempt: int) -> tuple[list[Model], int]:
-        """Models with further points between those of a matrix, and the number of such points that do not count."""
+    def _denser(self, attempt: int) -> tuple[list[Model], int]:
+        """The models with points between those of a matrix, too, and the number of these that do not count."""
         own = self.models[0].unsafe
-        found = [with_points_between(model, own, np.random.default_rng((self.seed, 5, attempt))) for model in models]
+        found = [
+            with_points_between(model, own, np.random.default_rng((self.seed, 5, attempt))) for model in self.models
+        ]
         return [model for model, _ in found], found[0][1]
 
     def _prove(self, trial: Trial, attempt: int) -> Trial:
