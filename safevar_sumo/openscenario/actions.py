@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
-from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
-from safevar_sumo.openscenario.places import Place, Way, line_of, neighbour, way_of, way_through
+from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported, whole
+from safevar_sumo.openscenario.places import AHEAD, Place, Way, line_of, neighbour, of_reference, way_of, way_through
 
 if TYPE_CHECKING:
     from safevar_sumo.openscenario.storyboard import Player
@@ -40,10 +39,13 @@ IGNORED = (
 
 
 class Transition(NamedTuple):
-    """How long a change takes [s], and its share, 0 to 1, at times since it began."""
+    """How long a change takes [s], or with `over_distance` how far the actor drives meanwhile [m]; and
+    its share, 0 to 1, after so much of either.
+    """
 
     duration: float
     share: Callable[[Array], Array]
+    over_distance: bool = False
 
 
 SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
@@ -54,26 +56,23 @@ SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
 """Shapes of a change by their names (class DynamicsShape): largest slope, and the share done at a share of the time."""
 
 
-def transition_of(dynamics: Element, change: float, speed: float, name: str) -> Transition:
-    """Class TransitionDynamics for a change; its distance is driven at a speed [m/s]. A rate is the largest one."""
+def transition_of(dynamics: Element, change: float, speed: float | None = None) -> Transition:
+    """Class TransitionDynamics for a change. A rate is the largest one.
+
+    A distance is driven at a speed [m/s], or without one at whatever speed the actor has.
+    """
     shape = attribute(dynamics, "dynamicsShape")
     dimension = attribute(dynamics, "dynamicsDimension")
-    value = number(dynamics, "value")
-    if shape == "step" or not change or (not value and dimension != "rate"):
+    duration = number(dynamics, "value")
+    if shape == "step" or not change or (not duration and dimension != "rate"):
         return Transition(0.0, np.ones_like)
-    if shape not in SHAPES:
-        raise unsupported(f"{name}: dynamicsShape {shape} is not supported")
     steepest, share = SHAPES[shape]
-    match dimension:
-        case "time":
-            duration = value
-        case "rate":
-            duration = steepest * abs(change / value) if value else math.inf
-        case "distance":
-            duration = value / speed if speed else math.inf
-        case _:
-            raise unsupported(f"{name}: dynamicsDimension {dimension} is not supported")
-    return Transition(duration, lambda time: share(np.minimum(time / duration, 1.0)))
+    if dimension == "rate":
+        duration = steepest * abs(change / duration) if duration else math.inf
+    elif dimension == "distance" and speed is not None:
+        duration = duration / speed if speed else math.inf
+    over_distance = dimension == "distance" and speed is None
+    return Transition(duration, lambda since: share(np.minimum(since / duration, 1.0)), over_distance)
 
 
 # Longitudinal
@@ -86,21 +85,18 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     value = number(target, "value")
     if target.tag == "RelativeTargetSpeed":
         other = player.other(target)
-        if target.get("continuous") == "true":
+        if truth(target, "continuous"):
             raise unsupported("SpeedAction: RelativeTargetSpeed with continuous = true is not supported")
         value = _relative_speed(target, other)
         player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
     if value < 0:
         raise unsupported(f"{actor.name} drives backwards ({value:.2f} m/s)")
     dynamics = part(action, "SpeedActionDynamics")
-    transition = transition_of(dynamics, value - start, (start + value) / 2, "SpeedAction")
+    transition = transition_of(dynamics, value - start, (start + value) / 2)
     if actor is player.ego and transition.duration:
         raise unsupported(f"SpeedAction of {actor.name} that takes time: its driving system drives")
-    rate = number(dynamics, "value", 0.0) if dynamics.get("dynamicsDimension") == "rate" else 1.0
     if math.isinf(transition.duration):
         player.remark(f"{actor.name}: SpeedAction with rate 0 has no effect")
-    elif rate < 0 < value - start:
-        player.remark(f"{actor.name}: SpeedAction with the rate {rate:g} towards a higher speed: its size counts")
     if not transition.duration:
         actor.speed_now = value
     share = transition.share
@@ -124,7 +120,7 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
     gap = number(action, "distance", math.nan)
     if math.isnan(gap):
         gap = number(action, "timeGap") * follower.speed_now
-    if action.get("freespace") == "true":
+    if truth(action, "freespace"):
         gap += other.shape.front - actor.shape.rear if leads else actor.shape.front - other.shape.rear
     signed = gap if leads else -gap
     player.depends(other, player.now, f"{actor.name}'s distance to {other.name}")
@@ -134,7 +130,7 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
         actor.at = mine._replace(distance=its.distance + signed)
     else:
         actor.at = Place.free(its.pose.moved(signed))
-    if action.get("continuous") != "true":
+    if not truth(action, "continuous"):
         return []
     speed = actor.speed_now
     running = actor.begin("along", math.inf, player.now, lambda time: np.full_like(time, speed))
@@ -169,6 +165,8 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
             is_way = steady.tag == "TargetDistanceSteadyState"
             steady_way = number(steady, "distance") if is_way else number(steady, "time") * final
             steady_time = steady_way / final if final else 0.0
+    if final < 0:
+        raise unsupported(f"{actor.name} drives backwards ({final:.2f} m/s)")
     until = time - steady_time
     rest = way - steady_way
     if rest < -1e-6 or until < -1e-6:
@@ -198,19 +196,18 @@ def _approach(player: Player, actor: Actor, until: float, way: float, final: flo
 
 
 def lane_change_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """LaneChangeAction: lanes count to the left, where t grows; no lane has the number 0."""
+    """LaneChangeAction: a relative lane counts to the left of its entity, as the entity faces."""
     way = _way_of(action, actor)
     target = part(action, "LaneChangeTarget/*")
     lane = whole(target, "value")
     if target.tag == "RelativeTargetLane":
-        place = player.other(target).here
-        if not isinstance(place.path, Way):
-            raise unsupported("LaneChangeAction: RelativeTargetLane refers to an entity that is not on a road")
-        lane = neighbour(place.path.lane_at(place.distance, place.left), lane)
+        here = of_reference(target, player.place_of)
+        faces_along = here.is_forward == (player.other(target).here.turn.real >= AHEAD)
+        lane = neighbour(here.road.lane_at(here.s, here.t), lane if faces_along else -lane)
     offset = number(action, "targetLaneOffset", 0.0)
     goal = way.lane_left(lane, actor.here.distance) + _sign(way, actor) * offset
     dynamics = part(action, "LaneChangeActionDynamics")
-    transition = transition_of(dynamics, goal - actor.here.left, actor.speed_now, "LaneChangeAction")
+    transition = transition_of(dynamics, goal - actor.here.left)
     return [_sideways(player, actor, goal, transition)]
 
 
@@ -222,15 +219,13 @@ def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Ru
     by = _sign(way, actor) * number(target, "value")
     goal = way.lane_left(way.lane_at(actor.here.distance, left), actor.here.distance) + by
     if target.tag == "RelativeTargetLaneOffset":
-        goal = player.other(target).here.left + by
+        goal = _sign(way, actor) * of_reference(target, player.place_of).t + by
     dynamics = part(action, "LaneOffsetActionDynamics")
     shape = attribute(dynamics, "dynamicsShape")
     most = number(dynamics, "maxLateralAcc", 0.0)
     if shape == "step" or not most or goal == left:
         return [_sideways(player, actor, goal, Transition(0.0, np.ones_like))]
     peaks = {"sinusoidal": math.pi**2 / 2, "cubic": 6.0, "linear": 4.0}
-    if shape not in peaks:
-        raise unsupported(f"LaneOffsetAction: dynamicsShape {shape} is not supported")
     duration = math.sqrt(peaks[shape] * abs(goal - left) / most)
     share = SHAPES[shape][1]
     transition = Transition(duration, lambda time: share(np.minimum(time / duration, 1.0)))
@@ -250,10 +245,13 @@ def _sign(way: Way, actor: Actor) -> int:
 
 def _sideways(player: Player, actor: Actor, goal: float, transition: Transition) -> Running:
     start = actor.here.left
-    share = transition.share
-    if not transition.duration:
+    duration, share, over_distance = transition
+    if not duration:
         actor.at = actor.here._replace(left=goal)
-    return actor.begin("sideways", transition.duration, player.now, lambda time: start + (goal - start) * share(time))
+    since = float(actor.travelled[player.sample]) if over_distance else player.now
+    return actor.begin(
+        "sideways", duration, since, lambda by: start + (goal - start) * share(by), over_distance=over_distance
+    )
 
 
 # Places, routes and trajectories
@@ -303,7 +301,7 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
     is_relative = timing.get("domainAbsoluteRelative") == "relative"
     begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
     times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
-    if any(b <= a for a, b in pairwise(times)):
+    if (np.diff(times) <= 0).any():
         raise unsupported("FollowTrajectoryAction with Timing: the times of the vertices do not grow")
     now = player.now
     stations = np.asarray(line.stations)

@@ -11,10 +11,12 @@ import numpy as np
 
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
 from safevar_sumo.openscenario.places import Place, Way
-from safevar_sumo.openscenario.road import Line, Pose
+from safevar_sumo.openscenario.road import Pose
 
 STEP = 0.01
 """Time between two samples [s]."""
+LONGEST = 600.0
+"""Time up to which the StopTrigger of a file must hold [s]."""
 MIN_SPEED = 0.1
 """Speed from which on a body turns while it moves sideways [m/s]."""
 Array = Any
@@ -42,10 +44,15 @@ class Shape(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How a quantity changes since a time [s]: its value at times since then."""
+    """How a quantity changes since a time [s]: its value at times since then.
+
+    If it changes over a distance, `until` is where it ends, and both count in the distance that the
+    actor has travelled [m].
+    """
 
     since: float
     value: Callable[[Array], Array]
+    until: float | None = None
 
 
 @dataclass
@@ -98,18 +105,30 @@ class Actor:
             raise unsupported(f"{self.name} has no place in Init")
         return self.at
 
-    def begin(self, domain: str, duration: float, time: float, value: Callable[[Array], Array]) -> Running:
-        """Begin a motion `along` its way or `sideways` that lasts so long [s], in place of the one before."""
-        running = Running(time + duration)
+    def begin(
+        self,
+        domain: str,
+        duration: float,
+        since: float,
+        value: Callable[[Array], Array],
+        *,
+        over_distance: bool = False,
+    ) -> Running:
+        """Begin a motion `along` its way or `sideways`, in place of the one before.
+
+        It begins at a time and has a duration [s], or both are distances that are travelled [m].
+        """
+        until = since + duration
+        running = Running(math.inf if over_distance else until)
         if domain in self.running:
             self.running[domain].is_replaced = True
         self.running[domain] = running
         if domain == "along":
-            self.along = Motion(time, value)
+            self.along = Motion(since, value)
             self.follows = None
             self.stations = None
         else:
-            self.sideways = Motion(time, value)
+            self.sideways = Motion(since, value, until if over_distance else None)
         return running
 
     def end(self, running: Running) -> None:
@@ -137,19 +156,28 @@ class Actor:
         now = self.here
         n = last - sample
         later = slice(sample + 1, last + 1)
-        if self.along is None:
-            speed: Array = np.full(n, self.speed_now)
+        if self.follows is not None:
+            speed: Array = self.follows.other.speed[later]
+        elif self.along is None:
+            speed = np.full(n, self.speed_now)
         else:
             speed = np.broadcast_to(self.along.value(times[later] - self.along.since), n)
         before = np.concatenate([[self.speed_now], speed[:-1]])
         ahead = (before + speed) / 2 * STEP
         if self.stations is not None:
             ahead = np.diff(self.stations.value(times[later] - self.stations.since), prepend=now.distance)
+        self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
         forward = ahead
         left = np.full(n, now.left)
         turn = np.ones(n)
         if self.sideways is not None:
-            left = np.broadcast_to(self.sideways.value(times[later] - self.sideways.since), n)
+            motion = self.sideways
+            passed: Array = times[later] if motion.until is None else self.travelled[later]
+            left = np.broadcast_to(motion.value(passed - motion.since), n)
+            if motion.until is not None:
+                # It ends at the first sample at which the actor has travelled so far.
+                index = int(np.searchsorted(self.travelled[sample : last + 1], motion.until - 1e-9))
+                self.running["sideways"].end = float(np.append(times[sample : last + 1], np.inf)[index])
             aside = np.diff(left, prepend=now.left)
             sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
             cosine = np.sqrt(1 - np.square(sine))
@@ -161,26 +189,24 @@ class Actor:
                 middle = distance - forward / 2
                 distance = now.distance + np.cumsum(forward / (1 - path.curvature(middle) * left))
         if self.follows is not None:
-            speed, distance, path, left = self._behind(later, left)
+            distance = self._behind(self.follows, later)
         pose = path.pose(distance, left)
         self.place[later] = pose.place
         self.facing[later] = pose.facing * turn * now.turn
         self.speed[later] = speed
         self.distance[later] = distance
         self.left[later] = left
-        self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
         moves = speed > 1e-3
         since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
         self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (since == 0)
 
-    def _behind(self, later: slice, left: Array) -> tuple[Array, Array, Line, Array]:
-        """Speeds, distances and offsets along a path, of who keeps its distance to another actor."""
-        assert self.follows is not None
-        other, by = self.follows
+    def _behind(self, following: Following, later: slice) -> Array:
+        """Distances along the path of who keeps its distance to another actor."""
+        other, by = following
         path = self.here.path
         if not (isinstance(path, Way) and isinstance(other.here.path, Way) and path.chain == other.here.path.chain):
             raise unsupported(f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same roads")
-        return other.speed[later], other.distance[later] + by, path, left
+        return other.distance[later] + by
 
     def arrive(self, sample: int) -> None:
         """Be where it has been at a sample."""
@@ -200,7 +226,7 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
         body = next((each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
         if body is None:
             raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
-        if body.find("Trailer") is not None:
+        if any(each.tag != "TrailerRef" or each.get("entityRef") for each in body.findall("Trailer/*")):
             raise unsupported(f"the Trailer of {name} is not supported")
         middle = part(body, "BoundingBox/Center")
         size = part(body, "BoundingBox/Dimensions")

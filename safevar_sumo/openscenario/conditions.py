@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.openscenario.actors import STEP, Actor, Array
-from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
+from safevar_sumo.openscenario.actors import LONGEST, STEP, Actor, Array
+from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
 from safevar_sumo.openscenario.places import Way
 
@@ -26,20 +26,20 @@ REACTIONS = (
     "RelativeSpeedCondition",
 )
 """Conditions whose value, if they watch Ego, only a run can tell."""
+LEFT_TO_RUNS = frozenset((*REACTIONS, "EndOfRoadCondition", "OffroadCondition"))
+"""The same, and conditions that never hold for an Ego that drives straight on."""
 
 
 def compared(condition: Element, values: Array, limit: str = "value", otherwise: str = "equalTo") -> Array:
     """Where values satisfy the condition's rule."""
-    rule = condition.get("rule", otherwise)
-    if rule not in RULES:
-        raise unsupported(f"{condition.tag}: the rule {rule} is not supported")
-    return RULES[rule](values, number(condition, limit))
+    return RULES[condition.get("rule", otherwise)](values, number(condition, limit))
 
 
 def holds(player: Player, trigger: Element | None, window: slice) -> Array:
-    """At which samples of a window a trigger (class Trigger) holds; without one at all."""
-    found = np.full(window.stop - window.start, trigger is None)
-    for group in () if trigger is None else trigger.findall("ConditionGroup"):
+    """At which samples of a window a trigger (class Trigger) holds; without a condition at all."""
+    groups = [] if trigger is None else trigger.findall("ConditionGroup")
+    found = np.full(window.stop - window.start, not groups)
+    for group in groups:
         conditions = [_condition(player, each, window) for each in group.findall("Condition")]
         found = found | np.logical_and.reduce(conditions)
     return found
@@ -47,22 +47,19 @@ def holds(player: Player, trigger: Element | None, window: slice) -> Array:
 
 def _condition(player: Player, condition: Element, window: slice) -> Array:
     """Class Condition: with its edge, after its delay; it is unknown before it is asked for the first time."""
-    first, seen = player.seen.setdefault(id(condition), (window.start, np.zeros(len(player.times) + 1, bool)))
+    if id(condition) not in player.seen:
+        player.seen[id(condition)] = window.start, np.zeros(len(player.times) + 1, bool)
+    first, seen = player.seen[id(condition)]
     seen[window] = _value(player, condition, window)
-    samples = np.arange(window.start, window.stop) - round(number(condition, "delay", 0.0) / STEP)
+    delay = min(number(condition, "delay", 0.0), LONGEST)
+    samples = np.arange(window.start, window.stop) - round(delay / STEP)
     now = (samples >= first) & seen[samples]
     has_before = samples > first
     before = seen[samples - 1]
-    match condition.get("conditionEdge", "none"):
-        case "none":
-            return now
-        case "rising":
-            return now & has_before & ~before
-        case "falling":
-            return ~now & has_before & before
-        case "risingOrFalling":
-            return has_before & (now != before)
-    raise unsupported(f"conditionEdge {condition.get('conditionEdge')} is not supported")
+    rises = now & has_before & ~before
+    falls = ~now & has_before & before
+    edges = {"none": now, "rising": rises, "falling": falls, "risingOrFalling": rises | falls}
+    return edges[condition.get("conditionEdge", "none")]
 
 
 def _value(player: Player, condition: Element, window: slice) -> Array:
@@ -105,7 +102,6 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
     kind = attribute(condition, "storyboardElementType").lower()
     name = attribute(condition, "storyboardElementRef")
     times = player.times[window]
-    state = attribute(condition, "state")
     began, ended = (
         min(
             (time for (of, path), time in states.items() if of == kind and f"::{path}".endswith(f"::{name}")),
@@ -113,37 +109,29 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
         )
         for states in (player.begun, player.ended)
     )
-    match state:
-        case "completeState":
-            return times >= ended - 1e-9
-        case "endTransition" | "stopTransition":
-            return np.abs(times - ended) < 1e-9
-        case "runningState":
-            return (times >= began - 1e-9) & ~(times >= ended - 1e-9)
-        case "startTransition":
-            return np.abs(times - began) < 1e-9
-        case "standbyState":
-            return ~(times >= began - 1e-9)
-        case "skipTransition":
-            return np.zeros(len(times), bool)
-    raise unsupported(f"the state {state} is not supported")
+    has_begun = times >= began - 1e-9
+    has_ended = times >= ended - 1e-9
+    ends = np.abs(times - ended) < 1e-9
+    return {
+        "standbyState": ~has_begun,
+        "startTransition": np.abs(times - began) < 1e-9,
+        "runningState": has_begun & ~has_ended,
+        "endTransition": ends,
+        "stopTransition": ends,
+        "completeState": has_ended,
+        "skipTransition": np.zeros_like(ends),
+    }[attribute(condition, "state")]
 
 
 def parameter_condition(player: Player, condition: Element, window: slice) -> Array:
-    """ParameterCondition: parameters do not change in a run."""
-    return _of_name(player, condition, attribute(condition, "parameterRef").lstrip("$"), player.document.values, window)
-
-
-def variable_condition(player: Player, condition: Element, window: slice) -> Array:
-    """VariableCondition: variables keep their first value."""
-    return _of_name(player, condition, attribute(condition, "variableRef").lstrip("$"), player.variables, window)
-
-
-def _of_name(player: Player, condition: Element, name: str, values: dict[str, str], window: slice) -> Array:
+    """ParameterCondition, VariableCondition: both do not change in a run."""
+    is_variable = condition.tag == "VariableCondition"
+    values = player.variables if is_variable else player.document.values
+    name = attribute(condition, "variableRef" if is_variable else "parameterRef").lstrip("$")
     if name not in values:
         raise unsupported(f"the file declares no parameter {name}")
     holds = compare(attribute(condition, "rule"), values[name], attribute(condition, "value"))
-    return np.full(len(player.times[window]), holds)
+    return np.full(window.stop - window.start, holds)
 
 
 # By entity
@@ -157,8 +145,7 @@ def relative_distance_condition(player: Player, condition: Element, actor: Actor
 def time_headway_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """TimeHeadwayCondition: the distance over the triggering entity's speed [s]."""
     gap = distance(condition, actor, player.other(condition), window)
-    speed = actor.speed[window]
-    return compared(condition, np.where(speed > 0, gap / np.maximum(speed, 1e-9), np.inf))
+    return compared(condition, _time(gap, actor.speed[window]))
 
 
 def time_to_collision_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
@@ -167,9 +154,13 @@ def time_to_collision_condition(player: Player, condition: Element, actor: Actor
     if target is None:
         raise unsupported("TimeToCollisionCondition with a position is not supported")
     other = player.other(target)
-    gap = distance(condition, actor, other, window)
     closing = actor.speed[window] - _along(actor, other, window)
-    return compared(condition, np.where(closing > 0, gap / np.maximum(closing, 1e-9), np.inf))
+    return compared(condition, _time(distance(condition, actor, other, window), closing))
+
+
+def _time(way: Array, speed: Array) -> Array:
+    """The time for a distance at a speed, infinite if the speed is not above 0 [s]."""
+    return np.where(speed > 0, way / np.maximum(speed, 1e-9), np.inf)
 
 
 def traveled_distance_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
@@ -185,15 +176,10 @@ def reach_position_condition(player: Player, condition: Element, actor: Actor, w
 
 def distance_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """DistanceCondition: from a position [m]; the bodies' ends do not count."""
-    if condition.get("freespace") == "true":
+    if truth(condition, "freespace"):
         raise unsupported("DistanceCondition with freespace = true is not supported")
     gap = (player.place(part(condition, "Position/*")).pose.place - actor.place[window]) / actor.facing[window]
-    match condition.get("relativeDistanceType", "euclidianDistance"):
-        case "longitudinal":
-            return compared(condition, np.abs(gap.real))
-        case "lateral":
-            return compared(condition, np.abs(gap.imag))
-    return compared(condition, np.abs(gap))
+    return compared(condition, _part(condition.get("relativeDistanceType", ""), gap))
 
 
 def speed_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
@@ -218,21 +204,18 @@ def acceleration_condition(player: Player, condition: Element, actor: Actor, win
     return compared(condition, change / STEP)
 
 
-def collision_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
-    """CollisionCondition: the actors of a file are not asked, and an Ego that holds its speed has no collision."""
-    return np.zeros(len(player.times[window]), bool)
-
-
-def end_of_road_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
-    """EndOfRoadCondition: a scene ends where somebody is at the end of its road."""
-    return np.zeros(len(player.times[window]), bool)
+def never(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+    """CollisionCondition: no collision of others counts, and an Ego that holds its speed has none.
+    EndOfRoadCondition: a scene ends where somebody is at the end of its road.
+    """
+    return np.zeros(window.stop - window.start, bool)
 
 
 def offroad_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """OffroadCondition: Ego drives straight on in its lane."""
     if actor is not player.ego:
         raise unsupported(f"OffroadCondition of {actor.name} is not supported")
-    return np.zeros(len(player.times[window]), bool)
+    return never(player, condition, actor, window)
 
 
 def _along(actor: Actor, other: Actor, window: slice) -> Array:
@@ -242,27 +225,37 @@ def _along(actor: Actor, other: Actor, window: slice) -> Array:
 
 def distance(condition: Element, actor: Actor, other: Actor, window: slice) -> Array:
     """The distance that a condition measures [m]: of origins, or with `freespace` of bodies."""
-    is_free = condition.get("freespace") == "true"
+    is_free = truth(condition, "freespace")
     kind = condition.get("relativeDistanceType", "longitudinal")
+    if is_free and kind not in ("longitudinal", "lateral"):
+        raise unsupported(f"{condition.tag} with {kind} and freespace = true is not supported")
     if _is_along_road(condition, kind, actor):
         return _along_road(condition, actor, other, window, is_free)
-    facing = actor.facing[window]
-    apart = (other.place[window] - actor.place[window]) / facing
-    if kind in ("cartesianDistance", "euclidianDistance"):
-        if is_free:
-            raise unsupported(f"{condition.tag} with {kind} and freespace = true is not supported")
-        return np.abs(apart)
-    if not is_free:
-        return np.abs(apart.real if kind == "longitudinal" else apart.imag)
-    turn = other.facing[window] / facing
-    middle = apart + turn * complex(other.shape.ahead, other.shape.left) - complex(actor.shape.ahead, actor.shape.left)
-    cosine = np.abs(turn.real)
-    sine = np.abs(turn.imag)
+    apart, reach = bodies_apart(actor, other, window)
+    if is_free:
+        return np.maximum(_part(kind, apart) - _part(kind, reach), 0.0)
+    return _part(kind, (other.place[window] - actor.place[window]) / actor.facing[window])
+
+
+def _part(kind: str, apart: Array) -> Array:
+    """The size of what is ahead or aside of a distance, ahead + i left, or of all of it [m]."""
     if kind == "longitudinal":
-        reach = (cosine * other.shape.length + sine * other.shape.width + actor.shape.length) / 2
-        return np.maximum(np.abs(middle.real) - reach, 0.0)
-    reach = (sine * other.shape.length + cosine * other.shape.width + actor.shape.width) / 2
-    return np.maximum(np.abs(middle.imag) - reach, 0.0)
+        return np.abs(apart.real)
+    return np.abs(apart.imag if kind == "lateral" else apart)
+
+
+def bodies_apart(actor: Actor, other: Actor, window: slice) -> tuple[Array, Array]:
+    """The place of another actor's middle relative to an actor's own, ahead + i left; and the sizes
+    of both parts up to which the bodies overlap in them [m].
+    """
+    facing = actor.facing[window]
+    turn = other.facing[window] / facing
+    apart: Array = (other.place[window] - actor.place[window]) / facing
+    apart = apart + turn * complex(other.shape.ahead, other.shape.left) - complex(actor.shape.ahead, actor.shape.left)
+    size, own = (complex(one.shape.length, one.shape.width) for one in (other, actor))
+    # A body that is turned reaches as far ahead as the box around it.
+    across = complex(size.imag, size.real)
+    return apart, (np.abs(turn.real) * size + np.abs(turn.imag) * across + own) / 2
 
 
 def _is_along_road(condition: Element, kind: str, actor: Actor) -> bool:
@@ -280,16 +273,15 @@ def _along_road(condition: Element, actor: Actor, other: Actor, window: slice, i
     gap = other.distance[window] - actor.distance[window]
     if not is_free:
         return np.abs(gap)
-    ahead = gap + other.shape.rear - actor.shape.front
-    behind = actor.shape.rear - gap - other.shape.front
-    return np.maximum(np.maximum(ahead, behind), 0.0)
+    middles = np.abs(gap + other.shape.ahead - actor.shape.ahead)
+    return np.maximum(middles - (other.shape.length + actor.shape.length) / 2, 0.0)
 
 
 BY_VALUE: dict[str, Callable[[Player, Element, slice], Array]] = {
     "SimulationTimeCondition": simulation_time_condition,
     "StoryboardElementStateCondition": storyboard_element_state_condition,
     "ParameterCondition": parameter_condition,
-    "VariableCondition": variable_condition,
+    "VariableCondition": parameter_condition,
 }
 BY_ENTITY: dict[str, Callable[[Player, Element, Actor, slice], Array]] = {
     "RelativeDistanceCondition": relative_distance_condition,
@@ -302,8 +294,8 @@ BY_ENTITY: dict[str, Callable[[Player, Element, Actor, slice], Array]] = {
     "RelativeSpeedCondition": relative_speed_condition,
     "StandStillCondition": stand_still_condition,
     "AccelerationCondition": acceleration_condition,
-    "CollisionCondition": collision_condition,
-    "EndOfRoadCondition": end_of_road_condition,
+    "CollisionCondition": never,
+    "EndOfRoadCondition": never,
     "OffroadCondition": offroad_condition,
 }
 """Conditions that are supported, by the standard's names."""

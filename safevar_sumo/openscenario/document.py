@@ -5,9 +5,12 @@ from __future__ import annotations
 import copy
 import math
 import os
+import tomllib
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 from defusedxml import DefusedXmlException
@@ -20,6 +23,9 @@ Element: TypeAlias = "ElementTree.Element[str]"
 
 FILE_KEY = ""
 """Who reads a file names it, and the study."""
+LEGAL = tomllib.loads(Path(__file__).with_name("legal.toml").read_text(encoding="utf-8"))
+"""The words of an enumeration, or `SIZE`, by attribute."""
+SIZE = "at least 0"
 
 
 def unsupported(problem: str, legal: str = "") -> InputError:
@@ -63,10 +69,9 @@ def number(element: Element, name: str, default: float | None = None) -> float:
     if default is not None and name not in element.attrib:
         return default
     text = literal(attribute(element, name), {})
-    try:
-        return float(text)
-    except ValueError:
-        raise unsupported(f"{element.tag}: {name} = {text!r}", "a number") from None
+    if not is_number(text):
+        raise unsupported(f"{element.tag}: {name} = {text!r}", "a finite number")
+    return float(text)
 
 
 def is_number(text: str) -> bool:
@@ -83,6 +88,23 @@ def whole(element: Element, name: str) -> int:
     if value != round(value):
         raise unsupported(f"{element.tag}: {name} = {value:g}", "a whole number")
     return round(value)
+
+
+def _check(element: Element) -> None:
+    """Refuse a word that an enumeration does not have, and a negative size (a rate has no sign)."""
+    for name, value in element.attrib.items():
+        legal = LEGAL.get(f"{element.tag}.{name}", LEGAL.get(name))
+        is_transition = name == "value" and element.get("dynamicsDimension", "rate") != "rate"
+        if legal == SIZE or is_transition:
+            if number(element, name) < 0:
+                raise unsupported(f"{element.tag}: {name} = {value!r}", f"a number of {SIZE}")
+        elif legal and value not in legal:
+            raise unsupported(f"{element.tag}: {name} = {value!r}", one_of(legal))
+
+
+def truth(element: Element, name: str) -> bool:
+    """A truth value of an element; it is false if the element does not have it."""
+    return element.get(name) in ("true", "1")
 
 
 def part(element: Element, path: str) -> Element:
@@ -103,19 +125,28 @@ class Parameter(NamedTuple):
 
 def declared(element: Element) -> list[Parameter]:
     """The parameters that an element declares."""
-    found = element.find("ParameterDeclarations")
-    return [] if found is None else [_parameter(each) for each in found.findall("ParameterDeclaration")]
+    found = [
+        Parameter(
+            attribute(each, "name"),
+            attribute(each, "value"),
+            tuple(
+                tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
+                for group in each.findall("ConstraintGroup")
+            ),
+        )
+        for each in element.findall("ParameterDeclarations/ParameterDeclaration")
+    ]
+    check_unique([parameter.name for parameter in found], "parameters")
+    for rule in element.iterfind("ParameterDeclarations/*/ConstraintGroup/*"):
+        _check(rule)
+    return found
 
 
-def _parameter(each: Element) -> Parameter:
-    return Parameter(
-        attribute(each, "name"),
-        attribute(each, "value"),
-        tuple(
-            tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
-            for group in each.findall("ConstraintGroup")
-        ),
-    )
+def check_unique(names: Sequence[str], kind: str) -> None:
+    """Refuse a name that several of a kind have."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise unsupported(f"{count} {kind} are named {name!r}", "a name of its own for each")
 
 
 def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> dict[str, str]:
@@ -181,6 +212,10 @@ def read(file: str, given: Mapping[str, str]) -> Document:
         folders.append(beside(folder, literal(attribute(each, "path"), values)))
     catalogs: list[str] = []
     _resolve(root, values, tuple(folders), catalogs)
+    # An orientation without a type is absolute up to version 1.2, and relative from 1.3 on.
+    for orientation in root.iter("Orientation"):
+        orientation.attrib.setdefault("type", "relative" if number(header, "revMinor", 0.0) >= 3 else "absolute")
+    check_unique([attribute(one, "name") for one in root.findall("Entities/*")], "entities")
     _name_members(root)
     logic = root.find("RoadNetwork/LogicFile")
     if logic is None:
@@ -215,6 +250,7 @@ def _resolve(element: Element, values: Values, folders: tuple[str, ...], catalog
     for key, text in element.attrib.items():
         if "$" in text:
             element.set(key, literal(text, values))
+    _check(element)
     for place, child in enumerate(list(element)):
         if child.tag == "ParameterDeclarations":
             continue

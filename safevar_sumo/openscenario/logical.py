@@ -14,6 +14,7 @@ from safevar_sumo.openscenario.document import (
     Element,
     attribute,
     beside,
+    check_unique,
     declared,
     is_number,
     number,
@@ -90,6 +91,7 @@ def open_file(file: str) -> Source:
         if distribution.find("Deterministic") is None:
             raise unsupported("Stochastic distributions are not supported", "Deterministic ones, such as a range")
         choices = [_choice(each) for each in part(distribution, "Deterministic")]
+        check_unique([name for choice in choices for name in choice.names], "parameters with values")
         concrete = beside(os.path.dirname(file), attribute(part(distribution, "ScenarioFile"), "filepath"))
     declarations = declared(root_of(concrete))
     given = {name: choice.sets[0][place] for choice in choices for place, name in enumerate(choice.names)}

@@ -132,20 +132,23 @@ Entity = Callable[[str], Place]
 """The place of an entity by its name."""
 
 
-def oriented(orientation: Element | None, base: complex, otherwise: complex) -> complex:
-    """The direction of an Orientation (class Orientation): relative to `base`, or absolute, as without a type."""
+def oriented(orientation: Element | None, base: complex) -> complex:
+    """The direction of an Orientation: absolute, or relative to `base`; without one it is `base`."""
     if orientation is None:
-        return otherwise
+        return base
     turn = unit(number(orientation, "h", 0.0))
     return base * turn if orientation.get("type") == "relative" else turn
 
 
 def on_road(road: Road, network: Network, s: float, t: float, facing: Element | None, *, against: bool) -> Place:
-    """A place on a road, which faces along the reference line, `against` it, or as the orientation says."""
+    """A place on a road, which faces along the reference line, `against` it, or as an orientation says.
+
+    A relative orientation counts from the direction without one: in a lane from its driving direction.
+    """
     if not -1e-9 <= s <= road.length + 1e-9:
         raise unsupported(f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long")
     along = road.line.pose(s).facing
-    turn = oriented(facing, along, -along if against else along) / along
+    turn = oriented(facing, -along if against else along) / along
     is_forward = turn.real >= AHEAD
     way = Way.onward(network, road.id, is_forward)
     return Place(way, s, t, turn) if is_forward else Place(way, road.length - s, -t, -turn)
@@ -185,17 +188,17 @@ def road_position(position: Element, network: Network, entity: Entity) -> Place:
     return on_road(road, network, s, t, position.find("Orientation"), against=False)
 
 
-def _of_reference(position: Element, entity: Entity) -> Crossing:
-    """Where the referenced entity is on its road."""
-    place = entity(attribute(position, "entityRef"))
+def of_reference(target: Element, entity: Entity) -> Crossing:
+    """Where the entity that a position or a target refers to is on its road."""
+    place = entity(attribute(target, "entityRef"))
     if not isinstance(place.path, Way):
-        raise unsupported(f"{position.tag} refers to an entity that is not on a road")
+        raise unsupported(f"{target.tag} refers to an entity that is not on a road")
     return place.path.road_at(place.distance, place.left)
 
 
 def relative_road_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RelativeRoadPosition."""
-    here = _of_reference(position, entity)
+    here = of_reference(position, entity)
     s = here.s + number(position, "ds")
     t = here.t + number(position, "dt")
     return on_road(here.road, network, s, t, position.find("Orientation"), against=False)
@@ -203,7 +206,7 @@ def relative_road_position(position: Element, network: Network, entity: Entity) 
 
 def relative_lane_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RelativeLanePosition: dLane grows with t, and no lane has the number 0."""
-    here = _of_reference(position, entity)
+    here = of_reference(position, entity)
     s = here.s + number(position, "ds", 0.0) + number(position, "dsLane", 0.0)
     lane = neighbour(here.road.lane_at(here.s, here.t), whole(position, "dLane"))
     return _in_lane(position, here.road, network, lane, s)
@@ -211,16 +214,19 @@ def relative_lane_position(position: Element, network: Network, entity: Entity) 
 
 def relative_world_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RelativeWorldPosition: along the axes of the world."""
-    pose = entity(attribute(position, "entityRef")).pose
-    place = pose.place + complex(number(position, "dx"), number(position, "dy"))
-    return Place.free(Pose(place, oriented(position.find("Orientation"), pose.facing, pose.facing)))
+    return _beside(position, entity, 1)
 
 
 def relative_object_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class RelativeObjectPosition: along the axes of the entity."""
+    return _beside(position, entity, entity(attribute(position, "entityRef")).pose.facing)
+
+
+def _beside(position: Element, entity: Entity, axis: complex) -> Place:
+    """A place relative to an entity, with the direction of the first axis."""
     pose = entity(attribute(position, "entityRef")).pose
-    moved = pose.moved(number(position, "dx"), number(position, "dy"))
-    return Place.free(moved._replace(facing=oriented(position.find("Orientation"), pose.facing, pose.facing)))
+    place = pose.place + complex(number(position, "dx"), number(position, "dy")) * axis
+    return Place.free(Pose(place, oriented(position.find("Orientation"), pose.facing)))
 
 
 def trajectory_position(position: Element, network: Network, entity: Entity) -> Place:
@@ -246,8 +252,11 @@ def route_position(position: Element, network: Network, entity: Entity) -> Place
 
 
 def _turned(place: Place, orientation: Element | None) -> Place:
-    """A place on a line with an orientation, which counts from the line."""
-    return place if orientation is None else place._replace(turn=unit(number(orientation, "h", 0.0)))
+    """A place on a line with an orientation, to which a relative one counts from the line."""
+    if orientation is None:
+        return place
+    along = place.pose.facing
+    return place._replace(turn=oriented(orientation, along) / along)
 
 
 POSITIONS: dict[str, Callable[[Element, Network, Entity], Place]] = {

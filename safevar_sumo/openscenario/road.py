@@ -203,7 +203,7 @@ class Road:
 def _cubic(pieces: Cubics, s: float) -> float:
     start, (a, b, c, d) = next((one for one in reversed(pieces) if one[0] <= s + 1e-9), pieces[0])
     ds = max(s - start, 0.0)
-    return a + b * ds + c * ds**2 + d * ds**3
+    return a + ds * (b + ds * (c + ds * d))
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,18 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
-from safevar_sumo.openscenario.actors import STEP, Actor, Array, Running, actors_of
-from safevar_sumo.openscenario.conditions import REACTIONS, holds, watched
-from safevar_sumo.openscenario.document import Document, Element, attribute, number, part, unsupported
+from safevar_sumo.openscenario.actors import LONGEST, STEP, Actor, Array, Running, actors_of
+from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
+from safevar_sumo.openscenario.document import Document, Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.places import Place, Way, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network
 
-LONGEST = 60.0
-"""Longest scene [s]: how long a file without a StopTrigger that holds is played."""
+UNSTOPPED = 60.0
+"""How long a file without a StopTrigger is played, or if only a run can tell when it holds [s]."""
 AFTER = 4.0
 """Time after the StopTrigger that is played [s]: with a vehicle that brakes, all happens later."""
+TIMES = np.round(np.arange(round((LONGEST + AFTER) / STEP) + 1) * STEP, 9)
+"""Times of the samples of the longest scene [s]."""
 BLOCK = 1000
 """Samples that are played at once at most."""
 MAX_TURN = 0.01
@@ -76,7 +78,7 @@ def _below(outer: Key, element: Element) -> Key:
 
 
 def _stop_trigger(element: Element) -> Element | None:
-    """The StopTrigger of a storyboard or an act; None also for an empty one."""
+    """The StopTrigger of a storyboard or an act; None also for an empty one, which never holds."""
     stop = element.find("StopTrigger")
     return stop if stop is not None and len(stop) else None
 
@@ -87,7 +89,7 @@ class Player:
     def __init__(self, document: Document, ego: str) -> None:
         self.document = document
         self.network = read_network(document.road)
-        self.times = np.round(np.arange(round(LONGEST / STEP) + 1) * STEP, 9)
+        self.times = TIMES
         actors = {actor.name: actor for actor in actors_of(document.root, len(self.times))}
         if ego not in actors:
             raise unsupported(
@@ -112,6 +114,7 @@ class Player:
         self.stop = math.inf
         self.seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
+        self._refuse_states_of_nothing()
         self.acts = [
             self._act(each, ("story", attribute(story, "name")))
             for story in self._board.findall("Story")
@@ -166,7 +169,7 @@ class Player:
         for group in element.findall("ManeuverGroup"):
             actors = part(group, "Actors")
             group_key = _below(act_key, group)
-            if actors.get("selectTriggeringEntities") == "true":
+            if truth(actors, "selectTriggeringEntities"):
                 raise unsupported("Actors with selectTriggeringEntities = true is not supported")
             own = [self.other(each) for each in actors.findall("EntityRef")]
             for maneuver in group.findall("Maneuver"):
@@ -177,6 +180,16 @@ class Player:
         act_of_story = Act(element, act_key, events)
         self._refuse_reactions(act_of_story)
         return act_of_story
+
+    def _refuse_states_of_nothing(self) -> None:
+        """Refuse conditions on the state of an element that the storyboard does not have."""
+        for one in self._board.iter("StoryboardElementStateCondition"):
+            kind, name = (attribute(one, f"storyboardElement{each}") for each in ("Type", "Ref"))
+            found = [self._board]
+            for each in name.split("::"):
+                found = [inner for outer in found for inner in outer.iter() if inner.get("name") == each]
+            if kind.lower() not in [element.tag.lower() for element in found]:
+                raise unsupported(f"{one.tag}: storyboardElementRef = {name!r}", f"the name of a storyboard's {kind}")
 
     def _remark_repeats(self, group: Element, maneuver: Element) -> None:
         for one in (group, *maneuver.findall("Event")):
@@ -250,10 +263,10 @@ class Player:
                 self._begin(event, one)
             if event.has_begun and not event.has_ended:
                 self._finish(event)
-        outer_keys = dict.fromkeys(chain(*(event.outer[:3] for event in one.events)))
-        for key in outer_keys:
+        events = [event for other in self.acts for event in other.events]
+        for key in dict.fromkeys(chain(*(event.outer for event in one.events))):
             self.begun.setdefault(key, self.now)
-            if all(event.has_ended for event in one.events if key in event.outer):
+            if all(event.has_ended for event in events if key in event.outer):
                 self.ended.setdefault(key, self.now)
         if not one.events:
             self.ended.setdefault(one.key, self.now)
@@ -331,15 +344,16 @@ class Player:
         """Play up to the end."""
         self.initialise()
         stop = _stop_trigger(self._board)
-        final = len(self.times) - 1
+        longest = UNSTOPPED if stop is None or LEFT_TO_RUNS & {*watched(self, stop)} else LONGEST
+        final = round(longest / STEP)
         while True:
             self.settle()
             is_asked = stop is not None and math.isinf(self.stop)
             if is_asked and holds(self, stop, slice(self.sample, self.sample + 1))[0]:
                 self.stop = self.now
-                final = min(final, self.sample + round(AFTER / STEP))
+                final = self.sample + round(AFTER / STEP)
             if self.sample >= final:
-                return
+                break
             last = min(final, self.sample + BLOCK)
             for actor in sorted(self.actors.values(), key=lambda one: one.follows is not None):
                 actor.move(self.sample, last, self.times)
@@ -351,6 +365,13 @@ class Player:
             for actor in self.actors.values():
                 actor.arrive(last)
             self.sample = last
+        if math.isinf(self.stop) and self.now >= longest:
+            if longest == LONGEST:
+                legal = f"one that does, if {self.ego.name} keeps its speed"
+                raise unsupported(f"the StopTrigger does not hold within {LONGEST:g} s", legal)
+            self.remark(
+                f"the scene ends at {UNSTOPPED:g} s: it has no StopTrigger, or one that waits for {self.ego.name}"
+            )
 
     def _road_end(self, last: int) -> int:
         """The last sample at which all actors are on their roads."""

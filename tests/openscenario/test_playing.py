@@ -34,6 +34,9 @@ REAR = 1.5
 """The middle of a body is so far before its origin [m]."""
 
 
+DONE = "<StoryboardElementStateCondition storyboardElementType='{}' storyboardElementRef='{}' state='completeState'/>"
+
+
 def only(played: Played) -> Moved:
     (car,) = played.others
     return car
@@ -86,6 +89,20 @@ def test_a_rate_is_the_largest_one_and_a_distance_is_driven(
     played = play(file, {})
     assert played.duration - 4 == pytest.approx(duration, abs=STEP)
     assert origin(only(played))[-1].imag == pytest.approx(18)
+
+
+@pytest.mark.parametrize(
+    ("final", "half", "end"), [(4, 5 - math.sqrt(10), 3 + 9 / 4), (16, math.sqrt(40) - 5, math.sqrt(55) - 5)]
+)
+def test_a_lane_change_over_a_distance_takes_it_whatever_the_speed_does(
+    tmp_path: Path, final: float, half: float, end: float
+) -> None:
+    """30 m, while the speed changes by 2 m/s^2 from 10 m/s; after 15 m the body is between the lanes."""
+    change = event(lane_change(-1, "cubic", "distance", 30.0))
+    faster = event(speed(final, "linear", "rate", 2.0), name="Faster", priority="parallel")
+    played = play(write(tmp_path, change, faster, stop=trigger(DONE.format("event", "Event"), "")), {})
+    assert played.duration - 4 == pytest.approx(end, abs=STEP)
+    assert origin(only(played))[round(half / STEP)].imag == pytest.approx(16, abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -214,6 +231,65 @@ def test_one_event_ends_another(tmp_path: Path) -> None:
         assert car.speed[-1] == 20
 
 
+@pytest.mark.parametrize("stop", ["", trigger(watching("Ego", '<StandStillCondition duration="1"/>'), "")])
+def test_an_empty_trigger_starts_at_once_and_never_stops(tmp_path: Path, stop: str) -> None:
+    """Without a StopTrigger, and with one that waits for how Ego drives, a remark says when the scene ends."""
+    faster = event(speed(20, "linear", "time", 2), "<StartTrigger></StartTrigger>")
+    empty = play(write(tmp_path, faster, act_trigger="<StartTrigger/><StopTrigger/>", stop=stop), {})
+    assert only(empty).speed[[100, 250]].tolist() == [pytest.approx(15), 20]
+    assert (empty.duration, "the scene ends at 60 s" in empty.remarks[0]) == (60, True)
+
+
+BESIDE = 'RelativeTargetLane entityRef="Ego"'
+OFFSET = """<LateralAction><LaneOffsetAction><LaneOffsetActionDynamics dynamicsShape="step"/><LaneOffsetTarget>
+<RelativeTargetLaneOffset entityRef="Ego" value="1.5"/></LaneOffsetTarget></LaneOffsetAction></LateralAction>"""
+
+
+@pytest.mark.parametrize(
+    ("action", "ego", "its_lane", "left"),
+    [
+        (lane_change(-1, "step", "time", 0, BESIDE), -1, -1, -6),
+        (lane_change(1, "step", "time", 0, BESIDE), 2, 2, 2),
+        (lane_change(1, "step", "time", 0, BESIDE.replace("Ego", "Car")), -1, 2, 2),
+        (lane_change(-1, "step", "time", 0, BESIDE), -1, 2, -6),
+        (OFFSET, -1, 2, -0.5),  # offsets count along t
+        (OFFSET, 2, -1, 7.5),
+    ],
+)
+def test_lanes_count_to_the_left_of_an_entity_as_it_faces(
+    tmp_path: Path, action: str, ego: int, its_lane: int, left: float
+) -> None:
+    """On lanes with a number above 0 they drive against the others."""
+    start = private("Ego", teleport(at(ego, 900)), speed(20))
+    played = play(write(tmp_path, event(action), ego=start, car=(teleport(at(its_lane, 900)), speed(10))), {})
+    assert origin(only(played))[-1].imag == pytest.approx(20 + left)
+
+
+IN_LANE = '<LanePosition roadId="1" laneId="{}" s="500"><Orientation h="0.5" {}/></LanePosition>'
+ON_LINE = """<TrajectoryPosition s="1"><Orientation h="0.5" {}/><TrajectoryRef><Trajectory><Shape><Polyline>
+<Vertex><Position><WorldPosition x="0" y="0"/></Position></Vertex><Vertex><Position><WorldPosition x="-9" y="0"/></Position></Vertex>
+</Polyline></Shape></Trajectory></TrajectoryRef></TrajectoryPosition>"""
+
+
+@pytest.mark.parametrize(
+    ("minor", "place", "turned"),
+    [
+        ("2", IN_LANE.format(1, ""), 0),
+        ("3", IN_LANE.format(-1, ""), 0),
+        ("3", IN_LANE.format(1, ""), 1),
+        ("3", IN_LANE.format(1, 'type="absolute"'), 0),
+        ("1", IN_LANE.format(1, 'type="relative"'), 1),
+        ("2", ON_LINE.format(""), 0),
+        ("3", ON_LINE.format(""), 1),
+    ],
+)
+def test_an_orientation_is_absolute_or_relative(tmp_path: Path, minor: str, place: str, turned: int) -> None:
+    """The road leads to the east, lane 1 and the trajectory to the west. A remark says how lanes are understood."""
+    played = play(write(tmp_path, car=(teleport(place), speed(0)), minor=minor), {})
+    assert only(played).facing[0] == pytest.approx(np.exp(1j * (0.5 + turned * math.pi)))
+    assert any("driving direction" in remark for remark in played.remarks) == (turned and "Lane" in place)
+
+
 def test_a_spiral_is_the_integral_of_its_curvature() -> None:
     for first, last in ((0.0, 0.02), (0.02, -0.01), (-0.01, -0.03)):
         piece = Piece(Pose.at(3.0, -2.0, 0.7), 80.0, first, last)
@@ -269,10 +345,17 @@ def test_an_ego_in_the_left_lane_drives_against_s(tmp_path: Path) -> None:
 
 
 def test_a_state_is_that_of_the_element_with_its_whole_path(tmp_path: Path) -> None:
+    """A story has ended with its last act."""
     for name in ("Event", "Maneuver of Car::Event", "Story::Act::Group of Car::Maneuver of Car::Event"):
-        done = f"<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{name}' state='completeState'/>"
-        file = write(tmp_path, event(speed(20, "linear", "time", 3), AT_ONCE.format(2)), stop=trigger(done, ""))
+        file = write(
+            tmp_path,
+            event(speed(20, "linear", "time", 3), AT_ONCE.format(2)),
+            stop=trigger(DONE.format("event", name), ""),
+        )
         assert play(file, {}).duration == pytest.approx(5 + 4, abs=2 * STEP)
+    later = "</Act><Act name='Later'>" + group(event(speed(5, "linear", "time", 2), AT_ONCE.format(6)))
+    file = write(tmp_path, event(speed(8)), act_trigger=later, stop=trigger(DONE.format("story", "Story"), ""))
+    assert play(file, {}).duration == pytest.approx(8 + 4, abs=STEP)
 
 
 def test_a_selection_acts_and_is_watched_as_its_members(tmp_path: Path) -> None:

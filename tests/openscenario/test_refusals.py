@@ -17,6 +17,7 @@ from tests.in_process import ROOT
 from tests.openscenario.writing import (
     AT_ONCE,
     EGO,
+    PARAMETER,
     STRAIGHT,
     at,
     body,
@@ -46,6 +47,13 @@ TEMPLATES = [
     for _, message in GENERATE["messages"](Path(openscenario.__path__[0]))
 ]
 """The refusals that a page of the manual lists."""
+TRAILER = body("Car").replace("</Vehicle>", "<Trailer>{}</Trailer></Vehicle>")
+STATE = trigger(
+    "<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{}' state='runningState'/>",
+    "",
+)
+BACKWARDS = """<SynchronizeAction masterEntityRef="Ego"><TargetPositionMaster><LanePosition roadId="1" laneId="-1" s="250"/></TargetPositionMaster>
+<TargetPosition><LanePosition roadId="1" laneId="-2" s="200"/></TargetPosition><FinalSpeed><AbsoluteSpeed value="-2"/></FinalSpeed></SynchronizeAction>"""
 COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>"
 
 
@@ -75,7 +83,14 @@ COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionConditio
         ({"car": (teleport(at(-3, 100)), speed(10))}, "road 1 has no lane -3"),
         ({"car": (teleport(at(-2, 100)), speed("$v"))}, "the file declares no parameter v"),
         ({"car": (teleport(at(-2, 100)), speed("fast"))}, "value = 'fast'"),
-        ({"entities": body("Ego") + body("Car").replace("</Vehicle>", "<Trailer/></Vehicle>")}, "the Trailer of Car is not supported"),
+        ({"entities": body("Ego") + TRAILER.format('<TrailerRef entityRef="Cart"/>')}, "the Trailer of Car is not supported"),
+        ({"entities": body("Ego") + TRAILER.format('<Trailer name="Cart"/>')}, "the Trailer of Car is not supported"),
+        ({"entities": body("Ego") + 2 * body("Car")}, "2 entities are named 'Car'"),
+        ({"parameters": 2 * PARAMETER}, "2 parameters are named 'v'"),
+        ({"parameters": LIMITED.replace("lessThan", "below")}, "ValueConstraint: rule = 'below'"),
+        ({"stop": STATE.format("Evnt")}, "storyboardElementRef = 'Evnt'"),
+        ({"stop": STATE.format("Act::Other::Event")}, "storyboardElementRef = 'Act::Other::Event'"),
+        ({"events": group(event(BACKWARDS))}, r"Car drives backwards \(-2.00 m/s\)"),
         ({"stop": trigger(watching("Ego", f'<DistanceCondition freespace="true" value="5" rule="lessThan"><Position>{at(-1, 100)}</Position></DistanceCondition>'), "")}, "DistanceCondition with freespace = true is not supported"),
         ({"stop": trigger(watching("Ego", '<SpeedCondition direction="lateral" value="5" rule="lessThan"/>'), "")}, "SpeedCondition with direction = lateral is not supported"),
     ],
@@ -137,6 +152,10 @@ RANGE = '<DistributionRange stepWidth="{}"><Range lowerLimit="{}" upperLimit="{}
     [
         ("<Stochastic/>", "Stochastic distributions are not supported"),
         ("<Deterministic>" + ROW.format("w", RANGE.format(1, 0, 5)) + "</Deterministic>", "declares no parameter w"),
+        (
+            "<Deterministic>" + 2 * ROW.format("v", RANGE.format(1, 0, 5)) + "</Deterministic>",
+            "2 parameters with values",
+        ),
         (
             "<Deterministic>" + ROW.format("v", RANGE.format(0, 0, 5)) + "</Deterministic>",
             "v: a range from 0 to 5 by 0",

@@ -41,7 +41,7 @@ def test_lanes_are_where_netconvert_has_them(tmp_path: Path, geometry: str, leng
         name = next(one.get("value", "") for one in lane.iter("param") if one.get("key") == "origId")
         points = [complex(*map(float, point.split(","))) for point in lane.get("shape", "").split()]
         lanes[int(name.rpartition("_")[2])] = np.array(points)
-    assert sorted(lanes) == [-2, -1, 1]
+    assert sorted(lanes) == [-2, -1, 1, 2]
     for name, line in lanes.items():
         for s in np.linspace(15.0, length - 15.0, 9):
             place = road.line.pose(s, road.lane_t(name, s)).place

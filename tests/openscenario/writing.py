@@ -1,5 +1,5 @@
 # ruff: noqa: E501 (lines of XML, and formulas)
-"""Files of OpenSCENARIO for tests, from the parts that differ: a straight road of two lanes, Ego and a Car."""
+"""Files of OpenSCENARIO for tests, from the parts that differ: a straight road of four lanes, Ego and a Car."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 
 ROAD = """<OpenDRIVE><header revMajor="1" revMinor="6"/>
 <road name="" length="{length}" id="1" junction="-1"><planView>{geometry}</planView><lanes><laneSection s="0">
-<left><lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left><center><lane id="0" type="none"/></center>
+<left><lane id="2" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane>
+<lane id="1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></left><center><lane id="0" type="none"/></center>
 <right><lane id="-1" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane>
 <lane id="-2" type="driving"><width sOffset="0" a="4" b="0" c="0" d="0"/></lane></right></laneSection></lanes></road></OpenDRIVE>"""
 STRAIGHT = '<geometry s="0" x="10" y="20" hdg="0" length="2000"><line/></geometry>'
 BOX = '<BoundingBox><Center x="{ahead}" y="0" z="0.7"/><Dimensions width="{width}" length="{length}" height="1.5"/></BoundingBox>'
 FILE = """<?xml version="1.0"?>{prolog}
-<OpenSCENARIO><FileHeader revMajor="{version}" revMinor="2"/><ParameterDeclarations>{parameters}</ParameterDeclarations>
+<OpenSCENARIO><FileHeader revMajor="{version}" revMinor="{minor}"/><ParameterDeclarations>{parameters}</ParameterDeclarations>
 <CatalogLocations>{catalogs}</CatalogLocations><RoadNetwork><LogicFile filepath="{road}"/></RoadNetwork>
 <Entities>{entities}</Entities><Storyboard><Init><Actions>{init}</Actions></Init>
 <Story name="Story"><Act name="Act">{events}{act_trigger}</Act></Story><StopTrigger>{stop}</StopTrigger></Storyboard></OpenSCENARIO>"""
@@ -30,8 +31,8 @@ def person(name: str, length: float, width: float) -> str:
     return f'<ScenarioObject name="{name}"><Pedestrian name="">{box}</Pedestrian></ScenarioObject>'
 
 
-def at(lane: int, s: float, offset: float = 0.0) -> str:
-    return f'<LanePosition roadId="1" laneId="{lane}" s="{s}" offset="{offset}"/>'
+def at(lane: int, s: float, offset: float = 0.0, inner: str = "") -> str:
+    return f'<LanePosition roadId="1" laneId="{lane}" s="{s}" offset="{offset}">{inner}</LanePosition>'
 
 
 def world(x: float, y: float, h: float = 0.0) -> str:
@@ -52,9 +53,9 @@ def speed(value: object, shape: str = "step", dimension: str = "time", amount: f
     return f"<LongitudinalAction><SpeedAction>{how}{target}</SpeedAction></LongitudinalAction>"
 
 
-def lane_change(lane: int, shape: str, dimension: str, amount: float) -> str:
+def lane_change(lane: int, shape: str, dimension: str, amount: float, kind: str = "AbsoluteTargetLane") -> str:
     how = dynamics(shape, dimension, amount, "LaneChangeActionDynamics")
-    target = f'<LaneChangeTarget><AbsoluteTargetLane value="{lane}"/></LaneChangeTarget>'
+    target = f'<LaneChangeTarget><{kind} value="{lane}"/></LaneChangeTarget>'
     return f"<LateralAction><LaneChangeAction>{how}{target}</LaneChangeAction></LateralAction>"
 
 
@@ -87,6 +88,18 @@ def group(*events: str, actor: str = "Car") -> str:
     return f'<ManeuverGroup name="Group of {actor}" maximumExecutionCount="1">{actors}{maneuver}</ManeuverGroup>'
 
 
+PARAMETER = '<ParameterDeclaration name="v" parameterType="double" value="3"/>'
+LOGICAL = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValueDistribution><ScenarioFile filepath="scenario.xosc"/>
+<Deterministic><DeterministicSingleParameterDistribution parameterName="v"><DistributionSet>{}</DistributionSet></DeterministicSingleParameterDistribution></Deterministic></ParameterValueDistribution></OpenSCENARIO>"""
+
+
+def logical(folder: Path, *values: float) -> str:
+    """The path of a file with values of the parameter v of the scenario that has been written there."""
+    path = folder / "values.xosc"
+    path.write_text(LOGICAL.format("".join(f'<Element value="{value}"/>' for value in values)))
+    return str(path)
+
+
 EGO = private("Ego", teleport(at(-1, 50)), speed(20))
 
 
@@ -105,6 +118,7 @@ def write(
     found = {
         "prolog": "",
         "version": "1",
+        "minor": "2",
         "parameters": "",
         "catalogs": "",
         "road": "road.xodr",
