@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
-from safevar_sumo.openscenario.document import is_number, read, unsupported, violated
+from safevar_sumo.openscenario.conditions import bodies_apart
+from safevar_sumo.openscenario.document import is_number, read, unsupported, violated, whole
 from safevar_sumo.openscenario.road import Pose
 from safevar_sumo.openscenario.storyboard import Player
 
@@ -31,7 +32,7 @@ class Moved(NamedTuple):
 class Played(NamedTuple):
     """A scene: Ego's shape, the pose of the middle of its front at the start, and its speed [m/s]; the others; the
     length [s]; the time until which a motion depends on Ego, and what depends on it; remarks; the files that were read;
-    and the file's parameters that are numbers.
+    the file's parameters that are numbers; and why nothing happens to Ego, "" if something does.
     """
 
     ego: Shape
@@ -44,6 +45,7 @@ class Played(NamedTuple):
     remarks: list[str]
     files: list[str]
     numbers: list[str]
+    uneventful: str
 
 
 def play(file: str, values: Mapping[str, str], ego: str = "Ego", every: int = 1) -> Played:
@@ -62,7 +64,8 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego", every: int = 1)
         played = _play(file, values, ego, every)
         stamps = _stamps(played.files)
     _SCENES[key] = played, stamps  # the last one is the newest
-    if len(_SCENES) > KEPT_SCENES:
+    most = min(KEPT_SCENES, KEPT_SAMPLES // sum(len(one.speed) for one in played.others))
+    while len(_SCENES) > most:
         del _SCENES[next(iter(_SCENES))]
     return played
 
@@ -71,8 +74,15 @@ EVERY = 5
 """Samples of a scene that are kept if those of a study are among them: every fifth."""
 _SCENES: dict[tuple[object, ...], tuple[Played, list[tuple[int, int]]]] = {}
 KEPT_SCENES = 8000
-"""Number of played scenes that a process keeps: 10 s of a body that changes its motion take 8 kB with every fifth
-sample. All fits of a model meet the same 7,004 encounters.
+"""Number of played scenes that a process keeps: all fits of a model meet the same encounters, 7,004."""
+KEPT_SAMPLES = 9_600_000
+"""Number of samples of one body in all of these scenes; each takes 40 bytes."""
+HALF_LANE = 1.75
+"""Whoever is within this distance of Ego's path is in its lane: half of a lane of 3.5 m [m]."""
+NEAR = 4.0
+"""Ego follows a body that is ahead in its lane within this time of driving for this time; a body that
+left the lane at most so long before Ego arrives is met, too [s]. At a time to collision of 4 s Euro
+NCAP's tests begin.
 """
 EVEN = 1e-11
 """Difference of a step from that at an even speed up to which it is one [m]: what rounding leaves."""
@@ -107,9 +117,36 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     until = min(player.dependences.get(what, 0.0), player.now)
     files = list(dict.fromkeys([file, *document.catalogs, document.road]))
     numbers = [name for name, value in document.values.items() if is_number(value)]
-    return Played(
-        own.shape, start, float(own.speed[0]), others, player.now, until, what, [*player.remarks], files, numbers
-    )
+    speed = float(own.speed[0])
+    remarks = [*player.remarks]
+    reason = _why_uneventful(player)
+    return Played(own.shape, start, speed, others, player.now, until, what, remarks, files, numbers, reason)
+
+
+def _why_uneventful(player: Player) -> str:
+    """Why nothing happens to an Ego that holds its speed; "" if something does.
+
+    Ego meets a body that it reaches, unless the body left Ego's lane long before, and one that it
+    follows closely in its lane. A body that stands in its lane or crosses it needs no event.
+    """
+    own = player.ego
+    long = round(NEAR / STEP)
+    meets = has_company = False
+    for actor in player.actors.values():
+        if actor is own:
+            continue
+        apart, reach = bodies_apart(own, actor, slice(0, round(min(player.now, actor.deleted) / STEP) + 1))
+        is_in_lane = np.abs(apart.imag) < np.maximum(reach.imag, HALF_LANE)
+        gap = np.abs(apart.real) - reach.real
+        is_close = is_in_lane & (apart.real > 0) & (gap < NEAR * own.speed_now)
+        # The last sample in Ego's lane, or of all if it is never there.
+        last = int(np.flatnonzero(is_in_lane | ~is_in_lane.any())[-1])
+        has_company |= bool(is_in_lane.any())
+        meets |= bool((gap[: last + long] <= 0).any() or is_close.sum() >= long)
+    moving = [event for one in player.acts for event in one.events if event.moves]
+    if moving and not has_company and not any(event.running for event in moving):
+        return f"no event begins that moves somebody, and nobody is in {own.name}'s lane or crosses it"
+    return "" if meets else f"the scene ends at {player.now:.1f} s, before {own.name} has come near anybody"
 
 
 def _moved(actor: Actor, samples: slice) -> Moved:
@@ -126,9 +163,17 @@ def _moved(actor: Actor, samples: slice) -> Moved:
 
 
 def _remark(player: Player) -> None:
-    """What the user should know of what was not played."""
-    if player.document.root.find("Entities/ScenarioObject/ObjectController") is not None:
+    """What the user should know of what was not played, and how what was played was understood."""
+    root = player.document.root
+    if root.find("Entities/ScenarioObject/ObjectController") is not None:
         player.ignored.add("ObjectController")
+    in_lanes = root.findall(".//LanePosition/Orientation[@type='relative']/..")
+    beside = root.find(".//RelativeLanePosition/Orientation[@type='relative']")
+    # In lanes to the right of the reference line both readings are the same.
+    if beside is not None or any(whole(each, "laneId") > 0 for each in in_lanes):
+        player.remark(
+            "an Orientation relative to a lane counts from its driving direction (ASAM allows the road's, too)"
+        )
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")
     for actor in player.actors.values():
@@ -136,5 +181,5 @@ def _remark(player: Player) -> None:
             player.remark(f"{actor.name} is deleted at {actor.deleted:.1f} s")
     for one in player.acts:
         for event in one.events:
-            if event.moves and not event.has_begun:
+            if event.moves and not event.running:
                 player.remark(f"the event {event.name} never fires")

@@ -153,6 +153,9 @@ class Scenario:
     depends_until, dependence
         Time until which the others move as if the vehicle kept its speed [s], and a sentence on it: a run in which the
         ADS acts before is an invalid test.
+    uneventful
+        Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the ADS;
+        "" if something does, None if only a drive can tell.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -180,11 +183,14 @@ class Scenario:
         def depends_until(self) -> float: ...
         @property
         def dependence(self) -> str: ...
+        @property
+        def uneventful(self) -> str | None: ...
     else:
         pre_crash = ""
         test_speed = None
         depends_until = 0.0
         dependence = "others move as if the vehicle kept its speed"
+        uneventful = None
 
     @property
     def is_hit_in_front(self) -> bool:

@@ -13,6 +13,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import EVERY, STEP, Moved, Played, play, text_of
 from safevar_sumo.output import file_beside
 from safevar_sumo.records import FloatArray, IntArray, Quantity
+from safevar_sumo.scenarios.base import XmlChanges, as_text
+from safevar_sumo.scenarios.roads import Roads
 from safevar_sumo.scenarios.tracks import VUT_LENGTH, VUT_WIDTH, Track, TrackScenario
 from safevar_sumo.study import FreeParameter
 
@@ -20,6 +22,8 @@ WIDEST = 1e9
 """Largest size of a parameter of a file, which says itself what it allows."""
 AWAY_SPEED = 90.0
 """Speed at which a deleted entity, a point without size, leaves the scene to the left [m/s]."""
+LANE_LENGTH = 4000.0
+"""Length of the lane of the network `along` [m]."""
 SAME = 1e-6
 """Difference of two samples' numbers up to which they are one [-]."""
 DIGITS = 9
@@ -145,6 +149,11 @@ class OpenScenario(TrackScenario):
         played = self._scenes[0]
         return f"{played.dependence} at {played.depends_until:.1f} s depends on an Ego that keeps its speed"
 
+    @property
+    def uneventful(self) -> str:
+        """Why nothing happens to an Ego that keeps its speed."""
+        return self._scenes[0].uneventful
+
     def read_files(self, folders: Sequence[str]) -> None:
         """The file, which is refused if it has what nobody can play."""
         self.file = file_beside(self.name, folders) or self.file
@@ -157,6 +166,14 @@ class OpenScenario(TrackScenario):
         body = f"{played.ego.length:.2f} m x {played.ego.width:.2f} m"
         differs = [] if body == car else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
         return [*played.remarks, *differs]
+
+    def lanes(self, roads: Roads) -> XmlChanges:
+        """A longer lane in SUMO for a long scene."""
+        way = float(np.max(self.test_speed * self.duration))
+        if way < LANE_LENGTH / 2:
+            return {}
+        end = as_text(LANE_LENGTH + way)
+        return {"edge/lane[@id='road_0']": {"length": end, "shape": f"0,-1.75 {end},-1.75"}}
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """All entities but Ego; beyond the end of the scene they go on as they move there."""

@@ -19,6 +19,8 @@ MODEL = "openscenario"
 """The scenario that plays a file."""
 MOST_POINTS = 2000
 """Largest number of combinations of a file's values in a matrix."""
+MOST_NAMES = 50
+"""Largest number of combinations that a warning names."""
 WEATHER = tuple(free_parameters(Weather))
 """Parameters of the weather, which a study may search as well."""
 Raw = Mapping[str, Any]
@@ -163,25 +165,34 @@ def _points(rest: Source, given: Parameters) -> list[Parameters]:
 
 
 def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameters]) -> list[Parameters]:
-    """The points that can be played; a warning says how many cannot, and why."""
-    played = []
+    """The points that can be played and at which something happens; a warning names the others.
+
+    If nothing happens at any point, all that can be played are kept: they have no verdict.
+    """
+    playable = {}
     problems = {}
+    errors = []
     for point in points:
+        name = " and ".join(f"{name} = {value}" for name, value in point.items())
         try:
-            play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego, EVERY)
-        except InputError as problem:
-            problems[" and ".join(f"{name} = {value}" for name, value in point.items())] = problem
-        else:
-            played.append(point)
-    if problems:
-        first, error = next(iter(problems.items()))
-        if not played:
-            raise error
-        left_out = (
-            f"{len(problems)} of {len(points)} combinations of the file's values cannot be played and are left out"
+            scene = play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego, EVERY)
+            problems[name] = scene.uneventful
+            playable[name] = point
+        except InputError as error:
+            problems[name] = error.problem
+            errors.append(error)
+    if not playable:
+        raise errors[0]
+    kept = {name: point for name, point in playable.items() if not problems[name]} or playable
+    left_out = [name for name in problems if name not in kept]
+    if left_out:
+        counts = f"{len(left_out)} of {len(points)} combinations of the file's values"
+        others = "; ".join(left_out[1:MOST_NAMES]) or "none"
+        warn(
+            f"{counts} cannot be played, or nothing happens in them, and are left out; "
+            f"the first is {left_out[0]}: {problems[left_out[0]]}; others: {others}"
         )
-        warn(f"{left_out}; the first is {first}: {error.problem}")
-    return played
+    return [*kept.values()]
 
 
 def _too_many(rest: Source, total: int) -> InputError:

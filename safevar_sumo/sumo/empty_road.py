@@ -22,7 +22,7 @@ SLOW_APPROACH = 0.5
 
 
 class Reason(StrEnum):
-    """Why a first drive does not lead to the encounter: the ADS brakes or stands, or the others do not wait."""
+    """Why a first drive leads to no encounter: the ADS brakes or stands; others leave, or never come."""
 
     BRAKES = "brakes"
     LATE = "late"
@@ -46,17 +46,19 @@ def find_problems(system: System) -> dict[str, Problem]:
 
     At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach
     the place of the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it
-    from a collision.
+    from a collision. Neither is it where nothing happens to a vehicle that keeps its speed.
     """
+    original = system.characteristics.original[np.newaxis]
     try:
-        results = simulate_all_points(replace(system, sees_nobody=True), system.characteristics.original[np.newaxis])
+        results = simulate_all_points(replace(system, sees_nobody=True), original)
     except SimulationError:  # the study's own simulations decide, and report their errors
         return {}
+    points = system.at_encounters(original)[0].points
     return {
-        result.point.name: problem
-        for result in results
-        if not result.point.scenario.brakes_fully
-        and (problem := _problem(result.runs, result.point.scenario.test_speed))
+        point.name: problem
+        for point, result in zip(points, results, strict=True)
+        if not point.scenario.brakes_fully
+        and (problem := _problem(result.runs, result.point.scenario.test_speed, point.scenario.uneventful))
     }
 
 
@@ -73,7 +75,7 @@ def sentence_on(problems: dict[str, Problem], n_points: int) -> str:
     )
 
 
-def _problem(runs: SimulationRuns, test_speed: float | None) -> Problem | None:
+def _problem(runs: SimulationRuns, test_speed: float | None, uneventful: str | None) -> Problem | None:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road.
 
     Who still has its test speed at the end, and comes closer to nobody, has driven as it should. Who still has the
@@ -87,8 +89,11 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> Problem | None:
     approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
-    if gap[-1] <= 0 or (keeps_speed and is_alone) or runs.outcome[0] == Outcome.COLLISION:
+    meets_undisturbed = keeps_speed and uneventful == ""
+    if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
         return None
+    if gap[-1] <= 0 or (keeps_speed and is_alone):
+        return Problem(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
     if runs.outcome[0] == Outcome.PASSED and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH:

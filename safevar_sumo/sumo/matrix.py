@@ -29,6 +29,8 @@ takes longer.
 """
 MAX_VEHICLES = 4000
 """Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200 MB."""
+LONG_RUN = 60.0
+"""Length of a run up to which so many vehicles drive at once [s]; in longer ones there are fewer."""
 MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
 N_SIMILAR_POINTS = 4
@@ -151,8 +153,10 @@ def settings_per_batch(system: System, engine: Engine) -> int:
 
 
 def largest_batch(system: System) -> int:
-    """Largest number of vehicles in one batch; it is smaller if each vehicle has its own instance of an FMU."""
-    return min(MAX_VEHICLES, system.ads.max_vehicles or MAX_VEHICLES)
+    """Largest number of vehicles in one batch, smaller for long runs and if each has its own FMU."""
+    longest = max(float(np.max(point.scenario.duration)) for point in system.points)
+    in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
+    return min(in_memory, system.ads.max_vehicles or in_memory)
 
 
 def batch_size(system: System, engine: Engine) -> int:

@@ -22,7 +22,19 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import json_of, run
-from tests.openscenario.writing import AT_ONCE, at, event, lane_change, speed, teleport, trigger, watching, write
+from tests.openscenario.writing import (
+    AT_ONCE,
+    PARAMETER,
+    at,
+    event,
+    lane_change,
+    logical,
+    speed,
+    teleport,
+    trigger,
+    watching,
+    write,
+)
 from tests.scenarios.holding import Hold, driven
 
 FILES = Path(__file__).parents[1] / "openscenario" / "files"
@@ -198,16 +210,9 @@ def test_refusals(scenario: dict[str, Any], problem: str) -> None:
 
 
 def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path: Path) -> None:
-    speeds = '<ParameterDeclaration name="v" parameterType="double" value="10"/>'
-    write(tmp_path, car=(teleport(at(-2, 100)), speed("$v")), parameters=speeds)
-    elements = "".join(f'<Element value="{value}"/>' for value in (5, -5, 10))
-    row = f'<DeterministicSingleParameterDistribution parameterName="v"><DistributionSet>{elements}</DistributionSet></DeterministicSingleParameterDistribution>'
-    path = tmp_path / "values.xosc"
-    path.write_text(
-        f'<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValueDistribution><ScenarioFile filepath="scenario.xosc"/><Deterministic>{row}</Deterministic></ParameterValueDistribution></OpenSCENARIO>'
-    )
+    write(tmp_path, car=(teleport(at(-2, 100)), speed("$v")), parameters=PARAMETER)
     with pytest.warns(match=r"1 of 3 combinations .* the first is v = -5: Car drives backwards"):
-        study = study_of(str(path))
+        study = study_of(logical(tmp_path, 5, -5, 10))
     assert study.matrix is not None
     assert [test.over for test in study.matrix.tests] == [{"v": [5]}, {"v": [10]}]
 
