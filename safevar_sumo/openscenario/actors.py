@@ -15,8 +15,6 @@ from safevar_sumo.openscenario.road import Pose
 
 STEP = 0.01
 """Time between two samples [s]."""
-LONGEST = 600.0
-"""Time up to which the StopTrigger of a file must hold [s]."""
 MIN_SPEED = 0.1
 """Speed from which on a body turns while it moves sideways [m/s]."""
 Array = Any

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from safevar_sumo.openscenario.actors import LONGEST, STEP, Actor, Array
+from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
 from safevar_sumo.openscenario.places import Way
@@ -51,8 +51,8 @@ def _condition(player: Player, condition: Element, window: slice) -> Array:
         player.seen[id(condition)] = window.start, np.zeros(len(player.times) + 1, bool)
     first, seen = player.seen[id(condition)]
     seen[window] = _value(player, condition, window)
-    delay = min(number(condition, "delay", 0.0), LONGEST)
-    samples = np.arange(window.start, window.stop) - round(delay / STEP)
+    delay = round(min(number(condition, "delay", 0.0) / STEP, len(player.times)))
+    samples = np.arange(window.start, window.stop) - delay
     now = (samples >= first) & seen[samples]
     has_before = samples > first
     before = seen[samples - 1]

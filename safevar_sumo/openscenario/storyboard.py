@@ -10,12 +10,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
-from safevar_sumo.openscenario.actors import LONGEST, STEP, Actor, Array, Running, actors_of
+from safevar_sumo.openscenario.actors import STEP, Actor, Array, Running, actors_of
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import Document, Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.places import Place, Way, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network
 
+LONGEST = 600.0
+"""Time up to which the StopTrigger of a file must hold [s]."""
 UNSTOPPED = 60.0
 """How long a file without a StopTrigger is played, or if only a run can tell when it holds [s]."""
 AFTER = 4.0
