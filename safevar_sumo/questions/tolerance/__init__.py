@@ -77,6 +77,8 @@ OF_BOX = (
     *("fits", "fits_tried", "attacked", "least_attacked"),
 )
 """Numbers about the limits together."""
+MAX_REFUTED = 4
+"""Largest number of searches for joint limits, each without what refuted the one before."""
 NEAREST: Columns = {
     **CHARACTERISTIC,
     "limit": Column("", "the specified value", ".10g"),
@@ -173,10 +175,13 @@ def tolerance(
         everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
         known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, criterion, scans)]
         all_limits = {**specified, **everywhere}
-        while found_together is None or _is_refuted(found_together, search_alone.failures):
+        for _ in range(MAX_REFUTED):
             unsafe_settings = np.concatenate([*known, search_alone.failures])
             found_together = find_limits_together(models, all_columns, all_limits, scans, unsafe_settings, attack)
             search_alone.meet(found_together.searched, found_together.failures_alone)
+            if not _is_refuted(found_together, search_alone.failures):
+                break
+            found_together = found_together._replace(box=None)
     alone = search_alone.limits()
     contacts = None
     if found_together is not None and attack and len(members.scenario):

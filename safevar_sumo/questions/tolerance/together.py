@@ -18,6 +18,8 @@ from safevar_sumo.questions.tolerance.trial import Trial, Trials
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
+MAX_SIMULATIONS = 3_000_000
+"""Number of simulations, each at all points of a matrix, after which a search ends with the next box that passes."""
 MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 6, 3
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that limits move out."""
 PROMISE_POINTS = 256
@@ -137,7 +139,8 @@ def find_limits_together(
     drawn at random test it. What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
     boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can go, at most
     `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box is confirmed by further
-    searches for counterexamples. After `MAX_BOXES` boxes the largest that passed is confirmed, or none is found.
+    searches for counterexamples. After `MAX_BOXES` boxes or `MAX_SIMULATIONS` simulations the largest that passed is
+    confirmed, or none is found.
     """
     search, nothing = open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
@@ -158,19 +161,22 @@ def find_limits_together(
             outer = search.printed(sides)
         box = settlement.cut(outer, failed)
         # A box that is no larger than the one that passed ends the search, if further searches confirm that one.
-        is_last = passed is not None and (number == MAX_BOXES or volume(search, box) <= volume(search, passed.box))
+        is_over = number == MAX_BOXES or sum(each.evaluator.simulated for each in nothing.members) > MAX_SIMULATIONS
+        is_last = passed is not None and (is_over or volume(search, box) <= volume(search, passed.box))
         trial = trials.confirmed(passed, number) if passed and is_last else trials.whole(box, number)
         if _learn(search, trials, trial):
             is_refuted = passed is not None and bool(len(search.unsafe_inside(search.sides_of(passed.box))))
             passed = None if is_refuted else passed
             failed += 1
+            if is_over and passed is None:
+                break
         elif is_last:
             return result(nothing, settlement, trial, number)
         else:
             passed = trial
             outer = box
             failed = 0
-            if growths:
+            if growths and not is_over:
                 growths -= 1
                 with trials.evaluator.stage(SEARCH_STAGE):
                     outer = settlement.of(box)
