@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+import pandas as pd
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
@@ -21,6 +22,7 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Jobs, Range
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
+from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, as_printed
 from safevar_sumo.questions.measure import cases_by, study_by
 from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions
 from safevar_sumo.questions.research_questions.comparisons import titles_of
@@ -33,7 +35,7 @@ from safevar_sumo.questions.words import (
     number_of,
     question_command,
 )
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
 from safevar_sumo.sumo import assemble, evaluate, settings_per_batch, vehicle_remarks
@@ -215,13 +217,33 @@ def _verdict(results: Results, case: Case, system: System) -> str:
     if failures.empty:
         return counts
     fewest = failures.iloc[0]
-    ending = ending_in_words(fewest["outcome"], fewest["f_safe"], system.contact)
+    values = fewest[names].to_numpy(dtype=float)
+    printed = None if system.rater else _failing_as_printed(system, case, values)
+    if printed is None:
+        ending = ending_in_words(fewest["outcome"], fewest["f_safe"], system.contact)
+        bounded = fewest
+    else:
+        values = printed.settings[0]
+        ending = ending_in_words(str(printed.outcome[0]), float(printed.f_safe[0]), system.contact)
+        bounded = pd.Series({name: column[0] for name, column in printed.metrics.items()})
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
     elif case.unsafe.bound:
-        ending += f", {case.unsafe.bound.measure} {fewest[case.unsafe.bound.measure]:.3g}"
-    changes = list_of_changes(case.characteristics, {name: float(fewest[name]) for name in names})
+        ending += f", {case.unsafe.bound.measure} {bounded[case.unsafe.bound.measure]:.3g}"
+    by_name = dict(zip(names, values.tolist(), strict=True))
+    changes = list_of_changes(case.characteristics, by_name, are_printed=printed is not None)
     return f"{counts} With the fewest changes it {ending}: {changes}."
+
+
+def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:
+    """A solution simulated with its values as they are printed, with as many digits as it needs to be unsafe; None if
+    it is safe with all of them.
+    """
+    for further in FURTHER_DIGITS:
+        printed = evaluate(system, as_printed(system.characteristics, setting, further)[np.newaxis])
+        if case.unsafe.of(printed)[0] and not system.measuring.scoring.violation(printed)[0]:
+            return printed
+    return None
 
 
 def summarise(results: Results) -> Answer:

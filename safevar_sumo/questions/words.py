@@ -37,9 +37,11 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
     return f"{verb}, safety degree {distance_in_words(safety_degree, contact)}"
 
 
-def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]) -> list[str]:
+def change_texts(
+    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
+) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2
-    %)`, without a share of an original that is 0.
+    %)`, without a share of an original that is 0. Values that `are_printed` have their digits already.
     """
     texts = []
     for item in characteristics:
@@ -47,18 +49,27 @@ def change_texts(characteristics: CharacteristicSet, values: Mapping[str, float]
         value = values.get(item.name, item.original)
         if value != original:
             share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
-            texts.append(f"{item.name} {original:g} -> {item.text(value)}{item.suffix}{share}")
+            text = f"{value:.10g}" if are_printed else item.text(value)
+            texts.append(f"{item.name} {original:g} -> {text}{item.suffix}{share}")
     return texts
 
 
-def list_of_changes(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+def list_of_changes(
+    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
+) -> str:
     """The values that differ from the original values in one line, as in `change_texts`."""
-    return ", ".join(change_texts(characteristics, values)) or "no change at all"
+    return ", ".join(change_texts(characteristics, values, are_printed=are_printed)) or "no change at all"
 
 
-def encounter_in_words(characteristics: CharacteristicSet, values: Mapping[str, float]) -> str:
+def encounter_in_words(
+    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
+) -> str:
     """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`; empty without any."""
-    phrases = [f"{item.short_name} {item.text(values[item.name])}{item.suffix}" for item in characteristics.scenario]
+    texts = {
+        item: f"{values[item.name]:.10g}" if are_printed else item.text(values[item.name])
+        for item in characteristics.scenario
+    }
+    phrases = [f"{item.short_name} {text}{item.suffix}" for item, text in texts.items()]
     return f" in an encounter with {join_phrases(phrases)}" if phrases else ""
 
 

@@ -15,10 +15,10 @@ from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.questions import models, scope
+from safevar_sumo.questions import counterexamples, models, scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance import counterexamples, search
+from safevar_sumo.questions.tolerance import search
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray

@@ -13,10 +13,10 @@ from safevar_sumo import compare, tolerance
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify, reach, rounded_down
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.tolerance.counterexamples import describe
 from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study

@@ -14,12 +14,12 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Column, tabulate, with_interval
 from safevar_sumo.questions.compare.settings import within
+from safevar_sumo.questions.counterexamples import where_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tolerance.counterexamples import where_in_words
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject

@@ -13,6 +13,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
+from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.across_fits import Ranges, conclusions_across_fits
 from safevar_sumo.questions.explain.causes import BOUNDARIES, SUBSETS, count_needed
@@ -32,6 +33,7 @@ from safevar_sumo.questions.explain.tables import (
     statistics_tables,
 )
 from safevar_sumo.questions.model_spread import FITS_AT_ONCE
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -198,12 +200,19 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
     leading = causes.iloc[0]
     if not leading["changes"]:
         return f"The original itself is unsafe in this encounter: no change is needed. {counts}"
+    # The vehicle at the boundary with the values as they are printed, with which it is unsafe.
+    members = evaluator.characteristics
+    boundary = {**leading["boundary"], **leading.get("encounter", {})}
+    setting = np.array([boundary.get(item.name, item.original) for item in members], dtype=float)
+    printed = describe(Model(0, evaluator, unsafe), {"": setting})
+    values = dict(zip(members.names, (printed[""].setting if printed else setting).tolist(), strict=True))
     limits = [
-        f"{item.short_name} {'above' if value > item.original else 'below'} {item.text(value)}{item.suffix}"
-        for item in evaluator.characteristics
-        if (value := leading["boundary"].get(item.name)) is not None
+        f"{item.short_name} {'above' if values[item.name] > item.original else 'below'} "
+        f"{limit_text(item, values[item.name]) if printed else item.text(values[item.name]) + item.suffix}"
+        for item in members
+        if item.name in leading["boundary"]
     ]
-    encounter = encounter_in_words(evaluator.characteristics, leading.get("encounter", {}))
+    encounter = encounter_in_words(members, values, are_printed=bool(printed))
     where = f"{encounter}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
     sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []

@@ -11,12 +11,12 @@ import pandas as pd
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.falsify import Reach, enough
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
 from safevar_sumo.questions.tolerance.alone import AloneLimit, budget_alone
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
-from safevar_sumo.questions.tolerance.counterexamples import Failure, describe
 from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
 from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE

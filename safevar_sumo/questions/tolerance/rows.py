@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.alone import AloneLimit
-from safevar_sumo.questions.tolerance.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.study import Limit

@@ -10,12 +10,12 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify, reach
 from safevar_sumo.questions.models import Model, Models, limit_criterion, models_of
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
-from safevar_sumo.questions.tolerance.counterexamples import Failure, describe
 from safevar_sumo.questions.tolerance.left_out import leading_parameter
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import FloatArray

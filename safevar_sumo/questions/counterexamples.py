@@ -16,7 +16,7 @@ from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenari
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import Characteristic
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
 """Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is unsafe."""
@@ -47,7 +47,8 @@ def describe(model: Model, settings: Mapping[str, FloatArray], within: Box | Non
     for further in FURTHER_DIGITS:
         if not waiting:
             break
-        rows = np.array([_printed(model, setting, within, further) for setting in waiting.values()])
+        members = model.evaluator.characteristics
+        rows = np.array([as_printed(members, setting, further, within) for setting in waiting.values()])
         found = _failing(model, rows)
         failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
         waiting = {name: setting for name, setting in waiting.items() if name not in failures}
@@ -59,11 +60,10 @@ def limit_text(item: Characteristic, value: float) -> str:
     return f"{value:.10g}{item.suffix}"
 
 
-def _printed(model: Model, setting: FloatArray, within: Box | None, further: int) -> FloatArray:
+def as_printed(members: CharacteristicSet, setting: FloatArray, further: int, within: Box | None = None) -> FloatArray:
     """A setting with its values rounded to the digits of limits and some further ones: the vehicle's away from the
     original, those of the encounter to the nearest.
     """
-    members = model.evaluator.characteristics
     printed = setting.copy()
     for column, item in enumerate(members):
         value = setting[column]
