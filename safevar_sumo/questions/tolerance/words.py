@@ -74,7 +74,7 @@ def verdict_sentences(
         yield from _nearest_in_words(nearest)
         yield from _box_in_words(models, together, bool(limits), budget)
     yield f"Scope: {scope_of(study, between=budget > 0)}."
-    for name, scope, _, verdict in wider:
+    for name, scope, _, verdict, _ in wider:
         yield f"In the wider scope of {name} ({scope}) {verdict}"
     if names := [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]:
         yield f"Unsafe alone, beyond the limits: {join_phrases(names)}."
