@@ -22,6 +22,8 @@ SEARCH_POINTS = 256
 """Number of Sobol points, and of corners, at which a box is searched for something unsafe."""
 SLAB_POINTS = 64
 """Number of Sobol points, and of corners, at which the room beside a box is searched."""
+SEARCHED_MODELS = 4
+"""Number of models in which a box is searched at once."""
 MAX_ATTEMPTS = 40
 """Maximum number of boxes that are searched for something unsafe, and of tests."""
 DEVIATIONS = tuple(0.35 * 0.7**k for k in range(9))
@@ -159,9 +161,15 @@ class BoxSearch(BoxGeometry):
         for number, member in enumerate(self.models):
             if member.evaluator is model.evaluator:
                 points = (*member.points, *model.points) if member.points and model.points else ()
-                self.models[number] = member._replace(points=tuple(sorted({*points})))
-                return
-        self.models.append(model)
+                model = member._replace(points=tuple(sorted({*points})))
+                del self.models[number]
+                break
+        self.models.insert(0, model)
+
+    @property
+    def first_models(self) -> list[Model]:
+        """The models in which a box is searched: those in which something failed last. Its test meets them all."""
+        return self.models[:SEARCHED_MODELS]
 
     @property
     def failures_alone(self) -> FloatArray:
@@ -191,7 +199,7 @@ class BoxSearch(BoxGeometry):
         first.
         """
         has_unsafe = np.zeros(len(groups), dtype=bool)
-        for model in [*self.models]:
+        for model in self.first_models:
             waiting = np.flatnonzero(~has_unsafe)
             rows = groups[waiting].reshape(-1, len(self.original))
             if not len(rows):

@@ -90,7 +90,7 @@ class Settlement:
             return True
         beyond = [wider.lower.copy(), wider.upper.copy()]
         beyond[1 - side][column] = (box.lower, box.upper)[side][column]
-        judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.models]
+        judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.first_models]
         rng = np.random.default_rng((search.seed, 10, side, column))
         found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
         search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
