@@ -7,13 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter, is_in_the_way, time_to_reach
-from safevar_sumo.ads.car_following import KEEPING_GAINS
-from safevar_sumo.ads.reference_drivers import (
-    ANY_BRAKING,
+from safevar_sumo.ads.reaction import (
     DECELERATION_ROUNDING,
     HARDEST_BRAKING,
-    JERK,
     LEAST_DIVISOR,
+    Danger,
     Reaction,
     ReferenceDriver,
     StartThrottle,
@@ -35,8 +33,8 @@ class _Perceiving(NamedTuple):
         Time since an obstacle first strayed from this position [s], negative before.
     braking_time
         Time since a leader began to brake harder than `leader_braking` [s], negative before.
-    first_gap
-        Gap at which the driver first saw who is in the way now [m]; infinite for nobody.
+    was_in_way
+        Whether the obstacle was in the way at the last call.
     """
 
     reaction: Reaction
@@ -44,7 +42,7 @@ class _Perceiving(NamedTuple):
     appeared_in_way: BoolArray
     stray_time: FloatArray
     braking_time: FloatArray
-    first_gap: FloatArray
+    was_in_way: BoolArray
 
 
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
@@ -58,10 +56,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
       by the letter the driver does not react while the leader brakes.
 
-    While it reacts it releases the accelerator. After a stop it waits until the way is clear. Behind a leader that
-    drives on after braking it does not accelerate while the gap g is shorter than the one g_0 with which it began to
-    follow: a <= max(0.07 (u - v) + 0.23 (g - g_0), 0), the gap control of Milanes and Shladover (2014), with the speeds
-    u and v of leader and vehicle.
+    While it reacts it releases the accelerator, and it does not press it again while the cause of
+    the danger blocks its way: after a stop it waits until the way is clear, and it does not follow
+    a leader that drives on after braking.
 
     Parameters
     ----------
@@ -94,41 +91,42 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
         reaction = ReferenceDriver.start(self, n, nominal, step)
         never = np.full(n, -1.0)
-        nowhere = np.full(n, np.inf)
-        return _Perceiving(reaction, nowhere, np.zeros(n, dtype=bool), never, never, nowhere)
+        no = np.zeros(n, dtype=bool)
+        return _Perceiving(reaction, np.full(n, np.inf), no, never, never, no)
 
     def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
+        step = memory.reaction.step
         is_same = seen.obstacle == memory.reaction.leader
         is_perceived, memory = self._perceive(seen, memory, is_same)
         is_in_way = is_perceived & (is_in_the_way(seen, self.corridor) | _cuts_in(seen))
-        deceleration, reaction = self.watch_leader(seen, memory.reaction, is_in_way)
-        brakes_now = deceleration > self.leader_braking + DECELERATION_ROUNDING
-        begun = np.where(brakes_now, reaction.step, -1.0)  # it is seen a step after it began
-        braking_time = np.where(is_same & (memory.braking_time >= 0), memory.braking_time + reaction.step, begun)
-        still_brakes = deceleration > ANY_BRAKING + DECELERATION_ROUNDING
-        brakes = (braking_time >= self.perception_time - TIME_ROUNDING) & ((seen.closing_speed > 0) | still_brakes)
+        reaction = self.watch_leader(seen, memory.reaction, is_in_way)
+
+        # Since when has a leader braked so hard that it is a danger? It is seen a step later.
+        brakes_now = reaction.leader_deceleration > self.leader_braking + DECELERATION_ROUNDING
+        begun = np.where(brakes_now, step, -1.0)
+        has_begun = is_same & (memory.braking_time >= 0)
+        braking_time = np.where(has_begun, memory.braking_time + step, begun)
+        is_noticed = braking_time >= self.perception_time - TIME_ROUNDING
+        brakes = is_noticed & ((seen.closing_speed > 0) | reaction.leader_brakes)
+
+        # Towards somebody who does not brake, the time to collision decides.
         nearness = self.critical_ttc - time_to_reach(seen)
-        danger = is_in_way & (brakes | ((nearness > 0) & ~still_brakes))
-        is_followed = is_same & np.isfinite(memory.first_gap)
-        strayed_time = np.where(is_followed, reaction.step, memory.stray_time - self.perception_time)
-        longest = np.where(brakes, braking_time - self.perception_time, strayed_time)
-        first_gap = np.where(is_in_way, np.where(is_followed, memory.first_gap, seen.gap), np.inf)
-        command, reaction = self.react(
-            seen,
-            reaction,
-            danger,
+        is_danger = is_in_way & (brakes | ((nearness > 0) & ~reaction.leader_brakes))
+
+        # A new danger has lasted since its condition held, and not longer than it is perceived.
+        is_followed = is_same & memory.was_in_way
+        perceived_time = np.where(is_followed, step, memory.stray_time - self.perception_time)
+        danger = Danger(
+            is_danger,
             HARDEST_BRAKING,
             self.reaction_time,
-            JERK,
-            self.start_throttle,
-            self.lets_go,
-            still_brakes,
-            _following(seen, is_in_way, first_gap),
-            np.where(brakes, np.inf, nearness),
-            longest,
+            released=self.lets_go,
+            nearness=np.where(brakes, np.inf, nearness),
+            longest=np.where(brakes, braking_time - self.perception_time, perceived_time),
         )
+        command, reaction = self.react(seen, reaction, danger, self.start_throttle)
         braking_time = np.where(is_in_way, braking_time, -1.0)
-        return command, memory._replace(reaction=reaction, braking_time=braking_time, first_gap=first_gap)
+        return command, memory._replace(reaction=reaction, braking_time=braking_time, was_in_way=is_in_way)
 
     def _perceive(self, seen: Observation, memory: _Perceiving, is_same: BoolArray) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
@@ -156,11 +154,3 @@ def _cuts_in(seen: Observation) -> BoolArray:
     """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than across it."""
     moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
     return np.isfinite(seen.gap) & (seen.gap > 0) & moves_inwards & (seen.obstacle_speed >= np.abs(seen.lateral_speed))
-
-
-def _following(seen: Observation, is_in_way: BoolArray, first_gap: FloatArray) -> FloatArray:
-    """Upper limit of the acceleration behind a moving leader [m/s^2], at least 0; infinite if none is in the way."""
-    gained = np.where(is_in_way, seen.gap, 0.0) - np.where(is_in_way, first_gap, 0.0)
-    by_speed, by_gap = KEEPING_GAINS
-    gap_control = by_speed * (seen.obstacle_speed - seen.speed) + by_gap * gained
-    return np.where(is_in_way & (seen.obstacle_speed > 0), np.maximum(gap_control, 0.0), np.inf)

@@ -18,7 +18,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.ads.reference_drivers import ANY_BRAKING
+from safevar_sumo.ads.reaction import ANY_BRAKING
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.tables import Column, Columns, with_interval

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,127 +11,33 @@ import pytest
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.preventability import ANY
-from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.study import load_study
-from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points
-from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
-from safevar_sumo.vehicles import Vehicle, calibration_drive
-from safevar_sumo.vehicles.base import SumoType
 from tests.scenarios.holding import Hold, at_contact, driven
+from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
 
 WEAR = assemble(load_study("wear", matrix=None))
+IDEAL = ideal(WEAR)
 ORIGINAL = WEAR.characteristics.original[np.newaxis]
 LENGTH, WIDTH = 4.7, 1.85
 BODY: dict[str, Any] = {"vut_length": LENGTH, "vut_width": WIDTH}
 PATH = (WIDTH + CAR.width) / 2
-STEP = 0.05
-HARDEST, JERK, LETS_GO = 0.774 * 9.81, 12.65, 0.4
+HARDEST = 0.774 * 9.81
 
 
-class Rolling(NamedTuple):
-    speed: Any
-    throttle: Any
-    brake: Any
-    gear: Any
-
-
-class Ideal(Vehicle):
-    """A vehicle without drag or lag: the pedals are accelerations of up to 3 and 9.9 m/s^2."""
-
-    UNITS: ClassVar[dict[str, str]] = {}
-
-    def prepare(self, characteristics: Any, road_friction: Any, step: float, *_: Any) -> Any:
-        return step, len(next(iter(characteristics.values())))
-
-    def sumo_type(self, prepared: Any) -> SumoType:
-        return SumoType(*(np.full(prepared[1], value) for value in (1500.0, 3.0, 9.9, 70.0, 1e-3)))
-
-    def at_rest(self, prepared: Any) -> Rolling:
-        return Rolling(*np.zeros((4, prepared[1])))
-
-    def at_speed(self, prepared: Any, speed: Any) -> Rolling:
-        return Rolling(speed, *np.zeros((3, prepared[1])))
-
-    def sense(self, prepared: Any, state: Any, seen: Any) -> Any:
-        return seen, state
-
-    def advance(self, prepared: Any, state: Any, command: Any) -> Rolling:
-        speed = np.maximum(state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0], 0.0)
-        return Rolling(speed, command.throttle, command.brake, state.gear)
-
-
-def by_the_driver(scenario: Any) -> SimulationRuns:
-    """Runs of N encounters, whose parameters are arrays, with an ideal vehicle and the competent driver."""
-    n = N
-    vehicle = Ideal()
-    nominal = calibration_drive(vehicle, WEAR.characteristics)
-    system = replace(WEAR, vehicle=vehicle, ads=CompetentDriver(), nominal=nominal, scenario=scenario)
-    samples = round(float(np.max(scenario.duration)) / STEP) + 1
-    stage = Stage([scenario], np.arange(n), n_samples=samples, step=STEP)
-    settings = np.tile(WEAR.characteristics.original, (n, 1))
-    return drive(system, settings, LaneWorld(stage, np.zeros(n) + scenario.start_speed, STEP), stage)
-
-
-class Rule(NamedTuple):
-    """What the regulation's driver does: whether he hits the car with his front, at which closing speed [m/s], his
-    least gap in the path [m]; and whether the car is ahead of his front when it enters the path, if he held his speed.
+def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any) -> Mass:
+    """The regulation's driver: perceived at a time, a danger at a TTC below 2 s; he releases the accelerator, and
+    brakes with up to 0.774 g.
     """
 
-    hits: Any
-    speed: Any
-    least: Any
-    is_ahead: Any
+    def near(time: float, v: Any, u: Any, gap: Any, _: Any) -> Any:
+        return (time >= perceived) & (gap > 0) & (gap < 2.0 * (v - u)), HARDEST
 
-
-def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any, deceleration: Any = 0.0, arrives: Any = np.inf) -> Rule:
-    """The rule, integrated in fine steps: perceived at a time, a danger at a TTC below 2 s, 0.75 s later the brake
-    rises at 12.65 m/s^3 to 0.774 g; meanwhile the accelerator is released.
-
-    `gap` and `u` are those at time 0, `beside` is how long the other car stays beside the path [s].
-    """
-    n = len(v)
-    step = 0.005
-    speed = v + np.zeros(n)
-    left = gap + np.zeros(n)
-    danger = np.full(n, np.nan)
-    braking = np.zeros(n)
-    hits = np.zeros(n, dtype=bool)
-    impact = np.zeros(n)
-    least = np.full(n, np.inf)
-    for time in np.arange(0.0, 30.0, step):
-        other = np.maximum(u - deceleration * np.maximum(time - arrives, 0.0), 0.0)
-        closing = speed - other
-        is_in_path = time >= beside
-        is_near = (left > 0) & (left < 2.0 * closing)
-        danger = np.where(np.isnan(danger) & (time >= perceived) & is_near, time, danger)
-        is_braking = time >= danger + 0.75
-        braking = np.where(is_braking, np.minimum(np.maximum(braking, LETS_GO) + JERK * step, HARDEST), braking)
-        slowing = np.where(is_braking, braking, np.where(time >= danger, LETS_GO, 0.0))
-        after = np.maximum(speed - slowing * step, np.minimum(other, speed))
-        then = left + (other - (speed + after) / 2) * step
-        touches = is_in_path & (left > 0) & (then <= 0) & ~hits
-        impact = np.where(touches, after - other, impact)
-        hits |= touches
-        least = np.where(is_in_path & (then > -LENGTH - CAR.length), np.minimum(least, then), least)
-        speed = after
-        left = then
-    return Rule(hits, impact, least, gap - (v - u) * beside > 0)
-
-
-def agreement(runs: SimulationRuns, expected: Rule) -> tuple[Any, Any]:
-    """Where outcomes are equal; and by how much gaps [m], or the closing speeds of two collisions [m/s], differ."""
-    hits = runs.outcome == "collision"
-    closing = runs.collision_speed - runs.contact.speed
-    is_in_path = runs.trace.active & (np.abs(runs.trace.lateral) < PATH)
-    gap = np.where(is_in_path, runs.trace.gap, np.inf).min(axis=0)
-    with np.errstate(invalid="ignore"):  # nobody is ever in the path
-        late = np.nan_to_num(np.where(hits, closing - expected.speed, expected.least - gap))
-    return hits == expected.hits, late
+    return point_mass(v, gap, lambda time: u, near, beside, released=0.4)
 
 
 N = 1000
@@ -163,8 +68,8 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
     beside = (3.5 - PATH) / scenario.lateral_speed
     perceived = 0.375 / scenario.lateral_speed + 0.4
     expected = rule(v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived)
-    same, late = agreement(by_the_driver(scenario), expected)
-    is_ahead = expected.is_ahead
+    same, late = agreement(met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH)
+    is_ahead = scenario.gap - (v - scenario.target_speed) / 3.6 * beside > 0
     assert 0.1 < expected.hits.mean() < 0.9
     assert_near(same[is_ahead], late[is_ahead & same])
     assert same[~is_ahead].mean() >= 0.98
@@ -179,7 +84,7 @@ def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
     scenario = CutOut(speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY)
     perceived = np.maximum(0.375 / lateral_speed + 0.4, CAR.width / 2 / lateral_speed)
     expected = rule(v / 3.6, 2.0 * v / 3.6 + CAR.length + gap, 0.0, 0.0, perceived)
-    same, late = agreement(by_the_driver(scenario), expected)
+    same, late = agreement(met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH)
     assert 0.1 < expected.hits.mean() < 0.9
     assert_near(same, late[same])
 
