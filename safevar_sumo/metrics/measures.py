@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
+from safevar_sumo.metrics.conflicts import conflict
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
@@ -35,9 +36,12 @@ SAFETY_DEGREE_METRIC = Measure(
 
 
 def time_to_collision(runs: SimulationRuns) -> FloatArray:
-    """TTC(t) = L_s / v_L, the projected distance divided by the closing speed [s]; shape (T, N).
+    """TTC(t) = L_s / v_L, the distance between both over the speed at which it shrinks [s]; shape
+    (T, N).
 
-    Infinite while the distance does not shrink, outside the encounter, and once the vehicle has stopped after moving.
+    Infinite while the distance does not shrink, outside the encounter, and once the vehicle has
+    stopped after moving. The distance is that of the published data (method section 4): it also
+    shrinks by the speed of who crosses the path. `conflicts.conflict` is along the path alone.
     """
     return runs.time_to_collision
 
@@ -71,7 +75,11 @@ TET = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=time_exposed,
-    description="TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].",
+    description=(
+        "TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; TTC(t) = L_s / v_L, "
+        "the distance between both over the speed at which it shrinks; another TTC than that of "
+        "ttc_min and drac."
+    ),
 )
 TIT = Measure(
     name="tit",
@@ -80,39 +88,46 @@ TIT = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=time_integrated,
-    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2].",
+    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2], with the TTC of TET.",
 )
 
 
 def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """The least TTC(t) [s] (Hayward 1972); shape (N,), NaN on a collision, and for a vehicle that approaches nobody."""
-    least = np.min(time_to_collision(runs), axis=0, initial=np.inf)
+    """The least TTC_p(t) [s] (Hayward 1972); shape (N,), NaN on a collision, and for a vehicle that
+    approaches nobody in its path.
+    """
+    _, ttc = conflict(runs)
+    least = np.min(ttc, axis=0, initial=np.inf)
     return mask_collisions(runs, np.where(np.isfinite(least), least, np.nan))
 
 
 def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """The largest deceleration that would just avoid the collision, v_L^2 / (2 L_s) [m/s^2] (Cooper and Ferguson 1976;
-    DRAC of SUMO's SSM device), over the samples with a TTC; shape (N,), NaN as for the least TTC.
+    """The largest deceleration that would just avoid the collision, (v - u)^2 / (2 gap), which is
+    (v - u) / (2 TTC_p) [m/s^2] (Cooper and Ferguson 1976; DRAC of SUMO's SSM device), over the
+    samples with a TTC_p; shape (N,), NaN as for the least TTC_p.
 
-    Behind a leader, TTC and DRAC are the device's. With who crosses they are other quantities, and not compared: here
-    the gap closes to a body that is in the vehicle's path; the device predicts at which constant speeds both enter and
-    leave the place that two lanes share, and has a TTC only where one enters before the other has left.
+    Behind a leader, TTC and DRAC are the device's. With who crosses they are other quantities, and
+    not compared: the device predicts at which constant speeds both enter and leave the place that
+    two lanes share, and has a TTC only where one enters before the other has left.
     """
-    ttc = time_to_collision(runs)
+    closing_speed, ttc = conflict(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
-    rate = np.divide(runs.encounter.closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted)
+    rate = np.divide(closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted)
     largest = np.max(np.where(is_counted, rate, 0.0), axis=0, initial=0.0)
     return mask_collisions(runs, np.where(is_counted.any(axis=0), largest, np.nan))
 
 
 TTC_MIN = Measure(
     name="ttc_min",
-    title="least TTC",
+    title="least TTC along the path",
     unit="s",
     more_is_unsafe=False,
     over_collisions=False,
     function=least_time_to_collision,
-    description="Least time to collision during the encounter; without a collision.",
+    description=(
+        "Least TTC_p(t) = gap / (v - u) [s], both along the vehicle's path, to a body that is in "
+        "it or comes into it; another TTC than that of TET and TIT; without a collision."
+    ),
 )
 DRAC = Measure(
     name="drac",
@@ -121,7 +136,10 @@ DRAC = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=largest_deceleration_rate,
-    description="Largest deceleration rate to avoid the crash, v_L^2 / (2 L_s); without a collision.",
+    description=(
+        "Largest deceleration rate to avoid the crash, (v - u)^2 / (2 gap) [m/s^2], with the gap "
+        "and the speeds of ttc_min; without a collision."
+    ),
 )
 
 

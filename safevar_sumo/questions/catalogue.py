@@ -43,6 +43,7 @@ VEHICLES: Columns = {
     "meaning": Column("", "what it is", is_shown=False),
     "counterpart": Column("", "what it is in other models", is_shown=False),
 }
+METRICS_TITLE = "Metrics; TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
 WEATHER: Columns = NAME | {
     "road_friction": "factor on the tyres' friction",
     "visibility": "factor on the distance at which sensors detect an obstacle",
@@ -86,6 +87,7 @@ def list_models(kind: str | None = None) -> Answer:
         kind = "scenarios"
     effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
     weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
+    metrics = ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
     tables = {
         "studies": tabulate("Studies", STUDIES, _studies()),
         "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
@@ -93,9 +95,7 @@ def list_models(kind: str | None = None) -> Answer:
         "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(own or SCENARIOS)),
         "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
-        "metrics": tabulate(
-            "Metrics", DESCRIBED, ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
-        ),
+        "metrics": tabulate(METRICS_TITLE, DESCRIBED, metrics),
         "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, FURTHER_OBJECTIVES.items()),
     }
     if kind is not None:

@@ -234,13 +234,20 @@ class SimulationRuns:
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
 
     @cached_property
-    def time_to_collision(self) -> FloatArray:
-        """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
+    def is_approach(self) -> BoolArray:
+        """Whether a sample is in the encounter, before the vehicle has stopped after moving; shape
+        (T, N).
+        """
         trace = self.trace
-        _, distance, closing_speed, in_conflict = self.encounter
         has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
         has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
-        is_counted = trace.active & in_conflict & ~has_stopped & (closing_speed > 0) & (distance >= 0)
+        return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
+
+    @cached_property
+    def time_to_collision(self) -> FloatArray:
+        """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
+        _, distance, closing_speed, _ = self.encounter
+        is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
         return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
 
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:

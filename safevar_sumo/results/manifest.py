@@ -24,7 +24,7 @@ from safevar_sumo.study.schema import Tables
 
 FORMAT = 5
 """Version number of the files' format."""
-RESULTS = 9
+RESULTS = 10
 """Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
