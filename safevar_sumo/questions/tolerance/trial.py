@@ -18,6 +18,8 @@ MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 KNOWN = 32
 """Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
+FIRST_CORNERS = 512
+"""Number of corners that are tried first: most boxes fail soon."""
 CONFIRMATIONS, STARTS = 3, 256
 """Number of further attacks on a box that is to be printed, and of settings with which each begins."""
 TRIAL_STAGE = "test of the limits together"
@@ -67,30 +69,28 @@ class Trials:
         """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
 
     def whole(self, box: Box, attempt: int) -> Trial:
-        """Try all corners in all models, the whole attack, and settings drawn at random; the first part that finds
-        failures is the last.
+        """Try a box in all models: the first part that finds failures is the last.
+
+        Some corners in the models in which corners failed before; a search for counterexamples from the worst of them;
+        all corners in all models, of which the study's own fit meets more in a study that searches its scenario; and
+        settings drawn at random.
         """
-        all_corners = box.corners(self.seed, attempt)
-        others = {*range(len(self.models))} - self._failing
-        corners = all_corners[:MAX_CORNERS]
-        own = self.models[0]
-        of_fits = len(all_corners) + (len(self.models) - 1) * len(corners)
-        total = of_fits + self.budget + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
-        with self.evaluator.stage(TRIAL_STAGE, total):
-            lefts = self._left(corners, self._failing)
-            failed = self._failed(box, corners, lefts)
-            if failed:
-                return failed
-            trial = self._attack(box, corners, lefts, attempt)
+        corners = box.corners(self.seed, attempt)
+        some = np.random.default_rng((self.seed, 17, attempt)).permutation(corners[:MAX_CORNERS])[:FIRST_CORNERS]
+        total = len(self.models) * min(len(corners), MAX_CORNERS) + self.budget
+        with self.evaluator.stage(TRIAL_STAGE, total + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)):
+            lefts = self._left(some, self._failing)
+            if failures := self._failures(some, lefts):
+                return Trial(box, failures)
+            trial = self._attack(box, some, lefts, attempt)
             if trial.failures:
                 return trial
-            lefts |= self._left(corners, others)
-            # The study's own fit meets more corners in a study that searches its scenario.
-            more = all_corners[MAX_CORNERS:]
-            failures = failures_of(own, more, own.left(more, TRIAL_STAGE)) if len(more) else []
-            failed = self._failed(box, corners, lefts)
-            if failed or failures:
-                return trial._replace(failures=[*(failed.failures if failed else ()), *failures])
+            lefts = self._left(corners[:MAX_CORNERS], range(len(self.models)))
+            failures = self._failures(corners[:MAX_CORNERS], lefts)
+            if len(more := corners[MAX_CORNERS:]):
+                failures += failures_of(self.models[0], more, self.models[0].left(more, TRIAL_STAGE))
+            if failures:
+                return trial._replace(failures=failures)
             least = {
                 model.fit: model.unsafe.value(float(lefts[number].min(initial=np.inf)))
                 for number, model in enumerate(self.models)
@@ -101,11 +101,10 @@ class Trials:
         """What corners leave in some models, by their numbers."""
         return {number: self.models[number].left(corners, TRIAL_STAGE) for number in sorted(numbers)}
 
-    def _failed(self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray]) -> Trial | None:
-        """The trial whose corners fail in some models, which later ones try first; None if none fails."""
-        failures = [one for number in lefts for one in failures_of(self.models[number], corners, lefts[number])]
+    def _failures(self, corners: FloatArray, lefts: Mapping[int, FloatArray]) -> list[Failures]:
+        """The corners that fail in some models, which later boxes meet first."""
         self._failing |= {number for number, left in lefts.items() if (left < 0).any()}
-        return Trial(box, failures) if failures else None
+        return [one for number in lefts for one in failures_of(self.models[number], corners, lefts[number])]
 
     def _attack(self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], attempt: int) -> Trial:
         """Attack a box in all models, beginning at its worst corners in each, or in the first."""
