@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -24,7 +25,7 @@ from safevar_sumo.questions.ask import Criterion, Jobs, Range
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, as_printed
 from safevar_sumo.questions.measure import cases_by, study_by
-from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions
+from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions, remarks_on_runs
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
@@ -273,10 +274,15 @@ def summarise(results: Results) -> Answer:
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
     metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
-    try:
-        over_runs = answer_questions([case], names=RUN_TESTS).tables
-    except UnanswerableError:
-        over_runs = {}
+    tables = {"algorithms": table}
+    untold = list[str]()
+    with suppress(UnanswerableError):
+        tables |= answer_questions([case], names=RUN_TESTS).tables
+        untold = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]
+        # The first remark on tests of which none can be significant says how many runs are needed.
+        if few := " ".join(next(remarks_on_runs(name, tables[name]), "") for name in untold):
+            remarks = tables["remarks"]
+            remarks.loc[len(remarks)] = ["all", f"{case.name}: {few}"]
     runs = study.search.runs * len(rows)
     return Answer(
         question="study",
@@ -291,5 +297,6 @@ def summarise(results: Results) -> Answer:
             "original_outcome": results.original["outcome"],
             "original_degree": results.original[SAFETY_DEGREE],
         },
-        tables={"algorithms": table, **over_runs},
+        tables=tables,
+        folded=tuple(untold),
     )

@@ -254,7 +254,7 @@ class Answer:
         long = [f"{name} ({len(frame):,} rows)" for name, frame in self._reader_tables.items() if len(frame) > MAX_ROWS]
         sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
         folded = [name for name in self.folded if len(self.tables.get(name, ()))]
-        sentences += [f"By --all, or --table NAME: {', '.join(folded)}."] if folded else []
+        sentences += [f"By --table NAME: {', '.join(folded)}."] if folded else []
         return " ".join(sentences)
 
     def _label_of(self, table: str) -> str:

@@ -18,7 +18,12 @@ from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_coll
 from safevar_sumo.questions.research_questions import changes
 from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choices, titles_of
 from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
-from safevar_sumo.questions.research_questions.fronts import count_evaluations, describe_evaluations, few_evaluations
+from safevar_sumo.questions.research_questions.fronts import (
+    count_evaluations,
+    describe_evaluations,
+    describe_rules,
+    few_evaluations,
+)
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, OVER_RUNS, POOLED, TABLES, WEATHER
 from safevar_sumo.questions.words import demanded_in_words, number_of
@@ -119,6 +124,7 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
     errors = []
     for name in names:
         title, compute, columns, wide = TABLES[name]
+        label = next(iter(columns))  # of the case
         if name == CAUSES and not choices.causes:
             continue
         groups = [cases] if name == WEATHER else [[case] for case in cases]
@@ -131,10 +137,10 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
-                parts.append(part if name == WEATHER else part.assign(setting=group[0].name))
+                parts.append(part if name == WEATHER else part.assign(**{label: group[0].name}))
                 for case in group:
                     remarks += [(name, note) for note in _remarks(name, case, part, choices.alpha)]
-        shown = {**columns, "setting": columns["setting"]._replace(is_shown=len(cases) > 1)}
+        shown = {**columns, label: columns[label]._replace(is_shown=len(cases) > 1)}
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
     if errors and all(frame.empty for frame in frames.values()):
@@ -183,8 +189,10 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
         remarks += _on_pooled_tests(table, case, frame, alpha)
     if table in POOLED:
         remarks += filter(None, [_equal_solutions(case)])
-    if table in ("rq1-runs", "rq2-runs"):
-        remarks += _on_tests_of_runs(table, frame, alpha)
+    if table in ("rq1-runs", "rq2-runs", "rq2-common"):
+        remarks += remarks_on_runs(table, frame, alpha)
+    if table == "rq2-runs":
+        remarks += filter(None, [describe_rules(case)])
     if table == "a12" and len(frame):
         remarks.append(f"* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2.")
     if table == "combinations" and frame.empty:
@@ -221,14 +229,14 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         yield f"settings that a run simulates, mean: {describe_evaluations(case, count_evaluations(case))}."
 
 
-def _on_tests_of_runs(table: str, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
-    """How tests of runs are corrected, and which have too few runs."""
-    rq = table.removesuffix("-runs").upper()
+def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> Iterator[str]:
+    """Which tests of runs have too few runs, and how tests are corrected."""
+    rq = table.partition("-")[0].upper()
     tests = frame.dropna(subset="effect_size")
     tests_in_words = number_of(len(tests), "test")
-    if len(tests):
-        yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."
     few = len(tests) - int(tests["enough_runs"].sum())
     if few:
         needed = fewest_runs(rq, alpha, len(tests))
         yield f"too few runs for {few} of {tests_in_words} of {rq} ({needed} are needed after the correction)."
+    if len(tests):
+        yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."

@@ -5,22 +5,24 @@ once for each solution. Solutions of one run resemble each other, and a repeated
 small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests of the question:
 those of RQ1 and those of RQ2 are a family each.
 
-In the frames, `method` holds the name of the test, and `enough_runs` whether a test with so many runs can be
-significant; undefined values are NaN. Functions of a case raise `UnanswerableError` if no
-run is finished, if an algorithm that they compare is missing, and over runs if the solutions belong to no run.
+In the frames, `method` holds the name of the test, `enough_runs` whether a test with so many runs can be significant,
+and `significant` whether it is, undefined where nothing was tested; undefined values are NaN. Functions of a case
+raise `UnanswerableError` if no run is finished, if an algorithm that they compare is missing, and over runs if the
+solutions belong to no run.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from itertools import product
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from msgspec.structs import replace
+from msgspec import structs
 
 from safevar_sumo.metrics import Measure
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, solutions_for_metric
@@ -29,13 +31,15 @@ from safevar_sumo.questions.research_questions.fronts import (
     MORE_IS_BETTER,
     compute_indicators,
     count_evaluations,
+    nondominated_evaluations,
+    valid_evaluations,
 )
 from safevar_sumo.questions.research_questions.statistics import (
     ALPHA,
+    can_be_significant,
     compare_samples,
     correct_by_holm,
     effect_interval,
-    fewest_runs,
     log_rank_test,
     median_interval,
     signed_rank_test,
@@ -44,12 +48,15 @@ from safevar_sumo.questions.research_questions.statistics import (
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
-CAUSES = "causes"
+CAUSES, BEST = "causes", "best_safety_degree"
+BETTER = {CAUSES: True, BEST: False}
+"""Whether more is better in the samples of runs that only some tables have."""
 MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
 """Magnitudes of effects in a table for a paper."""
 INTERVAL_OF_MEDIAN = ["median", "median_low", "median_high"]
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
+NOTHING: Samples = MappingProxyType({})
 
 
 class Choices(NamedTuple):
@@ -104,16 +111,32 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return tests[tests.index == "RQ1"]
 
 
-def rq2_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def rq2_runs(case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING) -> pd.DataFrame:
     """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, metrics' means
     over solutions and, if they were counted, distinct minimal causes.
 
     `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` and `enough_runs` are as in
     `rq1_runs`, for all tests of RQ2.
     """
-    tests = compare_over_runs(case, choices)
+    tests = compare_over_runs(case, choices, further)
     opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
     return tests[tests.index == "RQ2"]
+
+
+def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+    """The tests of `rq2_runs` where one rule says what a run returns, whatever the algorithm: all
+    that no other evaluation of the run dominates; and a test of the best safety degree of a run.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no evaluations.
+    """
+    common = replace(case, solutions=nondominated_evaluations(case))
+    best = valid_evaluations(case, case.evaluations).groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
+    further = {(name, BEST): best[name] for name in best.index.unique("algorithm")}
+    # The causes were counted among the solutions that the algorithms returned.
+    return rq2_runs(common, choices._replace(causes={}), further)
 
 
 def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
@@ -122,7 +145,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """
     tests = rq2_runs(case, choices)
     texts = [
-        f"{effect:.2f}{'*' * significant} {MARKS[magnitude]}".strip() if magnitude in MARKS else "-"
+        f"{effect:.2f}{'*' if significant else ''} {MARKS[magnitude]}".strip() if magnitude in MARKS else "-"
         for effect, significant, magnitude in zip(
             tests["effect_size"], tests["significant"], tests["magnitude"], strict=True
         )
@@ -131,34 +154,41 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return tests[columns].assign(a12=texts)
 
 
-def compare_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """Every test of RQ1 and, if it has an answer, of RQ2 over runs; the index is the question, RQ1 or RQ2."""
+def compare_over_runs(case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING) -> pd.DataFrame:
+    """Every test of RQ1 and, if it has an answer, of RQ2 over runs, also of `further` samples; the index is the
+    question, RQ1 or RQ2.
+    """
     rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
-        rows["RQ2"] = _test_opponents(case, choices, over_runs=True)
-    families = {question: _corrected(question, pd.DataFrame(rows[question]), choices.alpha) for question in rows}
+        rows["RQ2"] = _test_opponents(case, choices, over_runs=True, further=further)
+    families = {question: _corrected(question, rows[question], choices.alpha) for question in rows}
     return _with_significance(pd.concat(families).droplevel(1), choices)
 
 
-def _corrected(question: str, tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
-    """The tests of a question, which are corrected as a family."""
-    needed = fewest_runs(question, alpha, int(tests["p_value"].count()))
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough_runs=tests["runs"] >= needed)
+def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFrame:
+    """The tests of a question over runs, which are corrected as a family."""
+    tests = pd.DataFrame(rows)
+    count = int(tests["p_value"].count())
+    is_enough = [can_be_significant(question, row["n1"], row["n2"], alpha, count) for row in rows]
+    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough_runs=is_enough)
 
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
     """Tests with the column `significant`: where p-values are corrected, the corrected one counts; where solutions of
     runs are pooled, there have to be enough runs for a test. Over runs, effects have intervals.
     """
+    p_values = tests["p_holm" if "p_holm" in tests else "p_value"]
+    is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype("boolean")
+    tests = tests.assign(significant=is_significant.where(p_values.notna()))
     if "p_holm" not in tests:
-        return tests.assign(significant=(tests["p_value"] < choices.alpha) & tests["enough_runs"])
+        return tests
     sizes = tests["n2"].where(tests.index == "RQ2")
     ends = [
         effect_interval(effect, m, None if np.isnan(n) else n, choices.alpha)
         for effect, m, n in zip(tests["effect_size"], tests["n1"], sizes, strict=True)
     ]
     low, high = zip(*ends, strict=True)
-    return tests.assign(significant=tests["p_holm"] < choices.alpha, effect_size_low=low, effect_size_high=high)
+    return tests.assign(effect_size_low=low, effect_size_high=high)
 
 
 def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
@@ -234,7 +264,6 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
     """A row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
     rows = []
-    fewest = fewest_runs("RQ1", choices.alpha)
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values = _values(case, algorithm, metric, over_runs)
         originals = _originals(case, algorithm, metric, over_runs)
@@ -244,33 +273,36 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
-        row |= {"mean": values.mean(), "original": original, "enough_runs": runs >= fewest}
+        is_enough = not case.has_runs or can_be_significant("RQ1", runs, 0, choices.alpha)
+        row |= {"mean": values.mean(), "original": original, "enough_runs": is_enough}
         rows.append({**row, **test._asdict()})
     return rows
 
 
-def _test_opponents(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
-    """A row for each baseline and metric."""
+def _test_opponents(
+    case: Case, choices: Choices, *, over_runs: bool = False, further: Samples = NOTHING
+) -> list[JsonObject]:
+    """A row for each baseline and metric, also of `further` samples."""
     first, others = opponents_of(case, choices.algorithm)
-    samples = _samples(case, choices, over_runs)
+    samples = {**_samples(case, choices, over_runs), **further}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more causes.
     directions = MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
-    directions |= {CAUSES: True} if (first, CAUSES) in samples else {}
+    directions |= {name: better for name, better in BETTER.items() if (first, name) in samples}
     rows = []
-    fewest = fewest_runs("RQ2", choices.alpha)
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         if not more_is_better:  # so that above 0.5 the first algorithm is better
             test = test.reversed()
-        runs = min((test.n1, test.n2) if over_runs else (_finished_runs(case, name) for name in (first, baseline)))
+        runs = _finished_runs(case, first), _finished_runs(case, baseline)
+        is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
         row = {"algorithm": first, "baseline": baseline, "metric": metric}
-        rows.append({**row, **test._asdict(), "runs": runs, "enough_runs": runs >= fewest})
+        rows.append({**row, **test._asdict(), "enough_runs": is_enough})
     return rows
 
 
-def _finished_runs(case: Case, algorithm: str) -> float:
-    """The number of an algorithm's finished runs; without limit for imported solutions, whose runs are unknown."""
-    return sum(name == algorithm for name, _ in case.finished_runs) if case.has_runs else math.inf
+def _finished_runs(case: Case, algorithm: str) -> int:
+    """The number of an algorithm's finished runs."""
+    return sum(name == algorithm for name, _ in case.finished_runs)
 
 
 def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
@@ -309,7 +341,7 @@ def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> 
         return pd.Series(case.original[metric.name], index=values.index, dtype=float)
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
-    return _values(case, algorithm, replace(metric, name=ORIGINAL_DEGREE), over_runs)
+    return _values(case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs)
 
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:
@@ -317,4 +349,4 @@ def titles_of(cases: Iterable[Case]) -> dict[str, str]:
     cases = list(cases)
     metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
     algorithms = {name: case.title_of(name) for case in cases for name in case.algorithms}
-    return algorithms | INDICATOR_TITLES | metrics
+    return algorithms | INDICATOR_TITLES | metrics | {BEST: "best SD of a run"}

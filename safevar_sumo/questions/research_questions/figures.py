@@ -29,6 +29,7 @@ from safevar_sumo.questions.research_questions.changes import ANY, changes_of, c
 from safevar_sumo.questions.research_questions.fronts import (
     REFERENCE_COORDINATE,
     compute_convergence,
+    compute_indicators,
     nondominated_points,
     points_of,
     reference_front,
@@ -96,8 +97,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of a run's solutions, of those found so far, over the number of evaluations, as median and range
-    over the runs; a line ends where its algorithm does, at the hypervolume of the tables.
+    """The hypervolume of all settings that a run has evaluated so far, over the number of evaluations, as median and
+    quartiles over the runs. A line ends where its algorithm does; a mark there is the median of what the runs return.
     """
     import seaborn as sns
 
@@ -115,14 +116,18 @@ def draw_convergence(case: Case) -> Figure:
         hue="algorithm",
         style="algorithm",
         estimator="median",
-        errorbar=("pi", 100),
+        errorbar=("pi", 50),
         palette=COLOURS[: len(labels)],
         ax=axis,
     )
     axis.set_ylabel(
-        "normalised hypervolume of a run's solutions found so far\n(line: median, band: range over runs; "
-        f"reference point {REFERENCE_COORDINATE:g})"
+        "normalised hypervolume of all settings so far\n(line: median, band: quartiles over runs;\n"
+        f"mark: of what a run returns; reference point {REFERENCE_COORDINATE:g})"
     )
+    ends = growth.groupby("algorithm", sort=False)["evaluations"].max()
+    returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median()
+    for (name, end), colour in zip(ends.items(), COLOURS, strict=False):
+        axis.plot([end], [returned.get(name)], "o", color=colour, markeredgecolor="black")
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
     return figure

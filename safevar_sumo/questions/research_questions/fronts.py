@@ -1,11 +1,10 @@
 """The quality of the fronts that runs return (docs/method.md, section 7): IGD+ and hypervolume on normalised
-objectives, and its growth with the evaluations; IGD, as published, on objectives in their units; and the number of
-evaluations.
+objectives; IGD, as published, on objectives in their units; and the number of evaluations. Of all evaluations: the
+non-dominated ones, and the growth of their hypervolume.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 import moocore
@@ -96,11 +95,58 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
 
-def _frames_of_runs(case: Case, frame: pd.DataFrame) -> Iterator[tuple[tuple[str, int], pd.DataFrame]]:
-    """The finished runs that have rows, each with its rows, in the study's order of algorithms."""
+def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
+    """The finished runs that have rows, each with its rows, in the study's order of algorithms; raises
+    UnanswerableError if there are none.
+    """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
-    yield from ((run, groups[run]) for run in runs if run in groups)
+    if not groups.keys() & set(runs):
+        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+    return [(run, groups[run]) for run in runs if run in groups]
+
+
+def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
+    """The evaluations that a search may return: all objectives are defined, and the original vehicle is safe in the
+    same encounter.
+    """
+    is_defined = np.isfinite(minimised_values(case, frame)).all(axis=1)
+    valid: pd.DataFrame = frame[is_defined & case.scoring.feasible_rows(frame)]
+    return valid
+
+
+def nondominated_evaluations(case: Case) -> pd.DataFrame:
+    """The evaluations of each finished run that no other one of the run dominates: what random search returns.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no evaluations.
+    """
+    runs = [valid_evaluations(case, rows) for _, rows in _frames_of_runs(case, case.evaluations)]
+    fronts = [
+        rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)] for rows in runs if len(rows)
+    ]
+    return pd.concat([runs[0][:0], *fronts], ignore_index=True)
+
+
+def describe_rules(case: Case) -> str:
+    """Which algorithms return other settings than `nondominated_evaluations`, in a sentence; "" if none does, or if the
+    evaluations are unknown.
+    """
+    if case.evaluations.empty:
+        return ""
+    columns = ["algorithm", "run", *case.characteristics.names]
+    fronts = nondominated_evaluations(case)
+    joined = case.solutions[columns].merge(fronts[columns], "outer", indicator=True)
+    others = joined.loc[joined["_merge"] != "both", "algorithm"].unique()
+    if not len(others):
+        return ""
+    return (
+        f"algorithms return solutions by different rules: {', '.join(map(case.title_of, others))} return others than "
+        "all settings that nothing in the run dominates. Means over solutions depend on the rule; rq2-common applies "
+        "one rule to all."
+    )
 
 
 def count_evaluations(case: Case) -> pd.DataFrame:
@@ -120,8 +166,6 @@ def count_evaluations(case: Case) -> pd.DataFrame:
         last = int(group["evaluation"].max()) + 1
         requested = search.evaluations if last > search.evaluations - search.population else last
         rows.append((algorithm, run, requested, len(group), search.evaluations))
-    if not rows:
-        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
     return pd.DataFrame(rows, columns=["algorithm", "run", "requested", "simulated", "budget"])
 
 
@@ -157,42 +201,41 @@ def few_evaluations(case: Case) -> str:
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of each run's solutions, of those found after a number of evaluations; columns algorithm, run,
+    """The hypervolume of all that each run has evaluated after a number of evaluations; columns algorithm, run,
     evaluations, hypervolume.
 
-    The numbers end with the longest run of the algorithm, and with the hypervolume of `compute_indicators`. It is 0 as
-    long as no solution dominates the reference point.
+    Objectives are normalised as in `compute_indicators`. The numbers end with the longest run of the algorithm. The
+    hypervolume is 0 as long as no evaluation dominates the reference point.
 
     Raises
     ------
     UnanswerableError
-        If there are no runs or no solutions.
+        If there are no evaluations or no solutions.
     """
     reference = reference_front(case)
-    search = case.study.search
     frames = []
-    counts = np.linspace(min(search.population, search.evaluations), search.evaluations, CURVE_POINTS, dtype=int)
+    counts = np.linspace(0, case.study.search.evaluations, CURVE_POINTS + 1, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
-    names = list(case.characteristics.names)
-    returned = {run: _settings_of(rows, names) for run, rows in _frames_of_runs(case, case.solutions)}
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
-        solutions = {*returned.get((algorithm, run), ())}
-        is_solution = np.array([setting in solutions for setting in _settings_of(group, names)])
-        points = normalised(minimised_values(case, group), reference)
-        is_defined = np.isfinite(points).all(axis=1) & is_solution & case.scoring.feasible_rows(group)
-        numbers = group["evaluation"].to_numpy()
+        valid = valid_evaluations(case, group)
+        points = normalised(minimised_values(case, valid), reference)
+        numbers = valid["evaluation"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front = points[:0]
         volumes = []
-        for start, end in pairwise([0, *counts_of_run]):
-            new_points = points[is_defined & (start <= numbers) & (numbers < end)]
+        for start, end in pairwise(counts_of_run):
+            new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
             volumes.append(hypervolume(front))
-        columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run, "hypervolume": volumes}
+        columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run[1:], "hypervolume": volumes}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
 
-def _settings_of(frame: pd.DataFrame, names: list[str]) -> list[bytes]:
-    """The settings in a frame, as bytes that are equal where they are."""
-    return [row.tobytes() for row in frame[names].to_numpy(dtype=float)]
+def summarise_convergence(case: Case) -> pd.DataFrame:
+    """`compute_convergence` over the runs: the median, and the quartiles as low and high; columns algorithm,
+    evaluations, hypervolume, low, high.
+    """
+    growth = compute_convergence(case).groupby(["algorithm", "evaluations"], sort=False)["hypervolume"]
+    names = {"hypervolume": 0.5, "low": 0.25, "high": 0.75}
+    return pd.DataFrame({name: growth.quantile(share) for name, share in names.items()}).reset_index()

@@ -34,14 +34,21 @@ MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 
 
 def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
-    """Smallest number of runs with which a test of RQ1 or RQ2 can be significant, after Holm's correction for so many
-    tests.
-
-    The smallest two-sided p-value of n runs is 2 / 2^n by RQ1's signed-rank test, and 2 / C(2n, n) by RQ2's U test; the
-    smallest one of a family is multiplied by the number of its tests.
+    """Smallest number of runs of every algorithm with which a test of RQ1 or RQ2 can be significant, after Holm's
+    correction for so many tests.
     """
-    orders = ((n, 2**n if question == "RQ1" else math.comb(2 * n, n)) for n in count(1))
-    return next(n for n, number in orders if 2 * max(tests, 1) / number < alpha)
+    return next(n for n in count(1) if can_be_significant(question, n, n, alpha, tests))
+
+
+def can_be_significant(question: str, m: int, n: int, alpha: float = ALPHA, tests: int = 1) -> bool:
+    """Whether a test of m runs, of RQ2 against n runs of another algorithm, can be significant after Holm's correction
+    for so many tests.
+
+    The smallest two-sided p-value is 2 / 2^m by the exact distribution of RQ1's signed-rank test, and 2 / C(m + n, n)
+    by that of RQ2's U test. Holm multiplies the smallest one of a family by the number of its tests.
+    """
+    orders = 2**m if question == "RQ1" else math.comb(m + n, n)
+    return 2 * max(tests, 1) / orders < alpha
 
 
 class TwoSampleTest(NamedTuple):

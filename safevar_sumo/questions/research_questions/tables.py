@@ -11,11 +11,11 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Column, Wide, with_interval
 from safevar_sumo.questions.research_questions import changes, comparisons
-from safevar_sumo.questions.research_questions.fronts import count_evaluations
+from safevar_sumo.questions.research_questions.fronts import count_evaluations, summarise_convergence
 from safevar_sumo.shipped import shipped_table
 
 WEATHER, CAUSES = "weather", "causes"
-CHOSEN = ("rq1-runs", "rq2-runs", "medians", "first-collision", CAUSES, "rq1", "rq2", "a12")
+CHOSEN = (*("rq1-runs", "rq2-runs", "rq2-common", "medians", "first-collision"), *(CAUSES, "rq1", "rq2", "a12"))
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
@@ -46,6 +46,7 @@ DATA = shipped_table("questions/research_questions/tables.toml")
 FUNCTIONS: Mapping[str, Compute] = {
     "rq1-runs": comparisons.rq1_runs,
     "rq2-runs": comparisons.rq2_runs,
+    "rq2-common": comparisons.rq2_common,
     "a12": comparisons.effects,
     "medians": comparisons.median_runs,
     "first-collision": comparisons.first_collisions,
@@ -53,6 +54,7 @@ FUNCTIONS: Mapping[str, Compute] = {
     "rq1": comparisons.rq1,
     "rq2": comparisons.rq2,
     "evaluations": count_evaluations,
+    "convergence": summarise_convergence,
     "rq3.1": changes.rq31,
     "rq3.2": changes.rq32,
     "rq3.3": changes.rq33,
@@ -61,7 +63,7 @@ FUNCTIONS: Mapping[str, Compute] = {
     "combinations": changes.frequent_combinations,
     WEATHER: changes.compare_weathers,
 }
-OVER_RUNS = ("rq1-runs", "rq2-runs", "a12", "collisions", CAUSES)
+OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 POOLED = ("rq1", "rq2", "collisions")
 """The tables that answer the questions about results with runs, and about imported solutions, which have none."""
 TABLES = {name: PaperTable.of(name, compute) for name, compute in FUNCTIONS.items()}
