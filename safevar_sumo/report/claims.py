@@ -31,10 +31,10 @@ from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.report.pack import PackedStudy
+from safevar_sumo.report.pack import DESCRIPTION, PackedStudy
 from safevar_sumo.report.page import answer_to, make_page
 from safevar_sumo.report.sections import ReportedStudy
-from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, record
+from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, in_order, record
 from safevar_sumo.study import Origin, Study, convert_table, user_code_names, write_study
 from safevar_sumo.terminal import Progress
 
@@ -88,8 +88,8 @@ class Packed:
         self._check_claims(study)
         scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None
         solutions = read_table(files[SOLUTIONS])
+        self._check_solutions(study, solutions)
         outcomes = packed.outcomes
-        self._solution_rows = rows_of(files[SOLUTIONS])
         codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
         evaluations = pd.DataFrame({"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))})
         original = self.manifest["original"]
@@ -111,6 +111,14 @@ class Packed:
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
+
+    def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
+        """Refuse a table of solutions with columns or rows that are missing, new or there twice."""
+        expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {"collision", "collision_speed"}
+        if wrong := expected ^ {*solutions}:  # pandas calls a second column x "x.1"
+            raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
+        if count_solutions(solutions) != self.packed.solutions:
+            raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
 
     @cached_property
     def shown(self) -> Case:
@@ -144,13 +152,13 @@ class Packed:
     @cached_property
     def simulated(self) -> tuple[bytes, bytes]:
         """The original vehicle's evaluation, and the table of solutions, all simulated again."""
-        characteristics = self.case.characteristics
+        names = self.case.characteristics.names
         solutions = self.case.solutions
         settings = self.case.settings
         evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self._progress)
-        frame = evaluations_frame(characteristics.names, [(("", 0), evaluations.take(range(1, len(settings))))])
+        frame = evaluations_frame(names, [(("", 0), evaluations.take(range(1, len(settings))))])
         frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
-        return json_bytes(record(evaluations, row=0)), rows_of(csv_of(frame))
+        return json_bytes(record(evaluations, row=0)), csv_of(in_order(frame, names))
 
     @cached_property
     def searched(self) -> tuple[bytes, bytes]:
@@ -159,11 +167,11 @@ class Packed:
             study = self.case.study
             runs = self.packed.runs
             results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)
-            return json_bytes(count_outcomes(results.case)), rows_of(csv_of(results.solutions))
+            return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 
     def claims(self, folder: Path, search: bool) -> Iterator[Claim]:
         """What the pack claims, and the functions that compute it again; the manifest is in `folder`."""
-        solutions = self._solution_rows
+        solutions = self.files[SOLUTIONS]
         yield Claim("inputs", b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode())
         yield Claim("study", self.files[STUDY], self.study_file)
         yield Claim("original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0])
@@ -219,16 +227,18 @@ def csv_of(frame: pd.DataFrame) -> bytes:
     return frame.to_csv(index=False, lineterminator="\n").encode()
 
 
-def rows_of(table: bytes) -> bytes:
-    """The rows of a CSV table as JSON."""
-    return json_bytes(list(csv.DictReader(io.StringIO(table.decode()))))
-
-
 def count_outcomes(case: Case) -> dict[str, int]:
     """The number of evaluations of all finished runs, by outcome."""
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
     outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
     return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
+
+
+def count_solutions(solutions: pd.DataFrame) -> list[int]:
+    """The number of solutions of every run that has some, and of all different ones: a run may return a setting
+    twice.
+    """
+    return [*solutions.groupby(["algorithm", "run"]).size(), len(solutions.drop_duplicates())]
 
 
 def compare(study: str, claim: Claim) -> tuple[str, ...]:

@@ -37,6 +37,7 @@ from safevar_sumo.report.claims import (
     Packed,
     compare,
     count_outcomes,
+    count_solutions,
     csv_of,
     json_bytes,
     json_of,
@@ -114,7 +115,8 @@ def _pack_study(
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown, directory)]
     questions = list(dict.fromkeys(asked))
     folder = f"{number}-{study.name}"
-    described = PackedStudy(folder, questions, list(case.finished_runs), count_outcomes(case), unsafe)
+    runs = list(case.finished_runs)
+    described = PackedStudy(folder, questions, runs, count_outcomes(case), count_solutions(case.solutions), unsafe)
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
     packed = Packed(described, files, study.origin.places, jobs, partial(show_within, progress, study.name))

@@ -32,13 +32,15 @@ PACK = "a file that the command `evidence` has written, unchanged"
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     """One results directory in a pack: its folder there, the questions that its answers answer, as typed, its finished
-    runs, the number of their evaluations by outcome, and what is unsafe, if it was stated.
+    runs, the number of their evaluations by outcome, the number of the solutions of every run and, last, of all
+    different ones, and what is unsafe, if it was stated.
     """
 
     folder: str
     questions: list[str]
     runs: list[tuple[str, int]]
     outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
+    solutions: list[int]
     unsafe: str | None = None
 
 

@@ -38,6 +38,7 @@ from safevar_sumo.results.store import (
     UNKNOWN as UNKNOWN,
     ResultsDirectory as ResultsDirectory,
     evaluations_frame as evaluations_frame,
+    in_order as in_order,
     record as record,
     solutions_frame as solutions_frame,
     write_imported as write_imported,

@@ -129,9 +129,13 @@ def solutions_frame(
     characteristics: Collection[str], solutions: Iterable[tuple[tuple[str, int], Evaluations]]
 ) -> pd.DataFrame:
     """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
-    frame = evaluations_frame(characteristics, solutions)
+    return in_order(evaluations_frame(characteristics, solutions), characteristics)
+
+
+def in_order(solutions: pd.DataFrame, characteristics: Collection[str]) -> pd.DataFrame:
+    """Rows of solutions in the order of `solutions.csv`."""
     columns = ["algorithm", "run", "f_safe", "f_diff", "f_num_diff", *characteristics]
-    return frame.sort_values(columns, kind="stable", ignore_index=True)
+    return solutions.sort_values(columns, kind="stable", ignore_index=True)
 
 
 def evaluations_frame(

@@ -111,8 +111,7 @@ def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
     same encounter.
     """
     is_defined = np.isfinite(minimised_values(case, frame)).all(axis=1)
-    valid: pd.DataFrame = frame[is_defined & case.scoring.feasible_rows(frame)]
-    return valid
+    return pd.DataFrame(frame[is_defined & case.scoring.feasible_rows(frame)])
 
 
 def nondominated_evaluations(case: Case) -> pd.DataFrame:
@@ -124,10 +123,10 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
         If there are no evaluations.
     """
     runs = [valid_evaluations(case, rows) for _, rows in _frames_of_runs(case, case.evaluations)]
-    fronts = [
+    fronts: list[pd.DataFrame] = [
         rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)] for rows in runs if len(rows)
     ]
-    return pd.concat([runs[0][:0], *fronts], ignore_index=True)
+    return pd.concat([case.evaluations[:0], *fronts], ignore_index=True)
 
 
 def describe_rules(case: Case) -> str:
