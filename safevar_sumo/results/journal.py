@@ -35,6 +35,8 @@ SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
 POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = "evaluation", "outcome", "reason", "solutions", "crc32"
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
+COLUMN_TYPES = {POSITION: list[int], OUTCOME: list[str], REASON: list[str | None]}
+"""The types of a batch's columns, unless they hold numbers."""
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
@@ -91,6 +93,8 @@ class Journal:
         The file, made if it does not exist.
     head
         The owner of the journal, as `journal_head` names it. A journal without evaluations passes to the owner.
+    stated
+        The format of the journals, if the manifest says so.
     retry_failed
         Whether to drop the first failed evaluation and all that came after it.
 
@@ -107,14 +111,14 @@ class Journal:
         If another live process works on the run, or the file cannot be locked or written.
     """
 
-    def __init__(self, path: Path, head: JsonObject, *, retry_failed: bool = False) -> None:
+    def __init__(self, path: Path, head: JsonObject, stated: int | None = None, *, retry_failed: bool = False) -> None:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = _open_and_lock(path)
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
-                self.content = _read(self._file.read(), path, head, until_failure=retry_failed)
+                self.content = _read(self._file.read(), path, head, stated, until_failure=retry_failed)
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
             if not self.content.size:
@@ -153,19 +157,26 @@ class Journal:
                 remainder = remainder[self._file.write(remainder) :]
 
 
-def read_journal(path: Path, head: JsonObject) -> JournalContent:
-    """The contents of a journal that another process may be writing.
+def read_journal(path: Path, head: JsonObject, stated: int | None = None) -> JournalContent:
+    """The contents of a journal that another process may be writing; arguments as of `Journal`.
 
     Raises
     ------
     InputError
         If the journal cannot be read, or belongs to another study or run.
     """
+    _check_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
-    return _read(data, path, head)
+    return _read(data, path, head, stated)
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no file, such as a folder, or a pipe, which would be waited for; raises an InputError."""
+    if path.exists() and not path.is_file():
+        raise InputError(path, "is no file", "the journal that was there, or no file: the run then begins anew")
 
 
 class _Progress(msgspec.Struct):
@@ -179,6 +190,7 @@ class JournalReader:
     """Follows how many evaluations a run has asked for, in the journal that another process writes."""
 
     def __init__(self, path: Path, budget: int) -> None:
+        _check_file(path)
         self._path = path
         self._budget = budget
         self._end = self._asked = 0
@@ -203,6 +215,7 @@ class JournalReader:
 
 
 def _open_and_lock(path: Path) -> IO[bytes]:
+    _check_file(path)
     lock = portalocker.Lock(path, "a+b", PATIENCE, SECONDS_BETWEEN_ATTEMPTS, buffering=0)
     with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -214,26 +227,32 @@ def _open_and_lock(path: Path) -> IO[bytes]:
             raise SafevarError(f"{path}: cannot be locked: {error}; results need a disk that locks files") from None
 
 
-def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = False) -> JournalContent:
+def _read(
+    data: bytes, path: Path, head: JsonObject, stated: int | None, *, until_failure: bool = False
+) -> JournalContent:
     """The contents of a journal; with `until_failure`, without the first batch that failed and all that came after
-    it.
+    it. A first line with another format than the manifest has `stated` is not believed, and so is nothing after it.
     """
-    positions = []
+    positions = list[int]()
     batches = []
     results = {}
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
-    has_checksums = owner.get("format") != FORMAT_WITHOUT_CHECKSUMS
-    is_own = owner == (head if has_checksums else {**head, "format": FORMAT_WITHOUT_CHECKSUMS})
-    if lines and not is_own:
+    is_older = stated is None and owner.get("format") == FORMAT_WITHOUT_CHECKSUMS
+    is_own = owner == ({**head, "format": FORMAT_WITHOUT_CHECKSUMS} if is_older else head)
+    if stated == FORMAT and not is_own and head == {**owner, "format": FORMAT}:
+        lines = []
+    elif lines and not is_own:
         legal = "the manifest.json and journals of one study, as it was run; or another `out`"
         raise InputError(path, "belongs to another study, version or run, or is no journal", legal)
     size = len(first) if lines or owner == head else 0
-    checksum = zlib.crc32(first.rstrip()) if has_checksums else None
+    checksum = None if is_older else zlib.crc32(first.rstrip())
     for text in lines:
         line, checksum_of_line = _checked(text, checksum)
         try:
             if SOLUTIONS in line:
+                if not {*line[SOLUTIONS]} <= {*positions}:
+                    break
                 results[line["budget"]] = line[SOLUTIONS]
             else:
                 batch = _evaluations_of(line, head["characteristics"])
@@ -241,7 +260,7 @@ def _read(data: bytes, path: Path, head: JsonObject, *, until_failure: bool = Fa
                     break
                 batches.append(batch)
                 positions += line[POSITION]
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, msgspec.ValidationError):
             break
         size += len(text)
         checksum = checksum_of_line
@@ -286,10 +305,11 @@ def _batch_line(positions: Sequence[int], evaluations: Evaluations, characterist
 
 
 def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:
-    """The batch of evaluations in a line."""
-    columns = {
-        name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)
-    }
+    """The batch of evaluations in a line; raises an error if its columns are wrong or have different lengths."""
+    for name, values in line.items():
+        if len(msgspec.convert(values, COLUMN_TYPES.get(name, list[float | None]))) != len(line[POSITION]):
+            raise ValueError
+    columns = {name: np.array(values, dtype=float) for name, values in line.items() if name not in COLUMN_TYPES}
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
     reasons = line.get(REASON, [None] * len(settings))
     speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)

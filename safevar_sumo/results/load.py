@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
-from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
+from safevar_sumo.results.manifest import JOURNALS, identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -108,7 +108,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         path = journal_file(folder, name)
         if not path.exists():
             continue
-        content = read_journal(path, journal_head(digest, name, characteristics))
+        content = read_journal(path, journal_head(digest, name, characteristics), manifest.get(JOURNALS))
         has_checksums &= content.checksum is not None
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))

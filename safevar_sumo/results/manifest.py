@@ -56,6 +56,8 @@ IDENTITY = {
 """Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or
 REMEDY".
 """
+JOURNALS = "journals"
+"""Key of a manifest: the format of the journals; a directory that an earlier version began lacks it."""
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 FILES = (
     (

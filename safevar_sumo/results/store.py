@@ -17,9 +17,11 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
+from safevar_sumo.results.journal import FORMAT as JOURNAL_FORMAT
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
+    JOURNALS,
     MANIFEST,
     RUNS,
     SOLUTIONS,
@@ -73,7 +75,9 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
         make_directory(path)
-        self._earlier_manifest()
+        earlier_manifest = self._earlier_manifest()
+        if not earlier_manifest or JOURNALS in earlier_manifest:
+            self.manifest[JOURNALS] = JOURNAL_FORMAT
 
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other
