@@ -60,9 +60,9 @@ class InputError(SafevarError):
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
         self.source = source or subject()
-        self.problem = problem
+        self.problem = problem.encode(errors="backslashreplace").decode()  # a user's text may have lone surrogates
         self.legal = legal
-        super().__init__(self.source, problem, legal)
+        super().__init__(self.source, self.problem, legal)
 
     def __str__(self) -> str:
         message = f"{self.source}: {self.problem}"

@@ -1,12 +1,15 @@
-"""Files that users name: output files, written as a whole or not at all; and files beside a study."""
+"""Files that users name: output files, written as a whole or not at all; and files beside a study. Temporary files and
+folders, also those of killed processes.
+"""
 
 from __future__ import annotations
 
 import os
 import secrets
+import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from glob import escape
 from pathlib import Path
@@ -18,6 +21,8 @@ from safevar_sumo.errors import InputError
 ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
 SETTLING_TIME = 0.1
 """Time within which a process locks a temporary file that it has made [s]."""
+PREFIX, LOCK = "safevar-", "lock"
+"""Beginning of the names of temporary folders, and the file in them that their process has locked."""
 WRITABLE = "a file in a directory that can be written, with space for it"
 """What an error about an output file expects."""
 
@@ -35,7 +40,8 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
     short_stem = target.stem[:100]  # file systems limit the length of names
     file = path if is_stream else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
     try:
-        with nullcontext() if is_stream else _owned(file, f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"):
+        pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
+        with nullcontext() if is_stream else _owned(file, file.parent.glob(pattern)):
             yield file
         if not is_stream:
             with open(file, "rb+") as stream:
@@ -50,11 +56,20 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
 
 
 @contextmanager
-def _owned(file: Path, pattern: str) -> Iterator[None]:
-    """Make a temporary file and lock it within the block; remove files of the same pattern that nobody has locked."""
+def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
+    """Give a temporary folder, which ends with the block; those that killed processes have left are removed."""
+    with tempfile.TemporaryDirectory(prefix=PREFIX, dir=parent, ignore_cleanup_errors=True) as text:
+        folder = Path(text)
+        with _owned(folder / LOCK, folder.parent.glob(f"{PREFIX}*/{LOCK}")):
+            yield folder
+
+
+@contextmanager
+def _owned(file: Path, others: Iterable[Path]) -> Iterator[None]:
+    """Make a temporary file and lock it within the block; remove those of the others that nobody has locked."""
     with open(file, "xb") as own:
         if os.name != "nt":  # where a lock would keep out this process, too
-            for other in file.parent.glob(pattern):
+            for other in others:
                 if other != file:
                     _remove_left_behind(other)
             with suppress(portalocker.LockException):  # a disk without locks
@@ -63,11 +78,13 @@ def _owned(file: Path, pattern: str) -> Iterator[None]:
 
 
 def _remove_left_behind(file: Path) -> None:
-    """Remove a temporary file that no process has locked, unless it is so new that one may be about to."""
+    """Remove a temporary file, of a `LOCK` its folder, that no process has locked, unless it is so new that one may be
+    about to.
+    """
     with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
         portalocker.lock(stream, ALONE)
         if time.time() - os.fstat(stream.fileno()).st_mtime > SETTLING_TIME:
-            file.unlink()
+            shutil.rmtree(file.parent) if file.name == LOCK else file.unlink()
 
 
 def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: str = "") -> None:

@@ -110,7 +110,7 @@ class PerVehicleAds(Ads):
         drivers = [self._create() for _ in range(n)]
         with np.errstate():
             for driver in drivers:
-                driver.start(nominal, step)
+                self._code.call("start", driver.start, nominal, step)
         return drivers
 
     def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -70,6 +71,7 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
     path.inherit()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    tempfile.tempdir = str(last_words.parent)  # which ends with the pool; a worker is killed
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     say_last_words(file)

@@ -7,20 +7,19 @@ gives jobs to a pool.
 from __future__ import annotations
 
 import os
-import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import copy_context
 from copy import copy
-from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event
 from typing import Any, Protocol, TypeVar
 
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
+from safevar_sumo.output import temporary_folder
 
 Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
@@ -198,8 +197,8 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
         check_whole("jobs", jobs, MAX_JOBS)
     with ExitStack() as stack:
         if cluster is None:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="safevar-", ignore_cleanup_errors=True))
-            pool = Pool(jobs or available_cores(), lambda place: local.ProcessWorker(Path(folder, f"{place}.txt")))
+            folder = stack.enter_context(temporary_folder())
+            pool = Pool(jobs or available_cores(), lambda place: local.ProcessWorker(folder / f"{place}.txt"))
         else:
             client = stack.enter_context(dask.connect(cluster))
             pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))

@@ -145,12 +145,14 @@ class UserCode(NamedTuple):
         return UserCodeError("", problem, expected, place)
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call an FMU, whose exceptions show no line of user code."""
+        """Call an FMU, or what sets attributes of a user's object: exceptions may show no line of user code."""
         try:
             return function(*arguments)
         except (UserCodeError, KeyboardInterrupt):
             raise
         except BaseException as error:
+            if user_error := user_error_of(error):
+                raise user_error from error
             reason, legal = _reason_of(error)
             raise UserCodeError("", f"{self.name} raised in {method}: {reason}", legal) from error
 

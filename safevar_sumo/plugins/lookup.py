@@ -30,17 +30,22 @@ from safevar_sumo.plugins.contract import (
     violation,
 )
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.study import Study, convert_table, data_files
 from safevar_sumo.study.schema import Parameters
+
+A_DAY = 86_400.0
+"""The longest time limit [s]."""
 
 
 class Member(NamedTuple):
     """The class or record that a name in a study stands for; `code` is how errors name it if it is user code, else
-    None.
+    None; `time_limit` is that of its `__init__` [s].
     """
 
     target: Any
     code: UserCode | None = None
+    time_limit: float = A_DAY
 
 
 _added_folders: list[str] = []
@@ -52,10 +57,14 @@ class Lookup:
     """Looks up the names of a study, each class once.
 
     `folders`, searched before the working directory, are those of the study's file and of the files that it extends;
-    `files` are the paths of its data files by the names that it gives them.
+    `files` are the paths of its data files by the names that it gives them; `time_limit` is that of the import of user
+    code [s].
     """
 
-    def __init__(self, folders: Sequence[str] = (), files: Mapping[str, str] = MappingProxyType({})) -> None:
+    def __init__(
+        self, folders: Sequence[str] = (), files: Mapping[str, str] = MappingProxyType({}), time_limit: float = A_DAY
+    ) -> None:
+        self._time_limit = time_limit
         self.folders = folders
         self.files = files
         self._classes = dict[tuple[str, tuple[type, ...]], Member]()
@@ -63,7 +72,7 @@ class Lookup:
     @classmethod
     def of(cls, study: Study) -> Lookup:
         """The lookup for a study; raises an InputError if one of its data files is missing."""
-        return cls(study.origin.places, data_files(study))
+        return cls(study.origin.places, data_files(study), study.search.time_limit)
 
     def find(self, shipped: Mapping[str, Any], name: str, key: str) -> Member:
         """The object called `name` among the `shipped` ones, or the object that `package.module:Name` names.
@@ -92,7 +101,7 @@ class Lookup:
         except AttributeError:
             problem = f"{code.name} cannot be imported: {file_of_module(module_name)} has no {attribute!r}"
             raise InputError("", problem, expected) from None
-        return Member(target, code._replace(target=target))
+        return Member(target, code._replace(target=target), self._time_limit)
 
     def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
         """A class by name; a user's class must meet the contract of the first base that it derives from, else of that
@@ -146,7 +155,7 @@ class Lookup:
         dont_write_bytecode = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
-            with user_errors(subject()), np.errstate():
+            with user_errors(subject()), np.errstate(), end_if_longer(self._time_limit, f"the import of {name}"):
                 return importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
@@ -253,7 +262,7 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
     InputError
         If the class does not take the parameters.
     """
-    with user_errors(subject()), np.errstate():
+    with user_errors(subject()), np.errstate(), end_if_longer(member.time_limit, "`__init__`"):
         if issubclass(member.target, msgspec.Struct):
             for parameter in parameters:  # a user's class need not forbid what it does not have
                 problem = f"{key}.{parameter}: {name} has no such parameter"

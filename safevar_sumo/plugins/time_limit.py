@@ -1,4 +1,4 @@
-"""The time limit of a simulation: one that takes longer counts as hung.
+"""The time limit of a simulation, and of the import and `__init__` of user code: what takes longer counts as hung.
 
 It ends a worker, whose pool reports where it was; in any other process, where the system has timers, it is an error.
 """
@@ -35,9 +35,9 @@ def say_last_words(file: IO[str] | None) -> None:
 
 
 @contextmanager
-def end_if_longer(time_limit: float) -> Iterator[None]:
-    """End this process, if it is a worker, when the context takes longer than a time limit [s]; raise an error in the
-    main thread of any other process. Within such a context another one has no effect.
+def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[None]:
+    """End this process, if it is a worker, when the context takes longer than a time limit [s]; raise an error, which
+    names it by `what`, in the main thread of any other process. Within such a context another one has no effect.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def end_if_longer(time_limit: float) -> Iterator[None]:
         return
     _is_limited = True
     try:
-        with _end_process(time_limit, _last_words) if _last_words is not None else _raise_error(time_limit):
+        with _end_process(time_limit, _last_words) if _last_words is not None else _raise_error(time_limit, what):
             yield
     finally:
         _is_limited = False
@@ -69,9 +69,9 @@ def _end_process(time_limit: float, last_words: IO[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _raise_error(time_limit: float) -> Iterator[None]:
+def _raise_error(time_limit: float, what: str) -> Iterator[None]:
     def refuse(_signal: int, frame: FrameType | None) -> None:
-        problem = f"a simulation took longer than the time limit of {time_limit:g} s"
+        problem = f"{what} took longer than the time limit of {time_limit:g} s"
         while frame is not None:
             if is_user_file(frame.f_code.co_filename):
                 place = f"{frame.f_code.co_filename}:{frame.f_lineno}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import EnvironmentFault, InputError, about
+from safevar_sumo.output import temporary_folder
 from safevar_sumo.questions.ask import PointName
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
@@ -133,7 +133,7 @@ def open_drive(network: Network) -> str:
     EnvironmentFault
         If netconvert fails.
     """
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         arguments = ("-s", str(built_network(network)), "--opendrive-output", ROAD, "-o", "net.xml")
         exit_code, errors = run_program(Path(folder), "netconvert", *arguments)
         if exit_code != 0:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
+from safevar_sumo.output import temporary_folder
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id
@@ -96,7 +96,7 @@ def _look_at(world: SumoWorld) -> None:
 @contextmanager
 def _open_view(options: Sequence[str]) -> Iterator[Api]:
     """Open a window on what SUMO simulates with options."""
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
         view = ["--gui-settings-file", str(settings_file), "--start", "--quit-on-end", "--window-size", "1200,700"]

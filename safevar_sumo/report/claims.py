@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -22,6 +21,7 @@ from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import has_criterion
@@ -144,7 +144,7 @@ class Packed:
 
     def study_file(self) -> bytes:
         """A study file with all that the study extends."""
-        with tempfile.TemporaryDirectory() as folder:
+        with temporary_folder() as folder:
             path = Path(folder, f"{self.case.study.name}.toml")
             write_study(path, self.case.study, "The study as it was run, with all that it extends.")
             return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
@@ -163,7 +163,7 @@ class Packed:
     @cached_property
     def searched(self) -> tuple[bytes, bytes]:
         """The outcomes of all evaluations, and the table of solutions, of the same runs again."""
-        with tempfile.TemporaryDirectory() as folder:
+        with temporary_folder() as folder:
             study = self.case.study
             runs = self.packed.runs
             results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)

@@ -6,14 +6,13 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from safevar_sumo.errors import InputError, describe_error
-from safevar_sumo.output import check_writable
+from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_shipped, only_from
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Jobs, with_criterion
@@ -180,7 +179,7 @@ def verify(
     """
     path = Path(pack).absolute()
     description, files = read_pack(path)
-    with tempfile.TemporaryDirectory() as folder, open_progress(progress) as show:
+    with temporary_folder() as folder, open_progress(progress) as show:
         studies = {
             Path(folder, str(number)): _unpack(path, described, files, Path(folder, str(number)), jobs, show)
             for number, described in enumerate(description.studies)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import stat
 import sys
 import zipfile
@@ -92,7 +93,15 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
             files = {entry.filename: archive.read(entry) for entry in archive.infolist()}
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", PACK) from None
-    except (zipfile.BadZipFile, ValueError, RuntimeError, NotImplementedError, EOFError, zlib.error) as error:
+    except (
+        zipfile.BadZipFile,
+        ValueError,
+        RuntimeError,
+        NotImplementedError,
+        EOFError,
+        zlib.error,
+        lzma.LZMAError,
+    ) as error:
         _refuse(path, f"is no zip archive, or damaged: {error}")
     if DESCRIPTION not in files:
         _refuse(path, f"holds no {DESCRIPTION}")

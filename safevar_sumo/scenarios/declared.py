@@ -12,7 +12,7 @@ import msgspec
 
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.scenarios import SCENARIOS, TrackScenario, WorldScenario, weather_of
-from safevar_sumo.study import MatrixTable, Weather, convert_table, free_parameters
+from safevar_sumo.study import MatrixTable, SearchTable, Weather, convert_table, free_parameters
 from safevar_sumo.study.schema import Parameters
 
 
@@ -45,7 +45,8 @@ def _models(tables: Mapping[str, Any], places: Sequence[str]) -> Iterator[tuple[
     yield Weather, msgspec.structs.asdict(table)
     matrix = tables.get("matrix")
     tests = convert_table(matrix, MatrixTable, "matrix").tests if matrix else []
-    lookup = Lookup(places)
+    time_limit = convert_table(tables.get("search"), SearchTable, "search").time_limit
+    lookup = Lookup(places, time_limit=time_limit)
     for name in dict.fromkeys([one.model for one in tests] or [""]):
         model = name or tables["scenario"].get("model")
         if not isinstance(model, str):

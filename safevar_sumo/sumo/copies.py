@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import platformdirs
 
 from safevar_sumo.errors import EnvironmentFault, InputError
+from safevar_sumo.output import temporary_folder
 
 IdAttributes = Mapping[str, tuple[str, ...]]
 """Attributes that contain ids, by element; an attribute may contain several ids, separated by spaces."""
@@ -180,7 +180,7 @@ def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path
         return target / name
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=target.parent) as temporary:
+        with temporary_folder(target.parent) as temporary:
             new = Path(temporary, "new")
             new.mkdir()
             build(new)

@@ -18,10 +18,10 @@ from functools import cache, lru_cache
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean
+from safevar_sumo.output import temporary_folder
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges
 from safevar_sumo.scenarios.roads import lane_through
@@ -180,7 +180,7 @@ def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
     """
     files = copied_network(networks[0], len(networks))
     traffic_file = networks[0].path(TRAFFIC_FILE)
-    with TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         file = Path(folder, TRAFFIC_FILE)
         roots = [_changed(traffic_file, network.traffic_changes) for network in networks]
         with about(traffic_file):
