@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from difflib import get_close_matches
 from numbers import Integral
+from os import PathLike
+from typing import Any
 
 MAX_JOBS = 1024
 """Largest number of worker processes."""
@@ -133,6 +135,13 @@ def check_whole(option: str, value: object, highest: int) -> None:
     """Refuse what is no whole number from 1 to `highest`; raises an InputError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= highest:
         raise InputError(option, repr(value), f"a whole number from 1 to {highest:,}")
+
+
+def check_text(argument: str, value: Any) -> Any:
+    """The value of an argument, which has to be a text or a path; raises an InputError."""
+    if not isinstance(value, str | PathLike):
+        raise InputError(argument, repr(value), "a text or a path")
+    return value
 
 
 def check_name(source: object, problem: str, name: object, names: Collection[str], otherwise: str = "") -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, problem_of, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import MAX_BATCH, InputError, about, check_whole, warn
+from safevar_sumo.errors import MAX_BATCH, InputError, about, check_text, check_whole, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
@@ -76,7 +76,7 @@ def run(
         keys = [RunKey(*key) for key in only]
     if batch is not None:
         check_whole("batch", batch, MAX_BATCH)
-    directory = Path("results") / loaded_study.name if out is None else Path(out)
+    directory = Path("results") / loaded_study.name if out is None else Path(check_text("out", out))
     if out == "":
         raise InputError("out", "''", "a directory")
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)

@@ -8,7 +8,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import FORMATS, Answer, contents_of
 from safevar_sumo.questions.ask import Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.study import study_names
 
 GATE_EXIT_CODE = 3
@@ -59,8 +60,9 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
-        if declared:
-            named = declared.with_options(values)
+        if declared and (conditions or table):
+            of_simulation = "source" in values and ... in declared.numbers
+            named = declared.with_options(values, names_in_study(**values) if of_simulation else [...])
             for key, _, _ in conditions:
                 named.check_key(key)
             if table is not None:
@@ -95,6 +97,14 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         callback=print_answer if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
+
+
+def names_in_study(source: str, set: Sequence[str], as_it_is_now: bool, **_: Any) -> list[str]:
+    """Names of what a study measures, or that of results, and of the characteristics that are set."""
+    from safevar_sumo.sumo import assemble  # takes long to load
+
+    measuring = assemble(study_in(study_or_case(source, as_it_is_now=as_it_is_now))).measuring
+    return [*measuring.measures, *(text.partition("=")[0].strip() for text in set)]
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import json
 import re
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from types import EllipsisType
@@ -60,16 +60,18 @@ class Contents(NamedTuple):
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
 
-    def with_options(self, values: Mapping[str, Any]) -> Contents:
-        """The names that an answer has with these values of options; `NAME` for an option that has none."""
+    def with_options(self, values: Mapping[str, Any], given: Sequence[str | EllipsisType] = (...,)) -> Contents:
+        """The names that an answer has with these values of options, `NAME` for an option that has none, and those that
+        a study has `given`.
+        """
         named = defaultdict(lambda: "NAME")
         for option, text in values.items():
             if isinstance(text, str):
                 named[option] = text.partition("=")[0].strip()
-        tables = {}
-        for table, names in self.tables.items():
-            tables[table] = [name if name is ... else name.format_map(named) for name in names]
-        return self._replace(tables=tables)
+        tables = {"": self.numbers, **self.tables}
+        for table, names in tables.items():
+            tables[table] = [one for name in names for one in (given if name is ... else [name.format_map(named)])]
+        return Contents(tables.pop(""), tables)
 
     def check_table(self, name: str) -> None:
         """Refuse the name of no table; raises an InputError."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
 from importlib import import_module, invalidate_caches
@@ -17,7 +17,7 @@ from pathlib import Path
 from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
-from safevar_sumo.errors import MAX_JOBS, InputError, check_name, unknown_name, warn
+from safevar_sumo.errors import MAX_JOBS, InputError, check_name, check_text, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
@@ -117,9 +117,12 @@ class Option(NamedTuple):
         if self.is_repeated:
             if isinstance(value, Mapping):
                 value = [f"{name}={inner}" for name, inner in value.items()]
-            return (value,) if isinstance(value, str) else tuple(value)
-        if value is None or self.kind not in (int, float):
+            are_several = isinstance(value, Collection) and not isinstance(value, str)
+            return tuple(check_text(self.name, one) for one in (value if are_several else [value]))
+        if value is None or self.kind is bool or self.metavar == CRITERION:
             return value
+        if self.kind not in (int, float):
+            return check_text(self.name, value)
         number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
         words = f"{words} {self.limits}" if self.limits else words
         if isinstance(value, bool) or not isinstance(value, number) or (self.limits and value not in self.limits):
@@ -234,7 +237,7 @@ class Question:
                 continue
             texts = [""] if option.kind is bool else value if option.is_repeated else [value]
             words += [f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag for text in texts]
-        return " ".join([*words, *([f"--point {quote(point)}"] if point else [])])
+        return " ".join([*words, *([f"--point {quote(str(point))}"] if point else [])])
 
 
 def question(compute: Callable[..., Answer]) -> Question:

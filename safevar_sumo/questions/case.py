@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import InputError, describe_error
+from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
@@ -204,7 +204,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     InputError
         If a directory holds no results, is damaged or is given twice.
     """
-    paths = [Path(directory) for directory in directories]
+    paths = [Path(check_text("directory", directory)) for directory in directories]
     duplicates = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
     if duplicates:
         raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")

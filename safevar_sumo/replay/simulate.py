@@ -14,7 +14,7 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
-from safevar_sumo.metrics import STOPPING_DISTANCE
+from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
@@ -29,7 +29,7 @@ from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import at_point, point_record, simulate_all_points, vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
@@ -72,6 +72,11 @@ SPREAD: Columns = {
 }
 
 
+OUTCOME_NAMES = (
+    *("outcome", "collision", "collision_speed", "gap", ORIGINAL_DEGREE),
+    *(F_SAFE.name, F_DIFF.name, F_NUM_DIFF.name),
+)
+"""What every study says of a simulation besides its metrics."""
 NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
 """Why a setting of a study that searches its scenario is in no result."""
 
@@ -92,12 +97,12 @@ class Target(NamedTuple):
 
 
 @contents(
-    ...,
+    *("solution", "settings", "collisions", *OUTCOME_NAMES, ...),
     characteristics=CHARACTERISTICS,
     results=RESULTS,
     points=POINTS,
     spread=SPREAD,
-    sweep=["outcome", "gap", ...],
+    sweep=[*OUTCOME_NAMES, ...],
     remarks=REMARKS,
 )
 def simulate(

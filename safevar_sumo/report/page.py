@@ -15,7 +15,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
@@ -98,11 +98,11 @@ def report(
     InputError
         If a directory holds no results, there is no such question or point, or the file cannot be written.
     """
-    out = Path(out)
+    out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
     if paper and point is not None:
         raise InputError("point", "the research questions are about whole studies", "no `paper`, or no `point`")
-    paths = [Path(source.directory if isinstance(source, Results) else source) for source in results]
+    paths = [Path(check_text("results", getattr(source, "directory", source))) for source in results]
     cases = load_cases(paths)
     usual_joint = ["compare"] if len(cases) == 2 else []
     joint = [text for text in ask or usual_joint if parse_question(text)[0].others]

@@ -186,9 +186,9 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         ("Results", f"{study.directory.name}, seed {study.case.study.search.seed}"),
         ("Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())),
     ]
-    if numbers.get("fits"):
+    if numbers.get("fits_tried"):
         rows.append(("Fits", f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"))
-    if numbers.get("attacked") and numbers["at_most"] is not None:
+    if numbers.get("attacked") and numbers.get("at_most") is not None:
         uncertainty = f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
         rows.append(("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}"))
     tables = study.answers[0].tables if numbers else {}

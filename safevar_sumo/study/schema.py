@@ -194,6 +194,10 @@ class MatrixTest(Table, frozen=True, kw_only=True):
     over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
     weathers: list[str | Weather] = []
 
+    def __post_init__(self) -> None:
+        for name in self.parameters.keys() & self.over.keys():
+            raise mistake(f"{name} is in parameters and in over", "one of them")
+
 
 class RatingTable(Table, frozen=True, kw_only=True):
     """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such

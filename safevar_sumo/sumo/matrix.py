@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, check_text
 from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, finite_or_none
@@ -228,6 +228,7 @@ def at_point(study: Study, name: str) -> Study:
     InputError
         If no point has this name.
     """
+    check_text("point", name)
     points = [point.name for point in assemble(study).matrix]
     if study.matrix is None or name not in points:
         similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)

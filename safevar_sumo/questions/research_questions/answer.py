@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pandas as pd
 
@@ -98,7 +98,8 @@ def figures(*results: Results | str | Path) -> dict[str, Figure]:
 
 
 def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
-    return load_cases([source if isinstance(source, str | Path) else source.directory for source in results])
+    directories: list[Any] = [getattr(source, "directory", source) for source in results]
+    return load_cases(directories)
 
 
 def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
