@@ -8,7 +8,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         conditions = [_parse(text) for text in fail_if]
         if declared and (conditions or table):
             of_simulation = "source" in values and ... in declared.numbers
-            named = declared.with_options(values, names_in_study(**values) if of_simulation else [...])
+            named = declared.with_options(values, names_in_study(values) if of_simulation else [...])
             for key, _, _ in conditions:
                 named.check_key(key)
             if table is not None:
@@ -99,12 +99,12 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     )
 
 
-def names_in_study(source: str, set: Sequence[str], as_it_is_now: bool, **_: Any) -> list[str]:
-    """Names of what a study measures, or that of results, and of the characteristics that are set."""
+def names_in_study(values: Mapping[str, Any]) -> list[str]:
+    """Names of what the study of a simulation measures, and of its characteristics."""
     from safevar_sumo.sumo import assemble  # takes long to load
 
-    measuring = assemble(study_in(study_or_case(source, as_it_is_now=as_it_is_now))).measuring
-    return [*measuring.measures, *(text.partition("=")[0].strip() for text in set)]
+    study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
+    return [*assemble(study).measuring.measures, *study.domains]
 
 
 @contextmanager

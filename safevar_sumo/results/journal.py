@@ -35,8 +35,6 @@ SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
 POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = "evaluation", "outcome", "reason", "solutions", "crc32"
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
-COLUMN_TYPES = {POSITION: list[int], OUTCOME: list[str], REASON: list[str | None]}
-"""The types of a batch's columns, unless they hold numbers."""
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
@@ -165,18 +163,11 @@ def read_journal(path: Path, head: JsonObject, stated: int | None = None) -> Jou
     InputError
         If the journal cannot be read, or belongs to another study or run.
     """
-    _check_file(path)
     try:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     return _read(data, path, head, stated)
-
-
-def _check_file(path: Path) -> None:
-    """Refuse what is no file, such as a folder, or a pipe, which would be waited for; raises an InputError."""
-    if path.exists() and not path.is_file():
-        raise InputError(path, "is no file", "the journal that was there, or no file: the run then begins anew")
 
 
 class _Progress(msgspec.Struct):
@@ -190,7 +181,6 @@ class JournalReader:
     """Follows how many evaluations a run has asked for, in the journal that another process writes."""
 
     def __init__(self, path: Path, budget: int) -> None:
-        _check_file(path)
         self._path = path
         self._budget = budget
         self._end = self._asked = 0
@@ -215,7 +205,6 @@ class JournalReader:
 
 
 def _open_and_lock(path: Path) -> IO[bytes]:
-    _check_file(path)
     lock = portalocker.Lock(path, "a+b", PATIENCE, SECONDS_BETWEEN_ATTEMPTS, buffering=0)
     with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -259,7 +248,7 @@ def _read(
                 if until_failure and batch.failed.any():
                     break
                 batches.append(batch)
-                positions += line[POSITION]
+                positions += msgspec.convert(line[POSITION], list[int])
         except (KeyError, TypeError, ValueError, msgspec.ValidationError):
             break
         size += len(text)
@@ -306,10 +295,11 @@ def _batch_line(positions: Sequence[int], evaluations: Evaluations, characterist
 
 def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:
     """The batch of evaluations in a line; raises an error if its columns are wrong or have different lengths."""
-    for name, values in line.items():
-        if len(msgspec.convert(values, COLUMN_TYPES.get(name, list[float | None]))) != len(line[POSITION]):
-            raise ValueError
-    columns = {name: np.array(values, dtype=float) for name, values in line.items() if name not in COLUMN_TYPES}
+    if len({len(values) for values in line.values()}) > 1:
+        raise ValueError
+    columns = {
+        name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)
+    }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
     reasons = line.get(REASON, [None] * len(settings))
     speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)

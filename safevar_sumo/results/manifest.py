@@ -82,8 +82,17 @@ def run_name(algorithm: str, run: int) -> str:
 
 
 def journal_file(directory: Path, run: str) -> Path:
-    """The journal of a run, by the run's name."""
-    return directory / RUNS / f"{run}.jsonl"
+    """The journal of a run, by the run's name.
+
+    Raises
+    ------
+    InputError
+        If something else is there, such as a folder, or a pipe, which would be waited for.
+    """
+    path = directory / RUNS / f"{run}.jsonl"
+    if path.exists() and not path.is_file():
+        raise InputError(path, "is no file", "the journal that was there, or no file: the run then begins anew")
+    return path
 
 
 def stored_runs(directory: Path) -> set[str]:

@@ -125,9 +125,8 @@ def draw_convergence(case: Case) -> Figure:
         f"mark: of what a run returns; reference point {REFERENCE_COORDINATE:g})"
     )
     ends = growth.groupby("algorithm", sort=False)["evaluations"].max()
-    returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median()
-    for (name, end), colour in zip(ends.items(), COLOURS, strict=False):
-        axis.plot([end], [returned.get(name)], "o", color=colour, markeredgecolor="black")
+    returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median().reindex(ends.index)
+    axis.scatter(ends, returned, color=COLOURS[: len(ends)], edgecolor="black", zorder=3)
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
     return figure
