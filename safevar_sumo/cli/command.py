@@ -60,9 +60,9 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
-        if declared and (conditions or table):
-            of_simulation = "source" in values and ... in declared.numbers
-            named = declared.with_options(values, names_in_study(values) if of_simulation else [...])
+        if declared:
+            names_study = conditions and ... in declared.numbers  # as `simulate`
+            named = declared.with_options(values, names_in_study(values) if names_study else {})
             for key, _, _ in conditions:
                 named.check_key(key)
             if table is not None:
@@ -99,12 +99,13 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     )
 
 
-def names_in_study(values: Mapping[str, Any]) -> list[str]:
-    """Names of what the study of a simulation measures, and of its characteristics."""
+def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Names of what the study of a simulation measures; in the table of a sweep also of its characteristics."""
     from safevar_sumo.sumo import assemble  # takes long to load
 
     study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
-    return [*assemble(study).measuring.measures, *study.domains]
+    measures = [*assemble(study).measuring.measures]
+    return {"": measures, "sweep": [*measures, *study.domains]}
 
 
 @contextmanager

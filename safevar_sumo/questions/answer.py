@@ -6,7 +6,7 @@ import json
 import re
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from types import EllipsisType
@@ -52,6 +52,9 @@ WIDTH = 80
 """Width of text that is not printed to a terminal [characters]."""
 
 
+NOTHING: Mapping[str, list[str]] = {}
+
+
 class Contents(NamedTuple):
     """The names of an answer's numbers, and of the columns of its tables; `...` among them stands for names that a
     study gives, such as its metrics, and `{by}` for the name in a value NAME=... of the option `by`.
@@ -60,9 +63,9 @@ class Contents(NamedTuple):
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
 
-    def with_options(self, values: Mapping[str, Any], given: Sequence[str | EllipsisType] = (...,)) -> Contents:
+    def with_options(self, values: Mapping[str, Any], given: Mapping[str, list[str]] = NOTHING) -> Contents:
         """The names that an answer has with these values of options, `NAME` for an option that has none, and those that
-        a study has `given`.
+        a study has `given`, by table; of numbers under "".
         """
         named = defaultdict(lambda: "NAME")
         for option, text in values.items():
@@ -70,7 +73,8 @@ class Contents(NamedTuple):
                 named[option] = text.partition("=")[0].strip()
         tables = {"": self.numbers, **self.tables}
         for table, names in tables.items():
-            tables[table] = [one for name in names for one in (given if name is ... else [name.format_map(named)])]
+            of_study = given.get(table, [...])
+            tables[table] = [one for name in names for one in (of_study if name is ... else [name.format_map(named)])]
         return Contents(tables.pop(""), tables)
 
     def check_table(self, name: str) -> None:
@@ -256,7 +260,8 @@ class Answer:
         long = [f"{name} ({len(frame):,} rows)" for name, frame in self._reader_tables.items() if len(frame) > MAX_ROWS]
         sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
         folded = [name for name in self.folded if len(self.tables.get(name, ()))]
-        sentences += [f"By --table NAME: {', '.join(folded)}."] if folded else []
+        by_all = "" if self.question == "study" else "--all, or "
+        sentences += [f"By {by_all}--table NAME: {', '.join(folded)}."] if folded else []
         return " ".join(sentences)
 
     def _label_of(self, table: str) -> str:

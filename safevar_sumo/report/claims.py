@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import zip_longest
@@ -117,7 +118,7 @@ class Packed:
         expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {"collision", "collision_speed"}
         if wrong := expected ^ {*solutions}:  # pandas calls a second column x "x.1"
             raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
-        if count_solutions(solutions) != self.packed.solutions:
+        if count_solutions(solutions, self.packed.runs) != self.packed.solutions:
             raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
 
     @cached_property
@@ -234,11 +235,10 @@ def count_outcomes(case: Case) -> dict[str, int]:
     return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
 
 
-def count_solutions(solutions: pd.DataFrame) -> list[int]:
-    """The number of solutions of every run that has some, and of all different ones: a run may return a setting
-    twice.
-    """
-    return [*solutions.groupby(["algorithm", "run"]).size(), len(solutions.drop_duplicates())]
+def count_solutions(solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]) -> list[int]:
+    """The numbers of solutions of each run, of all, and of different ones: a run may return a setting twice."""
+    counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
+    return [*(counts[run] for run in runs), len(solutions), len(solutions.drop_duplicates())]
 
 
 def compare(study: str, claim: Claim) -> tuple[str, ...]:

@@ -115,7 +115,9 @@ def _pack_study(
     questions = list(dict.fromkeys(asked))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
-    described = PackedStudy(folder, questions, runs, count_outcomes(case), count_solutions(case.solutions), unsafe)
+    described = PackedStudy(
+        folder, questions, runs, count_outcomes(case), count_solutions(case.solutions, runs), unsafe
+    )
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
     packed = Packed(described, files, study.origin.places, jobs, partial(show_within, progress, study.name))

@@ -33,7 +33,7 @@ PACK = "a file that the command `evidence` has written, unchanged"
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     """One results directory in a pack: its folder there, the questions that its answers answer, as typed, its finished
-    runs, the number of their evaluations by outcome, the number of the solutions of every run and, last, of all
+    runs, the number of their evaluations by outcome, the numbers of solutions of each run, of all and of
     different ones, and what is unsafe, if it was stated.
     """
 

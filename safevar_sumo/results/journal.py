@@ -247,8 +247,8 @@ def _read(
                 batch = _evaluations_of(line, head["characteristics"])
                 if until_failure and batch.failed.any():
                     break
-                batches.append(batch)
                 positions += msgspec.convert(line[POSITION], list[int])
+                batches.append(batch)
         except (KeyError, TypeError, ValueError, msgspec.ValidationError):
             break
         size += len(text)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -193,6 +194,29 @@ def test_a_run_refuses_what_its_command_refuses(options: dict[str, Any], error: 
         for ask in (sv.risk, sv.tolerance, lambda study, jobs: sv.evaluate(study, [{}], jobs=jobs)):
             with pytest.raises(sv.InputError, match="jobs"):
                 ask("smoke", jobs=options["jobs"])
+
+
+WRONG_TYPES: dict[str, Callable[[], object]] = {
+    "directory": lambda: sv.load(3),  # type: ignore[arg-type]
+    "point": lambda: sv.risk("wear", point=3),
+    "results": lambda: sv.report(3),  # type: ignore[arg-type]
+    "out": lambda: sv.run("smoke", 3),  # type: ignore[arg-type]
+    "by": lambda: sv.tolerance("smoke", by=3),
+    "characteristics": lambda: sv.tolerance("smoke", characteristics=3),
+    "limits": lambda: sv.tolerance("smoke", limits=[3]),
+    "unsafe": lambda: sv.risk("smoke", unsafe=[3]),
+    "samples": lambda: sv.risk("smoke", samples="3"),
+    "changes": lambda: sv.simulate("smoke", 3),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("argument", WRONG_TYPES)
+def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(argument: str, in_tmp: Path) -> None:
+    with pytest.raises(sv.InputError, match=rf"^{argument}: .*3|^{argument}: is a int"):
+        WRONG_TYPES[argument]()
+    with pytest.raises(sv.InputError, match=r"^directory: None\nexpected: a text or a path"):
+        sv.tables(None)  # type: ignore[arg-type]
+    assert not [*in_tmp.iterdir()]
 
 
 @pytest.mark.slow

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, run_campaign
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, questions, run_campaign
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.share import carry_share
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.system import assemble
@@ -65,7 +66,9 @@ class FormulaPool(InlinePool):
         return super().submit(function, *arguments)
 
     def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        return function(*arguments) if function in (carry_share, evaluate_settings) else ""
+        if function in (carry_share, evaluate_settings):
+            return function(*arguments)
+        return Use({}, []) if function is questions._refuse_defects else ""
 
 
 def with_search(study: Study, **changes: object) -> Study:

@@ -25,7 +25,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, refused
+from tests.in_process import json_of, refused, run
 
 ROOT = Path(__file__).parents[2]
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
@@ -253,3 +253,18 @@ def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(c
 def test_every_command_that_gives_an_answer_declares_its_names() -> None:
     gives = [name for name in COMMANDS if "Answer" in str(inspect.signature(function_of(name)).return_annotation)]
     assert [name for name in COMMANDS if contents_of(function_of(name))] == gives
+
+
+@pytest.mark.parametrize("key", ["nope", "sweep.nope", "drac", "mass"])
+def test_a_key_that_the_study_of_a_simulation_has_not_is_refused_before_it_drives(
+    key: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("safevar_sumo.replay.simulate.simulate_with_original", None)
+    refused("simulate", "smoke", "--fail-if", f"{key} > 1", message=(f"--fail-if: the answer has no number '{key}'",))
+
+
+def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None:
+    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n')
+    assert "failed: drac = " in run("simulate", "mine.toml", "--fail-if", "drac > 0", expect=3).stderr
+    sweep = ("simulate", "mine.toml", "--set", "mass=2100..2200:2")
+    assert "mass = 2200 > 2150" in run(*sweep, "--fail-if", "sweep.mass > 2150", expect=3).stderr

@@ -186,6 +186,24 @@ def test_a_question_that_cannot_be_asked_is_refused(text: str, expected: str, sl
         page_of(slippery, ask=[text], jobs=1)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "text",
+    [
+        "explain --top 1 --limit 200",
+        "tolerance --quick --attack 0 --characteristics tireFric",
+        "risk --samples 50",
+        "rules --samples 50",
+    ],
+)
+def test_every_question_may_be_asked_first_alone_and_twice(text: str, slippery: Path) -> None:
+    """`explain` tells fits, but not of limits."""
+    question, values = parse_question(text)
+    first = question(str(slippery), **values, jobs=1).verdict.partition(". ")[0]
+    for ask in ([text], [text, text]):
+        assert first in words_of(page_of(slippery, ask=ask, jobs=1))
+
+
 @pytest.mark.parametrize("text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"])
 def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     question, values = parse_question(text)

@@ -74,23 +74,6 @@ def test_convergence_grows_to_the_hypervolume_of_all() -> None:
         assert group["hypervolume"].iloc[-1] == pytest.approx(volume)
 
 
-def test_convergence_ends_at_the_hypervolume_of_the_tables_whatever_else_was_evaluated() -> None:
-    """The first algorithm evaluates better settings than it returns: in the figure, too, it is behind the other."""
-    settings = [(1000.0 + 10 * i, 2.0 + i / 10, 0.1) for i in range(30)]
-    seen = [
-        {**row(name, values=values, sd=5 - i / 10 if name == "rs" else 1 - i / 100), "evaluation": i}
-        for name in ("nsga2", "rs")
-        for i, values in enumerate(settings)
-    ]
-    returned = [seen[3], seen[5], *seen[40:]]
-    case = made_up(*({**one} for one in returned), evaluations=seen)
-    ends = compute_convergence(case).groupby(["algorithm", "run"])["hypervolume"].last()
-    tables = compute_indicators(case)["hypervolume"]
-    assert ends.to_dict() == pytest.approx(tables.to_dict())
-    everything = normalised(points_of(case, case.evaluations.query("algorithm == 'nsga2'")), reference_front(case))
-    assert moocore.hypervolume(everything, ref=[1.1] * 3) > tables["nsga2", 0] + 0.01
-
-
 def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
     seen = [
         {**row(name, run, sd=2 - i / 100), "evaluation": i}
@@ -313,6 +296,12 @@ def test_the_table_for_a_paper_has_a_line_for_each_metric_and_a_mark_where_the_l
             "method algorithm enough_runs",
         ),
         ("medians", "setting algorithm metric runs median median_low median_high"),
+        ("convergence", "case algorithm evaluations hypervolume low high"),
+        (
+            "rq2-common",
+            "setting baseline metric p_value p_holm effect_size effect_size_low effect_size_high magnitude n1 n2 "
+            "method algorithm enough_runs",
+        ),
         ("evaluations", "setting algorithm run requested simulated budget"),
         ("rq3.1", "setting run j count"),
         ("rq3.2", "setting characteristic j percent rank"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -279,9 +281,32 @@ def test_altered_journals_are_simulated_again_and_those_without_checksums_are_re
     assert journal.read_bytes() == whole
     assert (copied / "solutions.csv").read_bytes() == (slippery / "solutions.csv").read_bytes()
     journal.write_bytes(re.sub(rb',"crc32":\d+}\n', b"}\n", whole.replace(b'"format":6', b'"format":5')))
+    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout, "the manifest says that there are checksums"
+    manifest = read_manifest(copied)
+    assert manifest.pop("journals") == 6
+    (copied / "manifest.json").write_text(json.dumps(manifest))
     tables = run("tables", str(copied))
     assert "without checksums: altered lines go unnoticed" in tables.stderr
     assert tables.stdout == run("tables", str(slippery)).stdout.replace(str(slippery), str(copied))
+    run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
+    assert "journals" not in read_manifest(copied), "which still has an older one"
+    assert "without checksums" in run("tables", str(copied)).stderr
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a pipe", "a folder"])
+def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
+    make: Callable[[Path], None], copied: Path, slippery: Path
+) -> None:
+    journal = copied / "runs/rs-00.jsonl"
+    journal.unlink()
+    make(journal)
+    study = str(slippery.parent / "slippery.toml")
+    for command in (
+        ("tables", str(copied)),
+        ("study", study, "--out", str(copied), "--quiet"),
+        ("report", str(copied)),
+    ):
+        refused(*command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew"))
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
