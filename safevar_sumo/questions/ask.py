@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
 from importlib import import_module, invalidate_caches
@@ -117,8 +117,7 @@ class Option(NamedTuple):
         if self.is_repeated:
             if isinstance(value, Mapping):
                 value = [f"{name}={inner}" for name, inner in value.items()]
-            are_several = isinstance(value, Collection) and not isinstance(value, str)
-            return tuple(check_text(self.name, one) for one in (value if are_several else [value]))
+            return (value,) if isinstance(value, str) else tuple(value)
         if value is None or self.kind is bool or self.metavar == CRITERION:
             return value
         if self.kind not in (int, float):

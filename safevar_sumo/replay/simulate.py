@@ -14,7 +14,7 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_settings
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
-from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, F_SAFE, STOPPING_DISTANCE
+from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
@@ -72,10 +72,7 @@ SPREAD: Columns = {
 }
 
 
-OUTCOME_NAMES = (
-    *("outcome", "collision", "collision_speed", "gap", ORIGINAL_DEGREE),
-    *(F_SAFE.name, F_DIFF.name, F_NUM_DIFF.name),
-)
+OUTCOME_NAMES = ("outcome", "collision", "collision_speed", "gap", ORIGINAL_DEGREE, "f_safe", "f_diff", "f_num_diff")
 """What every study says of a simulation besides its metrics."""
 NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
 """Why a setting of a study that searches its scenario is in no result."""

@@ -18,7 +18,7 @@ import pytest
 
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError
-from safevar_sumo.output import SETTLING_TIME, temporary_folder
+from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
 from tests.in_process import run
@@ -116,39 +116,31 @@ def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_writt
 
 
 HOLDING = """
-import sys, time
 from safevar_sumo.output import temporary_folder
 with temporary_folder() as folder:
-    (folder / "file").write_text("x")
     print(folder, flush=True)
-    time.sleep(60)
+    input()
 """
 
 
 def test_a_temporary_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_stays(
-    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = in_tmp / "temporary"
-    place.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(place))
-    environment = {**os.environ, "TMPDIR": str(place)}
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     command = [sys.executable, "-c", HOLDING]
-    holders = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) for _ in range(2)]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    holders = [subprocess.Popen(command, text=True, env=environment, **pipes) for _ in range(2)]
     folders = [Path(holder.stdout.readline().strip()) for holder in holders if holder.stdout]
-    assert all((folder / "file").exists() for folder in folders)
     holders[0].kill()
     holders[0].wait()
     time.sleep(2 * SETTLING_TIME)
-    mine = place / "safevar-of-somebody"
-    mine.mkdir()
-    with temporary_folder() as folder:
-        assert {*place.iterdir()} == {folders[1], folder, mine}, "a folder without a lock is not ours"
-    holders[1].kill()
-    holders[1].wait()
-    time.sleep(2 * SETTLING_TIME)
     with open_pool(1):
-        assert len([*place.glob("safevar-*/lock")]) == 1
-    assert [*place.iterdir()] == [mine]
+        own = {*tmp_path.glob("safevar-*")} - {*folders}
+        assert len(own) == 1
+        assert [folder.exists() for folder in folders] == [False, True]
+    holders[1].communicate("", timeout=60)
+    assert not [*tmp_path.glob("safevar-*")]
 
 
 @SLOW

@@ -191,7 +191,7 @@ def test_a_question_that_cannot_be_asked_is_refused(text: str, expected: str, sl
     "text",
     [
         "explain --top 1 --limit 200",
-        "tolerance --quick --attack 0 --characteristics tireFric",
+        "tolerance --attack 0 --characteristics tireFric",
         "risk --samples 50",
         "rules --samples 50",
     ],

@@ -13,7 +13,6 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import moocore
 import numpy as np
 import pytest
 import scipy
@@ -23,13 +22,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
-from safevar_sumo.questions.research_questions.fronts import (
-    compute_convergence,
-    compute_indicators,
-    normalised,
-    points_of,
-    reference_front,
-)
+from safevar_sumo.questions.research_questions.fronts import compute_convergence, compute_indicators, reference_front
 from safevar_sumo.questions.research_questions.statistics import (
     EXACT_TEST,
     compare_samples,
@@ -54,24 +47,6 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
     assert result.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
     assert result.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), "a whole width of f_safe away from one of two"
     assert result.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
-
-
-def test_convergence_grows_to_the_hypervolume_of_all() -> None:
-    rng = np.random.default_rng(1)
-    evaluations = [
-        {**row("nsga2", run, sd=sd, f_diff=diff), "evaluation": i}
-        for run in (0, 1)
-        for i, (sd, diff) in enumerate(rng.uniform(0.1, 1, size=(100 if run else 40, 2)))
-    ]
-    case = made_up(row(sd=0.1, f_diff=1), row(run=1, sd=1, f_diff=0.1), evaluations=evaluations)
-    grown = compute_convergence(case)
-    assert set(grown["evaluations"]) >= {10, 100}
-    assert grown.groupby("run")["evaluations"].max().tolist() == [100, 100], "a run that ended early keeps what it had"
-    for run, group in grown.groupby("run"):
-        assert (np.diff(group["hypervolume"]) >= 0).all()
-        points = points_of(case, case.evaluations[case.evaluations["run"] == run])
-        volume = moocore.hypervolume(normalised(points, reference_front(case)), ref=[1.1] * 3)
-        assert group["hypervolume"].iloc[-1] == pytest.approx(volume)
 
 
 def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:

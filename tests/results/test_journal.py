@@ -233,62 +233,53 @@ def test_a_journal_of_the_format_without_checksums_is_read_and_goes_on_in_it(tmp
     assert holds_the_first(0, read_journal(path, HEAD)), "it has checksums"
 
 
-@pytest.mark.parametrize("number", [5, 4, 7, "6", None])
+@pytest.mark.parametrize("number", [5, 4, None])
+@pytest.mark.parametrize("strip", [True, False])
 def test_a_first_line_that_contradicts_the_manifest_is_not_believed_and_nothing_after_it(
-    number: object, tmp_path: Path
+    number: object, strip: bool, tmp_path: Path
 ) -> None:
-    """Neither are lines whose checksums were taken out with it, nor those that still have theirs."""
     path = tmp_path / "a.jsonl"
-    for strip in (True, False):
-        write(path)
-        if strip:
-            without_checksums(path)
-        head, *lines = path.read_text().splitlines(keepends=True)
-        altered = json.dumps({**json.loads(head), "format": number}, separators=(",", ":")) + "\n"
-        path.write_text("".join([altered, *lines]))
-        assert holds_the_first(0, read_journal(path, HEAD, 6))
-        journal = Journal(path, HEAD, 6)
-        assert holds_the_first(0, journal.content)
-        for place in range(BATCHES):
-            journal.append(places(place), batch(place))
-        journal.close()
-        assert holds_the_first(BATCHES, read_journal(path, HEAD, 6)), "simulated again, with checksums"
-        assert path.read_text().count("crc32") == BATCHES
-    with pytest.raises(InputError, match="belongs to another study"):
-        read_journal(path, journal_head("other", "nsga2-00", ("a", "b")), 6)
-    path.write_text(path.read_text().replace('"format":6', '"format":7'))
+    write(path)
+    whole = path.read_bytes()
+    if strip:
+        without_checksums(path)
+    head, lines = path.read_text().split("\n", 1)
+    path.write_text(json.dumps({**json.loads(head), "format": number}) + "\n" + lines)
+    assert holds_the_first(0, read_journal(path, HEAD, 6))
+    journal = Journal(path, HEAD, 6)
+    for place in range(BATCHES):
+        journal.append(places(place), batch(place))
+    journal.finish(RESULT, BUDGET)
+    journal.close()
+    assert path.read_bytes() == whole, "simulated again, with checksums"
+    path.write_bytes(whole.replace(b'"format":6', b'"format":7'))
     with pytest.raises(InputError, match="belongs to another study, version"):
         read_journal(path, HEAD, 7)  # of a later version
 
 
-WRONG_VALUES = {
-    "solutions": ["[9999]", "[-1]", '"x"', "null", "9999", "[[1]]", '["1"]', "[1.5]"],
-    "budget": ["[1]", "{}"],
-    "evaluation": ["null", '"abc"', "[0,1]", '["0","1","2"]', "3"],
-    "outcome": ["null", '["stopped"]', "1"],
-    "a": ["null", '["x","y","z"]', "[1]", "[[1],[2],[3]]", '"abc"'],
-    "f_diff": ["null", "[1,2]", "1"],
-}
-
-
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name in WRONG_VALUES for value in WRONG_VALUES[name]])
-def test_a_line_of_an_older_journal_with_wrong_values_is_simulated_again(name: str, value: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("solutions", value) for value in ([9999], [-1], "x", None, [[1]], ["1"], 5)),
+        *(("evaluation", value) for value in (None, "abc", [0, 1], ["0", "1", "2"])),
+        *(("a", value) for value in (None, ["x", 1, 2], [1], "abc")),
+        *(("outcome", None), ("f_diff", [1, 2]), ("budget", [1])),
+    ],
+)
+def test_a_line_of_an_older_journal_with_wrong_values_is_simulated_again(
+    name: str, value: object, tmp_path: Path
+) -> None:
     path = tmp_path / "a.jsonl"
     write(path)
     without_checksums(path)
-    lines = path.read_text().splitlines(keepends=True)
+    lines = path.read_text().splitlines()
     place = -1 if name in ("solutions", "budget") else 2
-    lines[place] = json.dumps({**json.loads(lines[place]), name: json.loads(value)}) + "\n"
-    path.write_text("".join(lines))
-    content = read_journal(path, HEAD)
-    assert holds_the_first(BATCHES if place == -1 else 1, content)
-    assert not content.results
+    lines[place] = json.dumps({**json.loads(lines[place]), name: value})
+    path.write_text("\n".join(lines) + "\n")
     journal = Journal(path, HEAD)
-    for number in range(len(content.positions) // ROWS, BATCHES):
-        journal.append(places(number), batch(number))
-    journal.finish(RESULT, BUDGET)
+    assert holds_the_first(BATCHES if place == -1 else 1, journal.content)
+    assert not journal.content.results
     journal.close()
-    assert read_journal(path, HEAD).results == {BUDGET: RESULT}
 
 
 def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(tmp_path: Path) -> None:

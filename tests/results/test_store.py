@@ -289,8 +289,7 @@ def test_altered_journals_are_simulated_again_and_those_without_checksums_are_re
     assert "without checksums: altered lines go unnoticed" in tables.stderr
     assert tables.stdout == run("tables", str(slippery)).stdout.replace(str(slippery), str(copied))
     run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
-    assert "journals" not in read_manifest(copied), "which still has an older one"
-    assert "without checksums" in run("tables", str(copied)).stderr
+    assert "journals" not in read_manifest(copied), "one of them is older"
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a pipe", "a folder"])
