@@ -17,7 +17,7 @@ STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
 ORDERS = 31
 """Number of random orders in which failures are cut off."""
-CLEARANCE, RETREAT = 0.8, 0.15
+CLEARANCE, RETREAT = 0.8, 0.4
 """Share of such a move by which a limit keeps off a failure that an attack found between corners; and by how much more
 after each box that failed.
 """

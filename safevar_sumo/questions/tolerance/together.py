@@ -20,7 +20,7 @@ from safevar_sumo.study import Limit
 
 MAX_SIMULATIONS = 1_500_000
 """Number of simulations, each at all points of a matrix, after which a search ends with the next box that passes."""
-MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 3, 3
+MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that limits move out."""
 PROMISE_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
