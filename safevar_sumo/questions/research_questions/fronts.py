@@ -142,9 +142,9 @@ def describe_rules(case: Case) -> str:
     if not len(others):
         return ""
     return (
-        f"algorithms return solutions by different rules: {', '.join(map(case.title_of, others))} return others than "
-        "all settings that nothing in the run dominates. Means over solutions depend on the rule; rq2-common applies "
-        "one rule to all."
+        f"algorithms return solutions by different rules: those of {', '.join(map(case.title_of, others))} are not all "
+        "settings that nothing in the run dominates. Means over solutions depend on the rule; rq2-common applies one "
+        "rule to all."
     )
 
 
