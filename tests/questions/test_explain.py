@@ -33,6 +33,8 @@ from safevar_sumo.questions.explain.causes import (
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
 from tests.in_process import InlinePool
 from tests.questions.conftest import (
@@ -93,13 +95,17 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(case: Case, explained: Answer) -> None:
-    """The limits are those of the first row; nothing names a solution."""
+    """The limits are those of the first row, with values with which the vehicle collides; nothing names a solution."""
     leading, verdict = explained.tables["causes"].iloc[0], explained.verdict
     for item in case.characteristics:
         if item.name in leading["boundary"]:
             value = leading["boundary"][item.name]
             side = "above" if value > item.original else "below"
-            assert f"{item.short_name} {side} {item.text(value)}{item.suffix}" in verdict
+            said = float(re.search(rf"{item.short_name} {side} ([\d.]+)", verdict)[1])  # type: ignore[index]
+            assert abs(said - item.original) >= abs(value - item.original)
+            assert said == pytest.approx(value, abs=10.0**-item.digits)
+            printed = case.characteristics.setting({**leading["boundary"], item.name: said})
+            assert case.unsafe.of(evaluate(assemble(case.study), printed[np.newaxis]))[0]
     share = f"{100 * leading['robust_share']:.0f} % of its neighbours are unsafe too"
     assert re.search(rf"^With .* the vehicle collides \(.*{share}; in {leading['fits_holding']} of {FITS} ", verdict)
     assert leading["solution"] not in verdict
