@@ -80,7 +80,6 @@ TYPED = [
     ("simulate sun --set tireFric=1..2 --spread", "--spread"),
     ("explain smoke --unsafe bad", "below=X"),
     ("explain smoke --solution nsga2:0:0", "has no solutions"),
-    ("opinion smoke", "smoke: is a study and has no solutions"),
     ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
     ("tolerance smoke --margin -1", "a number from 0 to 100"),
     ("tolerance smoke --limits mas>=2100", "--limits: mas: there is no such characteristic; did you mean 'mass'?"),

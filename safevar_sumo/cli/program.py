@@ -35,7 +35,6 @@ COMMANDS_BY_GROUP = {
         "compare": "questions.compare:compare",
         "repair": "questions.repair:repair",
         "rating": "questions.rating:rating",
-        "opinion": "questions.opinion:opinion",
     },
     "Hand over": {
         "evidence": "report.evidence:evidence",

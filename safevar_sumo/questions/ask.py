@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
-    for name in ("compare", "explain", "opinion", "rating", "repair", "risk", "rules", "tolerance")
+    for name in ("compare", "explain", "rating", "repair", "risk", "rules", "tolerance")
 } | {"validate": "safevar_sumo.reference.agreement"}
 """The module of each question, whose function has the question's name."""
 

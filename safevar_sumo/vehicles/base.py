@@ -141,8 +141,6 @@ class Vehicle:
         Highest speed at which the parameters were identified [m/s].
     remarks
         Remarks for the user.
-    second_model
-        Name of the shipped vehicle whose equations represent it in CommonRoad's multi-body model; "" for none.
     RETURNS
         What the methods of a user's class must return.
     """
@@ -163,7 +161,6 @@ class Vehicle:
     PLAUSIBLE: Mapping[str, Plausible] = MappingProxyType({})
     FITTED_UP_TO: ClassVar[float] = np.inf
     remarks: Sequence[str] = ()
-    second_model: ClassVar[str] = ""
 
     def seeded(self, seed: int) -> Vehicle:
         """The vehicle with the study's seed, for what is random in it, the same for all vehicles; most need none."""

@@ -94,7 +94,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         the height, and measured gaps scale by the assumed height over the actual height.
     """
 
-    second_model = "carla"
     UNITS = {
         "max_rpm": "r/min",
         "dampRateFullT": "kg m^2/s",

@@ -108,7 +108,6 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         maxSteeringAngle of the vehicle for which the lane keeping was designed [deg].
     """
 
-    second_model = "lgsvl"
     UNITS = {
         "mass": "kg",
         "wheelMass": "kg",

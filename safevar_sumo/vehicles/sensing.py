@@ -68,7 +68,6 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this coefficient times g.
     """
 
-    second_model = "sumo"
     UNITS = {
         "mass": "kg",
         "accel": "m/s^2",
@@ -206,7 +205,6 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     to a. The vehicle never rolls back.
     """
 
-    second_model = "worn"
     UNITS = {
         "treadDepth": "mm",
         "brakeTorque": "-",

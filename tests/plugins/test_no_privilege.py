@@ -10,15 +10,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import pandas as pd
 import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, Unsafe, time_to_collision
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, time_to_collision
 from safevar_sumo.protocol.cells import MODELS
-from safevar_sumo.questions.opinion import judge_causes
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
@@ -249,19 +247,3 @@ def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() ->
     asked = [(file, name) for file, names in files.items() for name in names]
     assert asked != [], "some ask in their own file"
     assert [(file, name) for file, name in asked if shipped[name] != file] == []
-
-
-@pytest.mark.slow
-def test_a_second_opinion_on_models_in_a_users_file_is_the_same(in_tmp: Path) -> None:
-    ours = load_study(
-        "wear", matrix=None, scenario={"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
-    )
-    scenario = msgspec.structs.replace(ours.scenario, model=copied(SCENARIOS["crossing"], in_tmp))
-    vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES["worn"], in_tmp))
-    theirs = msgspec.structs.replace(ours, scenario=scenario, vehicle=vehicle)
-    causes = pd.DataFrame(
-        {"solution": ["a"], "changes": [{"brakeTorque": 0.5}], "fraction": [0.5], "robust_share": [1.0]}
-    )
-    frames = [judge_causes(study, causes, Unsafe())[0] for study in (ours, theirs)]
-    assert frames[0]["opinion"].tolist() != ["outside"]
-    pd.testing.assert_frame_equal(*frames)

@@ -206,16 +206,6 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     assert found.simulated <= 5000
 
 
-@pytest.mark.slow
-def test_a_second_model_judges_a_cause_in_its_encounter() -> None:
-    """Where it collides with our model, and the original vehicle does not."""
-    rows = json_of("opinion", "results")["tables"]["settings"]["rows"]
-    assert rows
-    assert {one["a_outcome"] for one in rows} == {"collision"}
-    assert all(8 <= one["encounter"]["distance"] <= 18 for one in rows)
-    assert all("our model it collides" in one["because"] for one in rows)
-
-
 def test_changes_are_those_of_the_vehicle(case: Case) -> None:
     tables = json_of("tables", "results")["tables"]
     solutions = case.solutions[case.solutions["algorithm"] == "nsga2"]

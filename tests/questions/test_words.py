@@ -33,7 +33,6 @@ TYPED = (
     ("rules", "tiny.toml", "--samples", "512"),
     ("explain", "tiny.toml", "--fits", "2", "--top", "2", "--limit", "500"),
     ("explain", "results", "--fits", "2", "--top", "2", "--limit", "500"),
-    ("opinion", "results"),
     ("compare", "tiny.toml", "rain", "--samples", "64"),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW, "--limits", "tireFric >= 3"),
@@ -99,7 +98,6 @@ def test_half_of_the_originals_is_said_by_every_question(tmp_path: Path, monkeyp
     monkeypatch.chdir(tmp_path)
     assert load_cases(["results"])[0].unsafe.is_half
     for typed in (
-        ("opinion", "results"),
         ("explain", "results", "--fits", "0", "--limit", "200", "--top", "1"),
         ("risk", "results", "--samples", "64"),
         ("rules", "results", "--samples", "64"),
