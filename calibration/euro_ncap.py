@@ -74,7 +74,6 @@ def block(sheet, frame, name: str) -> list[str]:
         *([f'light = "{light}"'] if light else []),
         f'measure = "{measure(name)}"',
         f'sheet = "{sheet.title}"',
-        f'name_cell = "A{top - 2}"',
         f'first_cell = "{sheet.cell(top, left).coordinate}"',
         *(
             [f'function_column = "{sheet.cell(top, headings["Function"]).column_letter}"']

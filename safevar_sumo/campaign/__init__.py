@@ -18,5 +18,4 @@ from safevar_sumo.campaign.runs import (
     algorithm_of as algorithm_of,
     all_runs as all_runs,
     problem_of as problem_of,
-    random_generator_of as random_generator_of,
 )

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import FINITE, Legal, UserCode, quoted
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import ORIGINAL_DEGREE, unit_text
+from safevar_sumo.study import ORIGINAL_DEGREE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,8 +67,6 @@ class Measure(Struct, frozen=True, kw_only=True):
         Whether colliding solutions count.
     description
         One sentence.
-    head
-        Heading of the measure's column in tables, by default title and unit.
     of
         What it measures: `runs` or `settings`.
     function
@@ -83,14 +81,8 @@ class Measure(Struct, frozen=True, kw_only=True):
     more_is_unsafe: bool = False
     over_collisions: bool = True
     description: str = ""
-    head: str = ""
     of: Literal["runs", "settings"] = "runs"
     function: Any = None
-
-    @property
-    def heading(self) -> str:
-        """`head`, by default title and unit."""
-        return self.head or self.title + unit_text(self.unit, ", {}")
 
     @property
     def sign(self) -> float:
@@ -166,10 +158,6 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
         """Whether the simulation succeeded, every objective is defined and the setting is feasible; shape (M,)."""
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
         return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
-
-    def metric(self, name: str) -> Measure:
-        """A metric by name."""
-        return next(metric for metric in self.metrics if metric.name == name)
 
 
 F_SAFE = Measure(name="f_safe", title="safety degree", unit="m, -m/s")

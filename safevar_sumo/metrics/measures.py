@@ -29,7 +29,6 @@ SAFETY_DEGREE_METRIC = Measure(
     name=SAFETY_DEGREE,
     title="SD",
     unit="m, or -m/s",
-    head="SD",
     function=safety_degree,
     description="Least separation during the encounter [m, > 0], or minus a collision's closing speed [m/s, < 0].",
 )

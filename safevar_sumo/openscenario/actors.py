@@ -232,11 +232,11 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
         width = number(size, "width")
         if not (0 < length <= 100 and 0 < width <= 100):
             raise unsupported(f"{name} is {length:g} m long and {width:g} m wide", "sizes above 0, up to 100 m")
-        shape = Shape(_kind(body, length), length, width, number(middle, "x"), number(middle, "y", 0.0))
+        shape = Shape(_kind(body), length, width, number(middle, "x"), number(middle, "y", 0.0))
         yield Actor(name, shape, n_samples)
 
 
-def _kind(body: Element, length: float) -> str:
+def _kind(body: Element) -> str:
     """What sumo-gui draws, and whether it is a person there."""
     if body.tag == "Pedestrian":
         height = number(part(body, "BoundingBox/Dimensions"), "height", 2.0)

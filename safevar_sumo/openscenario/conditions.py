@@ -30,9 +30,9 @@ LEFT_TO_RUNS = frozenset((*REACTIONS, "EndOfRoadCondition", "OffroadCondition"))
 """The same, and conditions that never hold for an Ego that drives straight on."""
 
 
-def compared(condition: Element, values: Array, limit: str = "value", otherwise: str = "equalTo") -> Array:
+def compared(condition: Element, values: Array) -> Array:
     """Where values satisfy the condition's rule."""
-    return RULES[condition.get("rule", otherwise)](values, number(condition, limit))
+    return RULES[condition.get("rule", "equalTo")](values, number(condition, "value"))
 
 
 def holds(player: Player, trigger: Element | None, window: slice) -> Array:

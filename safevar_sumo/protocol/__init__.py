@@ -3,7 +3,6 @@
 from safevar_sumo.protocol.cells import (
     COLOURS as COLOURS,
     EURO_NCAP_2026 as EURO_NCAP_2026,
-    Cell as Cell,
     CellMatrix as CellMatrix,
     Protocol as Protocol,
     protocol_of as protocol_of,

@@ -23,7 +23,7 @@ COLOURS = ("green", "yellow", "orange", "brown", "red")
 STANDARD, EXTENDED = "standard", "extended"
 NOT_RED = "Not red"
 """One of the two criteria of conditions; the other one is "Same or better than predicted"."""
-MITIGATION, WARNING = "mitigation", "warning"
+WARNING = "warning"
 NIGHT = "Illumination (Night)"
 SPEED, ACCELERATION, OFFSET, HEADING = "Speed", "Acceleration", "Initial position offset", "Trajectory/Heading"
 IN_DARKNESS = "Performance in darkness (1 lux)"
@@ -55,15 +55,14 @@ class CellRow(Struct, frozen=True, forbid_unknown_fields=True):
 class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True):
     """A matrix of a test; a test that is driven by day and by night has one matrix for each `light`.
 
-    In the official template the matrix is on `sheet`, its name in `name_cell`, its first colour in `first_cell`, and
-    the function of each row (AEB or FCW) in the column with the letter `function_column`. `points` are those of the
-    standard range, the extended range and robustness.
+    In the official template the matrix is on `sheet`, its first colour in `first_cell`, and the function of each row
+    (AEB or FCW) in the column with the letter `function_column`. `points` are those of the standard range, the extended
+    range and robustness.
     """
 
     test_name: str
     measure: Literal["mitigation", "avoidance"]
     sheet: str
-    name_cell: str
     first_cell: str
     points: tuple[float, float, float]
     rows: tuple[CellRow, ...]
@@ -225,7 +224,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         rows = []
         for cell in self.cells:
             starts = self.starts_by_measure.get(cell.judged_by)
-            if starts is None:  # MITIGATION
+            if starts is None:  # mitigation
                 starts = self.starts_by_vut_speed[str(min(int(cell.vut_speed), fastest))]
             rows.append([starts.get(colour, np.inf) for colour in COLOURS])
         return np.array(rows)

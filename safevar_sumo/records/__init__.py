@@ -9,7 +9,6 @@ from safevar_sumo.records.driving import (
     TIME_DECIMALS as TIME_DECIMALS,
     TIME_ROUNDING as TIME_ROUNDING,
     TOUCH_OVERLAP as TOUCH_OVERLAP,
-    UNDEFINED as UNDEFINED,
     ZERO as ZERO,
     BoolArray as BoolArray,
     Command as Command,

@@ -88,11 +88,6 @@ class Evaluations:
         return self.metrics.get(name, np.full(len(self), np.nan))
 
     @property
-    def objectives(self) -> FloatArray:
-        """The published study's three objectives, all minimised, shape (M, 3)."""
-        return np.stack([self.f_safe, self.f_diff, self.f_num_diff], axis=1)
-
-    @property
     def collided(self) -> BoolArray:
         return np.asarray(self.outcome == Outcome.COLLISION.value)
 

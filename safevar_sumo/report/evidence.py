@@ -111,7 +111,7 @@ def _pack_study(
     manifest = read_manifest(directory)
     manifest.pop("folders", None)  # of this machine
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
-    asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown, directory)]
+    asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
     questions = list(dict.fromkeys(asked))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)

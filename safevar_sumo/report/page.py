@@ -116,10 +116,7 @@ def report(
     answer_question = answer_to if ask else answer_or_reason
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
-    asked = [
-        alone if ask else usual_questions(case, path, point, unsafe)
-        for case, path in zip(by_criterion, paths, strict=True)
-    ]
+    asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
 
@@ -157,7 +154,7 @@ def report(
     return out
 
 
-def usual_questions(case: Case, directory: Path, point: str | None = None, unsafe: Criterion = None) -> list[str]:
+def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = None) -> list[str]:
     """The questions of a page about results; that of a rated study is about its points, with the variant that loses
     some by the fewest changes. Where the study has speeds, the second asks the limits up to some of them.
     """

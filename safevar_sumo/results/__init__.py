@@ -9,7 +9,6 @@ from safevar_sumo.results.load import (
     CHOICES as CHOICES,
     Failure as Failure,
     SolutionId as SolutionId,
-    StoredResults as StoredResults,
     choose_handle as choose_handle,
     failure_lines as failure_lines,
     failures_of as failures_of,

@@ -7,7 +7,6 @@ import msgspec
 from safevar_sumo.errors import check_name
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
-    LOCATION_DIMENSION as LOCATION_DIMENSION,
     SPEED_DIMENSION as SPEED_DIMENSION,
     VUT as VUT,
     Point as Point,

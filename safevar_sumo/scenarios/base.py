@@ -270,7 +270,7 @@ class WorldScenario(Scenario):
         raise NotImplementedError
 
 
-SPEED_DIMENSION, LOCATION_DIMENSION = "speed", "impact_location"
+SPEED_DIMENSION = "speed"
 """Keys of a point that are rows and columns where `simulate` tabulates a matrix."""
 
 

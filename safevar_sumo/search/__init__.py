@@ -5,11 +5,7 @@ from collections.abc import Mapping
 from safevar_sumo.search.base import Algorithm as Algorithm, Problem as Problem, Search as Search
 from safevar_sumo.search.baselines import RandomSearch, SafeFuzzer
 from safevar_sumo.search.genetic import Nsga2
-from safevar_sumo.search.pymoo import (
-    PYMOO_ALGORITHMS as PYMOO_ALGORITHMS,
-    PymooAlgorithm as PymooAlgorithm,
-    pymoo_algorithm as pymoo_algorithm,
-)
+from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS as PYMOO_ALGORITHMS, pymoo_algorithm as pymoo_algorithm
 from safevar_sumo.study import PYMOO
 
 ALGORITHMS: Mapping[str, type[Algorithm]] = {"nsga2": Nsga2, "rs": RandomSearch, "safe_fuzzer": SafeFuzzer}

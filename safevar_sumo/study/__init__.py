@@ -37,7 +37,6 @@ from safevar_sumo.study.schema import (
     MetricsTable as MetricsTable,
     ModelTable as ModelTable,
     Origin as Origin,
-    RatingTable as RatingTable,
     ScenarioTable as ScenarioTable,
     SearchTable as SearchTable,
     Study as Study,

@@ -177,13 +177,13 @@ def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]
     return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
-def simulate(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> SimulationRuns:
+def simulate(system: System, settings: FloatArray) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n).
 
     In a matrix, all settings run at the worst point of the last one: others may stand before it, such as the original.
     Raises the errors of `drive_all`.
     """
-    return drive_all(system.at(worst_point(system, settings[-1])), settings, engine)
+    return drive_all(system.at(worst_point(system, settings[-1])), settings)
 
 
 def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:

@@ -217,10 +217,6 @@ class Vehicle:
         """
         return None
 
-    def friction(self, prepared: Prepared, speed: FloatArray) -> FloatArray | None:
-        """The friction coefficient of tyres and road at speeds [m/s], shape (N,); None if it is the same at all."""
-        return None
-
     def compile(self, *, only_load: bool = False) -> bool:
         """Compile what `advance` calls, or with `only_load` take it only from an earlier process; returns whether it is
         ready.

@@ -116,18 +116,16 @@ class FeasibleRegion:
             problem = f"violates a constraint: {quantity} ({values})"
             raise InputError("", problem, bound.condition + otherwise)
 
-    def repaired(self, settings: FloatArray, *, filtered: bool = True) -> FloatArray:
-        """Settings moved towards the original until they are feasible, shape (N, n); if `filtered`, feasible after the
-        filter.
-        """
+    def repaired(self, settings: FloatArray) -> FloatArray:
+        """Settings moved towards the original until they are feasible after the filter, shape (N, n)."""
         repaired = settings.copy()
         original = self.characteristics.original
-        infeasible = np.flatnonzero(~self._are_accepted(settings, filtered))
+        infeasible = np.flatnonzero(~self._are_accepted(settings, filtered=True))
         for share in np.arange(N_REPAIR_SHARES - 1, -1, -1) / N_REPAIR_SHARES:
             if not len(infeasible):
                 break
             repaired[infeasible] = original + share * (settings[infeasible] - original)
-            infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered)]
+            infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered=True)]
         return repaired
 
     def draw_feasible(self, draw: Callable[[int], FloatArray], number: int, *, filtered: bool = False) -> FloatArray:

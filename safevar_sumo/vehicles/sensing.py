@@ -302,14 +302,10 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             frame = np.where(is_lost, state.frame, frame)
         return sensed._replace(**dict(zip(DELAYED, frame, strict=True))), state._replace(frame=frame)
 
-    def friction(self, prepared: _PreparedWorn, speed: FloatArray) -> FloatArray:
-        """The friction coefficient at speeds [m/s], shape (N,)."""
-        return lifted_friction(prepared.grip, prepared.lift, speed)
-
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
         p = prepared
         ones = np.ones_like(prepared.mass)
-        grip = self.friction(p, 0 * ones)
+        grip = lifted_friction(p.grip, p.lift, 0 * ones)
         limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, ones, grip)
         return SumoType(p.mass, *limits, self.max_speed * ones, p.brake_delay + p.step)
 
@@ -317,7 +313,8 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray
     ) -> FloatArray:
         # The speed in the middle of the step, as if the vehicle went on as in the last one.
-        grip = self.friction(p, state.speed + 0.5 * p.step * (state.acceleration - p.slope.back))
+        speed = state.speed + 0.5 * p.step * (state.acceleration - p.slope.back)
+        grip = lifted_friction(p.grip, p.lift, speed)
         drive = np.minimum(throttle * p.drive, grip * p.slope.down)
         return np.where(brake > 0, -self._deceleration(p, brake, grip), drive)
 

@@ -146,7 +146,7 @@ def test_a_setting_that_sumo_refuses_is_told_from_the_others(fail: Callable[...,
     assert np.array_equal(result.valid, ~np.isin(settings(8)[:, 0], (4302, 4305)))
     assert result.outcome[2] == Outcome.SIMULATOR_ERROR
     assert result.reason(2) == "SUMO failed: no place"
-    assert np.isnan(result.objectives[2, 0])
+    assert np.isnan(result.f_safe[2])
     assert np.array_equal(result.f_safe[result.valid], evaluated(settings(8)).f_safe[result.valid])
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
 

@@ -20,7 +20,6 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import across_fits, explain, failures
 from safevar_sumo.questions.explain.across_fits import are_causes, ranges_across_fits
 from safevar_sumo.questions.explain.causes import (
-    RESOLUTION,
     BoundaryState,
     Limits,
     causes_of_runs,
@@ -47,6 +46,9 @@ from tests.questions.conftest import (
     nowhere,
     two_islands,
 )
+
+RESOLUTION = 1 / 16_384
+"""Accuracy of a boundary that `find_boundary_shares` promises, as a share of the line."""
 
 
 @pytest.mark.slow

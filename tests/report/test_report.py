@@ -227,24 +227,24 @@ def test_the_sentence_about_a_model_is_whole() -> None:
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
-    assert [text.partition(" ")[0] for text in usual_questions(case, Path())] == [one.partition(" ")[0] for one in ASK]
+    assert [text.partition(" ")[0] for text in usual_questions(case)] == [one.partition(" ")[0] for one in ASK]
     limited = replace(case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}}))
-    assert usual_questions(limited, Path())[-1] == "repair"
+    assert usual_questions(limited)[-1] == "repair"
     rated = replace(case, study=load_study("euro_ncap_rating"))
     none = rated.solutions.iloc[:0]
-    assert usual_questions(replace(rated, solutions=none), Path()) == ["rating"]
-    assert usual_questions(rated, Path(), "a point")[0] == "tolerance"
+    assert usual_questions(replace(rated, solutions=none)) == ["rating"]
+    assert usual_questions(rated, "a point")[0] == "tolerance"
 
 
 def test_a_study_that_has_speeds_is_asked_for_the_limits_up_to_some_of_them(case: Case) -> None:
     """Those of all tests of a matrix; of a domain from 10 to 60 whose original is 40 the middle, that and the end."""
     wear, joint = (replace(case, study=load_study(name)) for name in ("wear", "wear_joint"))
-    assert usual_questions(wear, Path())[1] == "tolerance --by speed=10,20,30,40"
-    assert usual_questions(joint, Path())[1] == "tolerance --by speed=25,40,60"
+    assert usual_questions(wear)[1] == "tolerance --by speed=10,20,30,40"
+    assert usual_questions(joint)[1] == "tolerance --by speed=25,40,60"
     stops = replace(case, study=load_study("stop"))
-    assert usual_questions(stops, Path())[1] == "tolerance --by speed=30,80,120", "every second point: at most four"
+    assert usual_questions(stops)[1] == "tolerance --by speed=30,80,120", "every second point: at most four"
     for options in ({"point": "CPFA, speed 10"}, {"unsafe": "drac > 6"}):
-        assert [text.split()[0] for text in usual_questions(wear, Path(), **options)].count("tolerance") == 1
+        assert [text.split()[0] for text in usual_questions(wear, **options)].count("tolerance") == 1
 
 
 @pytest.mark.slow

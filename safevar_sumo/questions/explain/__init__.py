@@ -132,7 +132,7 @@ def explain(
     tables = {
         "causes": causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
-        **statistics_tables(evaluator, needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
+        **statistics_tables(needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
         "margins": tabulate("By the margin of the original", MARGINS, find_margins(population, evaluator, limit)),
         "moved": moved_table(evaluator, of_chosen),
         "distinct_causes": distinct_table(evaluator, [causes[row] for row in sample]),

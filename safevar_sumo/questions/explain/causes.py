@@ -203,8 +203,6 @@ PARTS_PER_ROUND = 8
 """Number of parts into which each further round divides the interval with the boundary."""
 ROUNDS = 3
 """Number of rounds after the first."""
-RESOLUTION = 1 / (LINE_SETTINGS * PARTS_PER_ROUND**ROUNDS)
-"""Accuracy of a boundary, as a share of the line."""
 
 
 class BoundaryState(StrEnum):
@@ -293,9 +291,9 @@ def find_boundary_shares(
 
     A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`, shape (M,), on, and
     its end must be unsafe. Each round simulates the bounds between equal parts of the interval from `low` to `high`,
-    and keeps the part below the first unsafe one. The error is at most `RESOLUTION` times the line above `lowest`. A
-    setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
-    `NOT_SIMULATED`.
+    and keeps the part below the first unsafe one. The error is at most 1 / 16,384 of the line above `lowest`: one part
+    of the last round. A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the
+    state `NOT_SIMULATED`.
     """
     lines = np.arange(len(starts))
     always = np.ones(len(starts), dtype=bool)

@@ -138,7 +138,7 @@ def causes_table(
 
 
 def statistics_tables(
-    evaluator: Evaluator, needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
+    needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
 ) -> dict[str, pd.DataFrame]:
     """The tables of characteristics and of drivers, with ranges over the fitted vehicle models."""
     in_fits = Column("-", "range over the fitted vehicle models", ".2f")

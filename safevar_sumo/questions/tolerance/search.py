@@ -70,7 +70,6 @@ class BoxGeometry:
     def __init__(self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]) -> None:
         members = region.characteristics
         self.region = region
-        self.columns = columns
         self.original = members.original
         is_varied = np.isin(range(len(members)), columns)
         self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied

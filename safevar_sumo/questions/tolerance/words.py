@@ -70,7 +70,7 @@ def verdict_sentences(
         yield f"Of the encounters over the domain {share} are left out, {margin}."
         yield from contacts_in_words(models.own.evaluator, contacts)
     if together is not None:
-        yield from _fits_in_words(models, together, bool(limits))
+        yield from _fits_in_words(models, together)
         yield from _nearest_in_words(nearest)
         yield from _box_in_words(models, together, bool(limits), budget)
     yield f"Scope: {scope_of(study, between=budget > 0)}."
@@ -82,7 +82,7 @@ def verdict_sentences(
         yield "No single characteristic makes it unsafe."
 
 
-def _fits_in_words(models: Models, together: LimitsTogether, has_limits: bool) -> Iterator[str]:
+def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
     """In which fits the specified limits do not hold, and which fits do not count."""
     if together.broken and len(models.members) > 1:
         kept = f"{len(together.members)} of {len(models.members)}"
