@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 
+from safevar_sumo.questions.sampling import Stream
 from tests.in_process import ROOT
 
 
@@ -40,3 +42,12 @@ def test_an_exchange_is_one_thing() -> None:
     exchange, pair = (ast.parse(f"def f():\n    {line}") for line in ("a, b = b, a", "a, b = b, 1"))
     assert not [*unrelated_assignments(exchange)]
     assert len([*unrelated_assignments(pair)]) == 1
+
+
+def test_no_two_uses_of_random_numbers_share_a_stream() -> None:
+    """Nor is one a number without a name; two share theirs, as answers depend on it."""
+    numbered = re.compile(r"default_rng\(\(.*\d|= [\w.]*seed, \d")
+    texts = [path.read_text() for path in (ROOT / "safevar_sumo" / "questions").rglob("*.py")]
+    assert not [line for text in texts for line in numbered.findall(text)]
+    shared = [name for name, stream in Stream.__members__.items() if name != stream.name]
+    assert shared == ["WIDER_SCOPE_FROM"]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
+from safevar_sumo.questions.sampling import CONFIDENCE, Stream, sobol_points
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import FeasibleRegion
 
@@ -71,7 +71,7 @@ class Box:
         if not (~of_vehicle & is_open).any():
             return self.at(points)
         points = np.tile(points, (MET_BY_CORNERS // len(points), 1))
-        places = np.random.default_rng((seed, 3, attempt)).random(points.shape)
+        places = Stream.ENCOUNTERS_AT_CORNERS.generator(seed, attempt).random(points.shape)
         return self.at(np.where(of_vehicle, points, places))
 
 

@@ -15,6 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -159,13 +160,14 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_un
 
 
 def with_points_between(
-    model: Model, unsafe: Unsafe, rng: np.random.Generator, cells: Sequence[MatrixTest] | None = None
+    model: Model, unsafe: Unsafe, count: int, cells: Sequence[MatrixTest] | None = None
 ) -> tuple[Model, int]:
     """A model whose study also has points between those of its matrix, or of other `cells`, drawn at random, and the
     number of those left out: points at which the original itself is unsafe, by a criterion that may be stricter than
-    the model's.
+    the model's. For another `count` the points are others.
     """
     study = model.evaluator.study
+    rng = Stream.TESTS_BETWEEN.generator(study.search.seed, count)
     tests = tests_between(study, rng, cells)
     if not tests:
         return model, 0

@@ -1,8 +1,9 @@
-"""Points that cover a domain evenly, and what a sample says about a share."""
+"""Random numbers, points that cover a domain evenly, and what a sample says about a share."""
 
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 
 import numpy as np
 
@@ -13,6 +14,36 @@ Interval = tuple[float, float]
 """Lower and upper end."""
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
+
+
+class Stream(IntEnum):
+    """What random numbers are drawn for: what one use draws does not depend on the others.
+
+    Results depend on the numbers of the streams; a new use takes a new number.
+    """
+
+    CONFIDENCE_BOUND = 1  # vehicles within joint limits, for the upper confidence bound
+    LARGER_BOXES = 2  # steps from the largest safe box that is known to larger ones
+    ENCOUNTERS_AT_CORNERS = 3  # encounters that the corners of a box meet
+    JOINT_LIMITS = 4  # falsification of joint limits
+    TESTS_BETWEEN = 5  # test cases between those of a matrix
+    LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
+    REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
+    NEAREST_LIMIT = 8  # falsification of a limit in place of a specified one that does not hold
+    WIDER_SCOPE = 9  # falsification of limits in the scope of a wider study
+    WIDER_SCOPE_FROM = WIDER_SCOPE  # the same, for the lowest value at which they fail there
+    EXTENSION = 10  # falsification of joint limits of which one is extended
+    SPECIFIED_BETWEEN = 11  # falsification of specified limits between two values of a parameter
+    SPECIFIED_UP_TO = 12  # the same, up to the largest value at which they hold
+    ORIGINAL_UP_TO = 13  # falsification of how far the original vehicle itself is safe
+    LEFT_OUT = 14  # search for contacts in encounters that do not count
+    VALIDATION = 15  # further falsifications of joint limits that passed one
+    ORDERS_OF_CUTS = 16  # orders in which counterexamples are cut off a box
+    FIRST_CORNERS = 17  # corners with which the test of joint limits begins
+
+    def generator(self, seed: int, *counts: int) -> np.random.Generator:
+        """The generator of a draw, by the seed of the study's search and what counts the draws."""
+        return np.random.default_rng((seed, self, *counts))
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:

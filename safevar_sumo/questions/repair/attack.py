@@ -10,6 +10,7 @@ import numpy as np
 from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
 from safevar_sumo.questions.repair.problem import RepairProblem
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
 BUDGET = 5000
@@ -28,6 +29,7 @@ def find_failures(problems: Sequence[RepairProblem], change: FloatArray, known: 
     counts the attacks, for their random numbers.
     """
     own = problems[0]
+    # These numbers are of no `Stream`: repairs depend on them.
     rng = np.random.default_rng((own.study.search.seed, number))
     judges = [partial(problem.left, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
@@ -54,7 +56,7 @@ def prove_change(
         left = own.left(change, settings, PROOF_STAGE)
         return Judgement(left < 0, np.zeros(len(left), dtype=bool), np.isfinite(left))
 
-    rng = np.random.default_rng((seed, 7, number))
+    rng = Stream.REPAIRED_BOUND.generator(seed, number)
     size = proof_size(attempt, MAX_UNSAFE_SHARE)
     with own.evaluator.stage(PROOF_STAGE, size if len(problems) == 1 else 2 * size):
         proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)

@@ -262,8 +262,7 @@ def _denser(models: Models, attack: int) -> list[Any]:
     if not attack:
         return [*models.members]
     own = models.own
-    seed = models.own.evaluator.study.search.seed
-    return [with_points_between(model, own.unsafe, np.random.default_rng((seed, 5, 0)))[0] for model in models.members]
+    return [with_points_between(model, own.unsafe, 0)[0] for model in models.members]
 
 
 def _is_refuted(together: LimitsTogether, failures: FloatArray) -> bool:

@@ -13,7 +13,7 @@ from safevar_sumo.questions.boundary import Move, find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.questions.sampling import Interval, Stream
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import Characteristic
@@ -219,7 +219,7 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
     for number in range(ATTACKS):
         boxes = list[Box]()
         known = list[list[FloatArray]]()
-        rngs = [np.random.default_rng((seed, 6, each.column, number)) for each in waiting]
+        rngs = [Stream.LIMITS_ALONE.generator(seed, each.column, number) for each in waiting]
         for each, rng in zip(waiting, rngs, strict=True):
             lower = np.where(members.of_vehicle, members.original, members.lower)
             upper = np.where(members.of_vehicle, members.original, members.upper)

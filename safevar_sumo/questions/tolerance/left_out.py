@@ -16,6 +16,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, reach
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, largest_tried
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION
@@ -92,8 +93,8 @@ def original_reach(evaluator: Evaluator, by: Parameter, unsafe: Unsafe) -> Origi
     reaches = list[float | None]()
     for demanded in (study.scenario.margin, 0.0):
         original = Model(0, evaluator, replace(contact, keep=demanded), every_point)
-        seed = study.search.seed, 13
-        reaches.append(reach(box, column, [original], LEAST_SIMULATIONS, seed, STAGE).value)
+        stream = study.search.seed, Stream.ORIGINAL_UP_TO
+        reaches.append(reach(box, column, [original], LEAST_SIMULATIONS, stream, STAGE).value)
     return OriginalReach(*reaches)
 
 
@@ -114,8 +115,8 @@ def contacts_left_out(models: Sequence[Model], boxes: Sequence[Box], name: str =
         left_out.append(_LeftOut(Model(model.fit, model.evaluator.for_study(nearer, verified=0), unsafe), demanded))
     found = list[FloatArray]()
     for number, box in enumerate(boxes):
-        seed = study.search.seed, 14, number
-        failures = reach(box, column, left_out, LEAST_SIMULATIONS, seed, STAGE).failures
+        stream = study.search.seed, Stream.LEFT_OUT, number
+        failures = reach(box, column, left_out, LEAST_SIMULATIONS, stream, STAGE).failures
         found += [rows for _, rows in failures]
     if not found:
         return Contacts(0)

@@ -16,6 +16,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, Reach, enough, falsify, reach
 from safevar_sumo.questions.models import Model, Models, models_of, with_points_between
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond
 from safevar_sumo.questions.tolerance.by_parameter import (
     Parameter,
@@ -39,8 +40,10 @@ SEARCHED_VALUES, VALUES_OF_FITS = 51, 5
 """Numbers of values, over what is safe up to the value below, at which a characteristic is scanned in many encounters:
 with the study's own fit, and with each.
 """
-FURTHER_SEEDS = ((5, 1), (5, 2))
-"""Seeds of further points between those of a matrix, at which limits alone are tried as they are printed."""
+POINT_SETS = 3
+"""Number of sets of points between those of a matrix: limits alone are found at the first, and tried at
+the others as they are printed.
+"""
 STAGE = "specified limits up to a value"
 
 
@@ -162,7 +165,7 @@ class LevelSearch:
         scans = scan(own.evaluator, self.columns, self.unsafe, within, numbers[0])
         if any(one.safe is None for one in scans):
             return Level(value, None, models)
-        judges, *further = [self._judges(models, low, value, seed) for seed in ((5, 0), *FURTHER_SEEDS)]
+        judges, *further = [self._judges(models, low, value, count) for count in range(POINT_SETS)]
         inside = self._inside(known, own.evaluator)
         search = AloneSearch(scans, self.columns, judges, numbers[1])
         search.meet([own], inside)
@@ -194,16 +197,12 @@ class LevelSearch:
             members.append(model._replace(evaluator=model.evaluator.for_study(of_fit, verified=0)))
         return self.whole._replace(members=tuple(members))
 
-    def _judges(self, models: Models, low: float | None, high: float, seeds: tuple[int, int]) -> Sequence[Model]:
-        """The models, with further points between those of a matrix if there is an attack."""
+    def _judges(self, models: Models, low: float | None, high: float, count: int) -> Sequence[Model]:
+        """The models, with points between those of a matrix if there is an attack."""
         if not self.budget or self.whole is not None:
             return models.members
         cells = cells_between(self.evaluator.study, self.by, low, high)
-        seed = self.evaluator.study.search.seed
-        return [
-            with_points_between(model, self.unsafe, np.random.default_rng((seed, *seeds)), cells)[0]
-            for model in models.members
-        ]
+        return [with_points_between(model, self.unsafe, count, cells)[0] for model in models.members]
 
     def up_to(self, value: float, settings: FloatArray) -> FloatArray:
         """Those of M settings, shape (M, n), whose encounter is up to a value of the searched parameter."""
@@ -229,8 +228,8 @@ class LevelSearch:
         """The falsification of the specified limits between two values, up to one that is printed."""
         box = self._promise(models.own)
         tested = (self.column, value) if self.is_searched else None
-        seed = self.evaluator.study.search.seed
-        return falsify(box, judges, enough(self.budget), (seed, 11, 0), STAGE, tested)
+        stream = self.evaluator.study.search.seed, Stream.SPECIFIED_BETWEEN, 0
+        return falsify(box, judges, enough(self.budget), stream, STAGE, tested)
 
     def reach(self, levels: Sequence[Level]) -> Reach[Model]:
         """The value up to which the specified limits hold, at most that up to which the original keeps its margin:
@@ -255,9 +254,10 @@ class LevelSearch:
                 upper = box.upper.copy()
                 upper[self.column] = high
                 box = Box(box.region, box.lower, upper)
-                seed = self.evaluator.study.search.seed
+                models = level.models.members
+                stream = self.evaluator.study.search.seed, Stream.SPECIFIED_UP_TO
                 failures = level.failures or ()
-                found = reach(box, self.column, level.models.members, enough(self.budget), (seed, 12), STAGE, failures)
+                found = reach(box, self.column, models, enough(self.budget), stream, STAGE, failures)
                 last = last if found.value is None else found
             break
         return last

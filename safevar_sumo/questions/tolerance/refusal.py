@@ -11,6 +11,7 @@ import numpy as np
 from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import Characteristic
 
@@ -61,7 +62,7 @@ def _attacked(
     step = max((item.upper - item.lower) / 50, 10.0**-item.digits)
     while True:
         value = item.rounded(value, upwards=side == 0)
-        rng = np.random.default_rng((models.own.evaluator.study.search.seed, 8, side))
+        rng = Stream.NEAREST_LIMIT.generator(models.own.evaluator.study.search.seed, side)
         found = attack(_box(models, limits, item, side, value), judges, [], ATTACK, rng)
         if not (found.left < 0).any():
             return value

@@ -9,6 +9,7 @@ import numpy as np
 
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.system import assemble
@@ -312,7 +313,7 @@ class BoxSearch(BoxGeometry):
 
         `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated at their corners.
         """
-        rng = np.random.default_rng((self.seed, 2))
+        rng = Stream.LARGER_BOXES.generator(self.seed)
         best = self.shrunk(sides, start)
         for deviation in DEVIATIONS:
             larger = self._larger(best, start, deviation, rng)

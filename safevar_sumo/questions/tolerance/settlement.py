@@ -8,6 +8,7 @@ import numpy as np
 
 from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Step
 from safevar_sumo.records import FloatArray
 
@@ -91,7 +92,7 @@ class Settlement:
         beyond = [wider.lower.copy(), wider.upper.copy()]
         beyond[1 - side][column] = (box.lower, box.upper)[side][column]
         judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.first_models]
-        rng = np.random.default_rng((search.seed, 10, side, column))
+        rng = Stream.EXTENSION.generator(search.seed, side, column)
         found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
         search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
         return bool((found.left < 0).any())
@@ -111,7 +112,7 @@ class Settlement:
         choices = np.count_nonzero(search.is_free & (failures > 0), axis=(1, 2))
         if not choices.all():
             return search.printed(search.fixed)
-        rng = np.random.default_rng((search.seed, 16))
+        rng = Stream.ORDERS_OF_CUTS.generator(search.seed)
         orders = [np.argsort(choices, kind="stable"), *(rng.permutation(len(failures)) for _ in range(ORDERS))]
         cuts = [
             self._cut_off(sides, failures[order], CLEARANCE + RETREAT * attempts)

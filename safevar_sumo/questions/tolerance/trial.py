@@ -12,6 +12,7 @@ from safevar_sumo.questions.attack import Attack, attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, with_points_between
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
 MAX_UNSAFE_SHARE = 0.003
@@ -76,7 +77,8 @@ class Trials:
         settings drawn at random.
         """
         corners = box.corners(self.seed, attempt)
-        some = np.random.default_rng((self.seed, 17, attempt)).permutation(corners[:MAX_CORNERS])[:FIRST_CORNERS]
+        rng = Stream.FIRST_CORNERS.generator(self.seed, attempt)
+        some = rng.permutation(corners[:MAX_CORNERS])[:FIRST_CORNERS]
         total = len(self.models) * min(len(corners), MAX_CORNERS) + self.budget
         with self.evaluator.stage(TRIAL_STAGE, total + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)):
             lefts = self._left(some, self._failing)
@@ -117,7 +119,8 @@ class Trials:
             for number in range(len(self.models))
         ]
         rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
-        found = attack(box, rows, worst, self.budget, np.random.default_rng((self.seed, 4, attempt)))
+        rng = Stream.JOINT_LIMITS.generator(self.seed, attempt)
+        found = attack(box, rows, worst, self.budget, rng)
         failures = [
             one
             for number, model in enumerate(judges)
@@ -133,7 +136,7 @@ class Trials:
         with self.evaluator.stage(TRIAL_STAGE, CONFIRMATIONS * self.budget):
             found = trial.attack
             for number in range(CONFIRMATIONS):
-                rng = np.random.default_rng((self.seed, 15, attempt, number))
+                rng = Stream.VALIDATION.generator(self.seed, attempt, number)
                 judges, _ = self._denser(attempt + number)
                 starts = [box.with_ends(STARTS // len(judges), rng) for _ in judges]
                 rows = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
@@ -150,9 +153,7 @@ class Trials:
     def _denser(self, attempt: int) -> tuple[list[Model], int]:
         """The models with points between those of a matrix, too, and the number of these that do not count."""
         own = self.models[0].unsafe
-        found = [
-            with_points_between(model, own, np.random.default_rng((self.seed, 5, attempt))) for model in self.models
-        ]
+        found = [with_points_between(model, own, attempt) for model in self.models]
         return [model for model, _ in found], found[0][1]
 
     def _prove(self, trial: Trial, attempt: int) -> Trial:
@@ -164,7 +165,7 @@ class Trials:
             failed = ~evaluations.valid & ~evaluations.infeasible
             return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
 
-        rng = np.random.default_rng((self.seed, 1, attempt))
+        rng = Stream.CONFIDENCE_BOUND.generator(self.seed, attempt)
         proof, unsafe = prove(lambda number: trial.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs)
         return trial._replace(proof=proof, failures=failures_of(model, unsafe, np.full(len(unsafe), -1.0)))
 

@@ -14,6 +14,7 @@ from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify, reach
 from safevar_sumo.questions.models import Model, Models, limit_criterion, models_of
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.left_out import leading_parameter
@@ -74,14 +75,16 @@ def wider_rows(
     if together.box is None and not limits:
         return []
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
-    seed = study.search.seed, 9
+    seed = study.search.seed
     with other.stage(WIDER_STAGE, budget):
-        found = falsify(box, models.members, budget, seed, WIDER_STAGE)
+        stream = seed, Stream.WIDER_SCOPE
+        found = falsify(box, models.members, budget, stream, WIDER_STAGE)
     lowest = None
     if found.failures and study.scenario.search:
         column = other.characteristics.names.index(leading_parameter(study))
         with other.stage(WIDER_STAGE):
-            below = reach(box, column, models.members, budget, seed, WIDER_STAGE, found.failures)
+            stream = seed, Stream.WIDER_SCOPE_FROM
+            below = reach(box, column, models.members, budget, stream, WIDER_STAGE, found.failures)
         failing = [(model, row) for model, rows in below.failures for row in rows]
         lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
