@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from safevar_sumo.errors import InputError, SafevarError, describe_error
-from safevar_sumo.plugins.time_limit import say_last_words
+from safevar_sumo.plugins.process import this_process
 
 CLUSTER = (
     "the address of a Dask scheduler, such as tcp://host:8786; for tls:// certificates in Dask's configuration: "
@@ -73,7 +73,7 @@ def _carry_out(packed_job: bytes) -> Any:
     """Carry out a job in a worker of the cluster."""
     function, arguments = pickle.loads(packed_job)
     with _libsumo_lock:
-        say_last_words(sys.__stderr__)
+        this_process.last_words = sys.__stderr__
         return function(*arguments)
 
 

@@ -20,7 +20,8 @@ from typing import Any
 
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.time_limit import TIMEOUT_MARK, say_last_words
+from safevar_sumo.plugins.process import this_process
+from safevar_sumo.plugins.time_limit import TIMEOUT_MARK
 from safevar_sumo.shipped import PACKAGE
 
 
@@ -74,7 +75,7 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
     tempfile.tempdir = str(last_words.parent)  # which ends with the pool; a worker is killed
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
-    say_last_words(file)
+    this_process.last_words = file
     threading.Thread(target=_end_with_caller, daemon=True).start()
 
 

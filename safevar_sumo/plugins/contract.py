@@ -21,6 +21,7 @@ import numpy as np
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError, about, describe_error
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.process import this_process
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 UserValue = Any
@@ -30,8 +31,6 @@ ABSTRACT = "__isabstractmethod__"
 """Attribute of an abstract method."""
 MAX_QUOTED_ELEMENTS, MAX_QUOTE = 4, 80
 """Largest size of an array, and of any other value's text [characters], that an error quotes."""
-named_files = set[str]()
-"""Files of the modules that studies name: an error has a line of theirs also where they are installed."""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside a simulation."""
 
@@ -58,7 +57,7 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
     if isinstance(error, SyntaxError) and error.filename:
         frames.append((error.filename, error.lineno, "import"))
     for file, line, name in reversed(frames):
-        if is_user_file(file) or file in named_files:
+        if is_user_file(file) or file in this_process.named_files:
             method = name.replace("<module>", "import")
             place = f"{file}:{line}"
             reason, legal = _reason_of(error)

@@ -20,16 +20,9 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, UserCodeError, check_name, describe_error, did_you_mean, one_of, subject
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins.contract import (
-    UserCode,
-    checked_class,
-    contract_of,
-    named_files,
-    user_error_of,
-    user_errors,
-    violation,
-)
+from safevar_sumo.plugins.contract import UserCode, checked_class, contract_of, user_error_of, user_errors, violation
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.process import file_of_module, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.study import Study, convert_table, data_files
 from safevar_sumo.study.schema import Parameters
@@ -46,11 +39,6 @@ class Member(NamedTuple):
     target: Any
     code: UserCode | None = None
     time_limit: float = A_DAY
-
-
-_added_folders: list[str] = []
-_user_modules: set[str] = set()
-"""Names of all modules that user code has loaded, as far as is known."""
 
 
 class Lookup:
@@ -95,7 +83,7 @@ class Lookup:
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
-        named_files.add(file_of_module(module_name))
+        this_process.named_files.add(file_of_module(module_name))
         try:
             target = getattr(module, attribute)
         except AttributeError:
@@ -163,43 +151,31 @@ class Lookup:
             raise UserCodeError("", f"{key} cannot be imported: {problem}", expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
-            _user_modules.update(sys.modules.keys() - modules_before)
+            this_process.modules |= sys.modules.keys() - modules_before
 
 
 def _derives(candidate: Any, base: type) -> bool:
     return inspect.isclass(candidate) and issubclass(candidate, base)
 
 
-def note_user_modules(names: Iterable[str]) -> None:
-    """Note modules that user code has loaded after its import, so that they are unloaded with it."""
-    _user_modules.update(names)
-
-
 def unload_user_modules() -> None:
     """Unload all modules that user code is made of, so that the next lookup loads them again."""
-    for name in _user_modules:
+    for name in this_process.modules:
         if is_user_file(file_of_module(name)):
             del sys.modules[name]
-    _user_modules.clear()
-
-
-def file_of_module(name: str) -> str:
-    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
-    interpreter.
-    """
-    module = sys.modules.get(name)
-    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
+    this_process.modules.clear()
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
     """Let modules import from `folders` and the working directory. The folders come directly before the working
     directory on Python's path: what is listed before it keeps precedence.
     """
-    sys.path[:] = [folder for folder in sys.path if folder not in _added_folders]
-    _added_folders[:] = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
+    sys.path[:] = [folder for folder in sys.path if folder not in this_process.added_folders]
+    added = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
+    this_process.added_folders = added
     indices = [i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd())]
     start = indices[0] if indices else len(sys.path)
-    sys.path[start:start] = _added_folders
+    sys.path[start:start] = added
 
 
 class ImportPath(NamedTuple):
@@ -211,11 +187,11 @@ class ImportPath(NamedTuple):
     @classmethod
     def here(cls) -> ImportPath:
         """The path of this process."""
-        return cls(sys.path[:], _added_folders[:])
+        return cls(sys.path[:], this_process.added_folders)
 
     def inherit(self) -> None:
         """Make this the path of this process."""
-        sys.path[:], _added_folders[:] = self
+        sys.path[:], this_process.added_folders = self
 
 
 @contextmanager

@@ -15,23 +15,14 @@ from typing import IO
 
 from safevar_sumo.errors import SimulationError, UserCodeError
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.process import this_process
 
 TIMEOUT_MARK = "Timeout ("
 """What the interpreter writes first when a process exceeds its time limit."""
-_last_words: IO[str] | None = None
-"""Where this process, if it is a worker, writes what it was doing when it crashed or exceeded a time limit."""
-_is_limited = False
-"""Whether a time limit is counting."""
 
 
 class _TimeIsUp(KeyboardInterrupt):
     """Passes user code as Ctrl-C does; its argument is the error for the user."""
-
-
-def say_last_words(file: IO[str] | None) -> None:
-    """Make this process a worker, which writes to a file what it was doing when it exceeds a time limit."""
-    global _last_words
-    _last_words = file
 
 
 @contextmanager
@@ -46,17 +37,17 @@ def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[Non
     SimulationError
         If no user code did.
     """
-    global _is_limited
     has_timer = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    if _is_limited or not (has_timer or _last_words is not None):
+    words = this_process.last_words
+    if this_process.is_limited or not (has_timer or words is not None):
         yield
         return
-    _is_limited = True
+    this_process.is_limited = True
     try:
-        with _end_process(time_limit, _last_words) if _last_words is not None else _raise_error(time_limit, what):
+        with _raise_error(time_limit, what) if words is None else _end_process(time_limit, words):
             yield
     finally:
-        _is_limited = False
+        this_process.is_limited = False
 
 
 @contextmanager

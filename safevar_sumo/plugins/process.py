@@ -1,4 +1,6 @@
-"""What user code uses though its text may not tell: modules imported by computed names, and files that it opens."""
+"""User code in this process: what it has changed here, and what it uses though its text may not tell: modules imported
+by computed names, and files that it opens.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +8,51 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from safevar_sumo.plugins.files import Files, digests, is_user_file, name_of_file
-from safevar_sumo.plugins.lookup import file_of_module, note_user_modules
 from safevar_sumo.shipped import PACKAGE
 
 WRITING = os.O_WRONLY | os.O_RDWR
 """Flags of a file that is not only read."""
-_opened: set[str] | None = None
-"""Paths that user code has opened to read, while they are recorded."""
-_is_listening = False
+
+
+@dataclass
+class _Process:
+    """The state of this process with regard to user code; all of its studies share it.
+
+    Attributes
+    ----------
+    added_folders
+        Folders that are on Python's path for user code.
+    modules
+        Names of all modules that user code has loaded, as far as is known.
+    named_files
+        Files of the modules that studies name: an error has a line of theirs also where they are
+        installed.
+    opened
+        Paths that user code has opened to read, while they are recorded.
+    is_listening
+        Whether this process is told of files that are opened.
+    last_words
+        Where this process, if it is a worker, writes what it was doing when it crashed or exceeded
+        a time limit.
+    is_limited
+        Whether a time limit is counting.
+    """
+
+    added_folders: list[str] = field(default_factory=list)
+    modules: set[str] = field(default_factory=set)
+    named_files: set[str] = field(default_factory=set)
+    opened: set[str] | None = None
+    is_listening: bool = False
+    last_words: IO[str] | None = None
+    is_limited: bool = False
+
+
+this_process = _Process()
 
 
 class Use(NamedTuple):
@@ -36,19 +71,18 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
     `folders` are those of the study's file and of the files that it extends; modules count from there and from the
     working directory.
     """
-    global _opened, _is_listening
-    if not _is_listening:
+    if not this_process.is_listening:
         sys.addaudithook(_listen)  # for the life of this process
-        _is_listening = True
+        this_process.is_listening = True
     use = Use({}, [])
     before = set(sys.modules)
-    opened = _opened = set[str]()
+    opened = this_process.opened = set[str]()
     try:
         yield use
     finally:
-        _opened = None
+        this_process.opened = None
     loaded = sys.modules.keys() - before
-    note_user_modules(loaded)
+    this_process.modules |= loaded
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
     files = {file for file in map(file_of_module, loaded) if is_user_file(file) and file.startswith(tuple(own_folders))}
     use.modules.update(digests((Path(file) for file in files if os.path.isfile(file)), folders))
@@ -56,14 +90,22 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
     use.opened.extend(sorted(name_of_file(Path(path), folders) for path in data if is_user_file(path)))
 
 
+def file_of_module(name: str) -> str:
+    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
+    interpreter.
+    """
+    module = sys.modules.get(name)
+    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
+
+
 def _listen(event: str, arguments: tuple[Any, ...]) -> None:
     """Note a file that user code opens to read."""
-    if event != "open" or _opened is None:
+    if event != "open" or this_process.opened is None:
         return
     path, mode, flags = arguments
     is_read = not (set(mode or "") & set("wax+") or (flags or 0) & WRITING)
     if is_read and isinstance(path, str | bytes) and _is_from_user_code():
-        _opened.add(os.path.abspath(os.fsdecode(path)))
+        this_process.opened.add(os.path.abspath(os.fsdecode(path)))
 
 
 def _is_from_user_code() -> bool:
