@@ -32,7 +32,7 @@ from safevar_sumo.questions.compare.differences import (
     compare_originals,
     compare_values,
     limits_of_both,
-    new_collision_in_words,
+    reasons_against,
 )
 from safevar_sumo.questions.compare.settings import (
     LINE,
@@ -143,9 +143,9 @@ def compare(
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
         **originals_numbers,
     }
-    refusal = new_collision_in_words(evaluators, titles)
+    refusals = reasons_against(evaluators, titles)
     sentences = [
-        *([f"{refusal}."] if refusal else []),
+        *(f"{refusal}." for refusal in refusals),
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         *_verdict(difference, titles, criteria[0], is_measured=bool(numbers["benign_scenes"])),
         _test_in_words(tested),
@@ -158,7 +158,7 @@ def compare(
         verdict=" ".join(sentences),
         numbers=numbers,
         tables={"limits": limits_table, "settings": _settings_table(common, settings)},
-        failures=(refusal,) if refusal else (),
+        failures=refusals,
         draw=partial(draw_pairs, titles=titles),
     )
 

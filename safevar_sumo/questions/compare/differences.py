@@ -179,9 +179,9 @@ def compare_originals(
     return numbers, Difference.joined(parts)
 
 
-def new_collision_in_words(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> str:
-    """A sentence on the fastest collision of B's original vehicle at a point where A's does not collide; "" without
-    one. A point that A does not have counts unless A's original vehicle collides anywhere.
+def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> tuple[str, ...]:
+    """Why B is not to be released: the fastest collision of its original vehicle at a point where A's does not collide,
+    if there is one. A point that A does not have counts unless A's original vehicle collides anywhere.
     """
     systems = [assemble(one.study) for one in evaluators]
     in_a, in_b = (
@@ -195,14 +195,13 @@ def new_collision_in_words(evaluators: Sequence[Evaluator], titles: Sequence[str
         if result.evaluations.collided[0] and not collides_in_a.get(name, any(collides_in_a.values()))
     ]
     if not new:
-        return ""
+        return ()
     speed, point = max(new, key=lambda pair: pair[0])
     where = where_in_words(systems[1].points, point, point.scenario, {})
     more = f" ({number_of(len(new), 'such point')})" if len(in_b) > 1 else ""
     a, b = titles
-    return (
-        f"Do not release {b}: its original vehicle collides at {speed:.2f} m/s{where}, where that of {a} does not{more}"
-    )
+    collision = f"its original vehicle collides at {speed:.2f} m/s{where}"
+    return (f"Do not release {b}: {collision}, where that of {a} does not{more}",)
 
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
