@@ -219,6 +219,7 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
     assert answer.numbers["kept"] is False
 
 
+@pytest.mark.slow
 def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> None:
     """The new version reacts later: its original hits somebody where that of `wear` does not."""
     file = tmp_path / "late.toml"
