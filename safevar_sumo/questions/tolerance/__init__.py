@@ -209,7 +209,7 @@ def tolerance(
         tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
     refusal = "" if is_safe else f"the original itself {criterion.breach_in_words(original)}: no limit can be kept"
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in found.broken)
-    is_kept = None if not failures and specified and not attack else not failures
+    is_kept = None if not failures and not attack else not failures
     sentences = verdict_sentences(
         models, alone, found_together, specified, found.broken, attack, nearest, wider, refusal, contacts
     )
@@ -219,7 +219,7 @@ def tolerance(
         verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
         numbers=_numbers(study, criterion, models, found_together, is_kept, attack, contacts),
         tables=tables,
-        failures=(NOT_FALSIFIED,) if is_kept is None else failures,
+        failures=(NOT_FALSIFIED,) if is_kept is None and specified else failures,
         draw=partial(_draw, scans=scans),
     )
 

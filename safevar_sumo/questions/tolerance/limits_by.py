@@ -86,11 +86,13 @@ def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach[Model]) 
     """Whether the specified limits hold up to the greatest value; without any, whether the original does. None where
     that was not tested.
     """
-    if not search.limits:
-        return levels[0].alone is not None
-    if any(level.alone is None or level.failures for level in levels):
+    if levels[0].alone is None:
         return False
-    return reach.value == search.by.values[-1] if search.budget else None
+    if search.limits and any(level.alone is None or level.failures for level in levels):
+        return False
+    if not search.budget:
+        return None
+    return not search.limits or reach.value == search.by.values[-1]
 
 
 def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> tuple[str, ...]:
@@ -98,7 +100,7 @@ def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> t
     if is_kept:
         return ()
     if is_kept is None:
-        return (NOT_FALSIFIED,)
+        return (NOT_FALSIFIED,) if search.limits else ()
     return (f"the limits hold up to {_text(search.by, reach.value)}, not {search.by.text(search.by.values[-1])}",)
 
 
@@ -244,7 +246,8 @@ def _sentences(
     failure = failure_in_words(unsafe, len(members))
     counted = _of_counted(search, by.values[-1])
     of_counted = f"{counted}," if counted else ""
-    yield f"Limits up to {values}{of_counted} hold {fits}: within them no vehicle that was tried {failure}."
+    hold = "hold" if search.budget else "were only scanned"
+    yield f"Limits up to {values}{of_counted} {hold} {fits}: within them no vehicle that was tried {failure}."
     yield _tried(search)
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:

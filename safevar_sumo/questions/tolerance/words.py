@@ -120,7 +120,8 @@ def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, bu
     decision = "All may go to their limits together"
     if has_limits:
         decision = "The limits together below hold" if together.broken else "Keeps all limits"
-        decision = decision if budget else "The specified limits were not tested; those together below hold"
+    if not budget:
+        decision = "No search for counterexamples tested the limits together below: they hold at their corners"
     yield f"{decision} {where}: within them no vehicle that was tried {failure_in_words(unsafe, count)}."
     yield f"Tried: {trial_in_words(together, budget)}."
     if names := _without_room(models, together):
