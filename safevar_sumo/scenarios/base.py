@@ -156,6 +156,8 @@ class Scenario:
     uneventful
         Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the ADS;
         "" if something does, None if only a drive can tell.
+    is_uneventful
+        In which searched encounters that is so, shape (N,): a run without a collision is an invalid test there.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -185,12 +187,15 @@ class Scenario:
         def dependence(self) -> str: ...
         @property
         def uneventful(self) -> str | None: ...
+        @property
+        def is_uneventful(self) -> Quantity | bool: ...
     else:
         pre_crash = ""
         test_speed = None
         depends_until = 0.0
         dependence = "others move as if the vehicle kept its speed"
         uneventful = None
+        is_uneventful = False
 
     @property
     def is_hit_in_front(self) -> bool:

@@ -154,6 +154,12 @@ class OpenScenario(TrackScenario):
         """Why nothing happens to an Ego that keeps its speed."""
         return self._scenes[0].uneventful
 
+    @property
+    def is_uneventful(self) -> Quantity | bool:
+        """In which of N searched encounters nothing happens to an Ego that keeps its speed, shape (N,)."""
+        are_uneventful = self._of_scenes([bool(scene.uneventful) for scene in self._scenes])
+        return are_uneventful if np.ndim(are_uneventful) else False
+
     def read_files(self, folders: Sequence[str]) -> None:
         """The file, which is refused if it has what nobody can play."""
         self.file = file_beside(self.name, folders) or self.file

@@ -13,7 +13,7 @@ from safevar_sumo.openscenario import play
 from safevar_sumo.scenarios import OpenScenario
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import MAX_VEHICLES, largest_batch
+from safevar_sumo.sumo.matrix import MAX_VEHICLES, evaluate, largest_batch
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of
 from tests.openscenario import writing
@@ -101,7 +101,7 @@ def test_what_happens_to_an_ego_that_keeps_its_speed(tmp_path: Path, scene: str)
 
 
 def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(tmp_path: Path) -> None:
-    """A pedestrian is passed at 0.75 m, by any vehicle; in a search the encounter of the original decides."""
+    """A pedestrian is passed at 0.75 m, by any vehicle; in a search the original's encounter decides on a verdict."""
     walks = event(speed(1.5), AT_V)
     file = writing.write(tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER)
     for when in (99, 3):
@@ -116,3 +116,22 @@ def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(
     assert (study.scenario.parameters["v"], why_no_verdict(assemble(study))) == (4, "")
     nowhere = load_study("wear", scenario={"file": writing.logical(tmp_path, 50, 60)})
     assert "at 2 of 2 points" in why_no_verdict(assemble(nowhere))
+
+
+def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Path) -> None:
+    """The pedestrian walks after v seconds: at 3 s in time, at 50 s never, and vehicles of that encounter are left out
+    whatever they do.
+    """
+    walks = event(speed(1.5), AT_V)
+    file = writing.write(tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER)
+    search = {"v": {"lower": 0.0, "upper": 99.0, "original": 3.0}}
+    study = load_study("wear", scenario={"file": file, "search": search})
+    system = assemble(study)
+    members = system.characteristics
+    settings = np.tile(members.original, (4, 1))
+    settings[:, members.names.index("v")] = 3.0, 50.0, 99.0, 3.0
+    settings[2:, members.names.index("treadDepth")] = 1.6
+    runs = evaluate(system, settings)
+    assert (runs.outcome == "invalid-test").tolist() == [False, True, True, False]
+    assert np.isnan(runs.f_safe[1:3]).all()
+    assert (system.measuring.scoring.violation(runs) > 0).tolist() == [False, True, True, False]
