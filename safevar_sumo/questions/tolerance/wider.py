@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe
@@ -23,8 +21,6 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit, Study, load_study
 
 WIDER_STAGE = "attack in the wider scope"
-MOST_COMPARED = 64
-"""Largest number of failures of which the worst is printed."""
 WIDER: Columns = {
     "study": "the wider study",
     "scope": Column("", "what it covers", is_shown=False),
@@ -119,9 +115,8 @@ def _verdict(
         model = models.members[int(attack.judges[0])]
         keeps = model.unsafe.value_in_words(model.unsafe.value(attack.left[0]))
         return f"they hold: the worst of {attack.simulated:,} aimed at them {keeps}.", None
-    candidates = [(model, row) for model, rows in found.failures for row in rows]
-    lefts = [float(model.left(row[np.newaxis], WIDER_STAGE)[0]) for model, row in candidates[:MOST_COMPARED]]
-    worst = candidates[int(np.argmin(lefts))]
+    # The search begins with the worst of the first settings, so its worst failure is the worst of all.
+    worst = (models.members[int(attack.judges[0])], attack.settings[0]) if len(attack.left) else None
     described = [
         failure
         for pair in (lowest, worst)
