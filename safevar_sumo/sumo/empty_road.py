@@ -10,6 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import Outcome, SimulationRuns
+from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System
 
@@ -53,7 +54,10 @@ def find_problems(system: System) -> dict[str, Problem]:
         results = simulate_all_points(replace(system, sees_nobody=True), original)
     except SimulationError:  # the study's own simulations decide, and report their errors
         return {}
-    points = system.at_encounters(original)[0].points
+    # A searched scenario is the one of the original encounter.
+    members = system.characteristics
+    values = dict(zip(members.scenario.names, original[:, ~members.of_vehicle].T, strict=True))
+    points = [encounter(point, values) if values else point for point in system.points]
     return {
         point.name: problem
         for point, result in zip(points, results, strict=True)

@@ -131,7 +131,7 @@ def columns_by(by: Parameter) -> Columns:
 
 
 def _title(by: Parameter) -> str:
-    return f"Limits {ALONE} up to each {by.name.replace('_', ' ')}, rounded to the safe side"
+    return f"Limits up to each {by.name.replace('_', ' ')}, {ALONE}, rounded to the safe side"
 
 
 def _text(by: Parameter, value: float | None) -> str:
