@@ -160,10 +160,11 @@ def tolerance(
     if is_sought:
         _check_drawable(evaluator)
     is_safe = not criterion.of(original)[0]
-    # Around an unsafe original there is nothing to scan.
-    within = None if is_safe else [(members.original[column],) * 2 for column in columns]
+    # Around an unsafe original there is nothing to scan, but points that are lost.
+    is_scanned = is_safe or is_rated(study)
+    within = None if is_scanned else [(members.original[column],) * 2 for column in columns]
     with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(columns)):
-        scans = scan(evaluator, columns, criterion, within, None if is_safe else 1)
+        scans = scan(evaluator, columns, criterion, within, None if is_scanned else 1)
     models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
     judges = _denser(models, attack) if is_sought else models.members
     search_alone = AloneSearch(scans, columns, judges)
