@@ -94,12 +94,13 @@ def drive(
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
+    encounter = observer.encounter(trace)
     ended = outcomes.classify()
     # In an encounter in which nothing happens, all but a collision says nothing.
     is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (ended != Outcome.COLLISION)
     return SimulationRuns(
         trace=trace,
-        encounter=observer.encounter(trace),
+        encounter=encounter,
         outcome=np.where(robot.invalid | is_idle, Outcome.INVALID_TEST, ended),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first,
