@@ -18,7 +18,7 @@ from safevar_sumo.questions.tolerance.trial import Trial, Trials
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
-MAX_SIMULATIONS = 800_000
+MAX_SIMULATIONS = 1_500_000
 """Number of simulations, each at all points of a matrix, after which a search ends with the next box that passes."""
 MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that limits move out."""
