@@ -2,10 +2,11 @@
 
     python benchmarks/answers.py [COMMAND...] [--json]
 
-Each command, such as "tolerance rain", is carried out as typed, by one worker in this process. Its processor time is
-compared with a floor: the number of its simulations, a vehicle at a point, times what one costs in a large batch of the
-same study. What lies above 1 is not simulation, or simulation in small batches. Results of "study rain" go into a
-temporary directory, which later commands find as results/rain.
+Each command, such as "tolerance rain", is carried out as typed, by one worker in this process. Its
+processor time is compared with a floor: the number of its simulations, a vehicle at a point, times
+what one costs in a large batch of the same study. What lies above 1 is not simulation, or
+simulation in small batches. Results of "study rain" go into a temporary directory, which later
+commands find as results/rain.
 """
 
 from __future__ import annotations
@@ -82,7 +83,9 @@ class Counted:
 
 
 def vehicles_each(study: Study) -> int:
-    """Vehicles that drive for a setting: the original one in the same encounter, too, where encounters are searched."""
+    """Vehicles that drive for a setting: the original one in the same encounter, too, where
+    encounters are searched.
+    """
     return 2 if study.scenario.search else 1
 
 
@@ -113,8 +116,14 @@ def records_of(command: str) -> Iterator[Record]:
     seconds = processor_seconds(carry_out)
     evaluation.evaluate_batch = evaluate_batch
     simulations = counted.simulations.total()
-    floor = sum(number * seconds_of_one(counted.studies[name]) for name, number in counted.simulations.items())
-    print(f"{command}: {seconds:.1f} s of a processor, {floor:.1f} s for its simulations", file=sys.stderr)
+    floor = sum(
+        number * seconds_of_one(counted.studies[name])
+        for name, number in counted.simulations.items()
+    )
+    print(
+        f"{command}: {seconds:.1f} s of a processor, {floor:.1f} s for its simulations",
+        file=sys.stderr,
+    )
     yield Record(command, "answer", simulations, seconds / floor)
     yield Record(command, "answer_simulating", simulations, counted.seconds / floor)
 
@@ -127,7 +136,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         print_records(
-            (record for command in arguments.commands for record in records_of(command)), as_json=arguments.json
+            (record for command in arguments.commands for record in records_of(command)),
+            as_json=arguments.json,
         )
 
 

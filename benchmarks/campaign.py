@@ -1,11 +1,13 @@
-"""What a campaign costs beside its simulations, and what more workers bring: ratios of one run on one machine.
+"""What a campaign costs beside its simulations, and what more workers bring: ratios of one run on
+one machine.
 
     python benchmarks/campaign.py [STUDY] [--runs N] [--evaluations N] [--turns N] [--json]
 
-Time outside the simulation is search, journal and progress of a share that this process carries out by itself. Workers
-start, and load the network, before the clock does. The floor is bare libsumo for one population. What two workers bring
-is told by the clock: only an idle machine tells the truth. `ceiling` is what two processes bring on this machine that
-only compute the same batches, and `two_workers_of_ceiling` the share of it that two workers reach.
+Time outside the simulation is search, journal and progress of a share that this process carries out
+by itself. Workers start, and load the network, before the clock does. The floor is bare libsumo for
+one population. What two workers bring is told by the clock: only an idle machine tells the truth.
+`ceiling` is what two processes bring on this machine that only compute the same batches, and
+`two_workers_of_ceiling` the share of it that two workers reach.
 """
 
 from __future__ import annotations
@@ -43,7 +45,9 @@ Computed = tuple[Task, FloatArray]
 
 
 class ThisProcess:
-    """A worker that computes in this process, keeps the batches, and measures the processor time of simulations [s]."""
+    """A worker that computes in this process, keeps the batches, and measures the processor time of
+    simulations [s].
+    """
 
     def __init__(self) -> None:
         self.batches: list[Computed] = []
@@ -53,7 +57,10 @@ class ThisProcess:
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         future: Future[Any] = Future()
         if function is not evaluate_settings:
-            self.batches, self.simulation = [], 0.0  # without the batches that warmed this process up
+            self.batches, self.simulation = (
+                [],
+                0.0,
+            )  # without the batches that warmed this process up
         future.set_result(function(*arguments))
         return future
 
@@ -87,7 +94,9 @@ def processors() -> float:
 def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
     characteristics = CharacteristicSet.of(study)
     rng = np.random.default_rng(seed)
-    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+    return characteristics.filter(
+        rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+    )
 
 
 def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
@@ -98,7 +107,16 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
         before, system = processors(), assemble(study)
 
         def carry_out() -> None:
-            run_campaign(study, system, all_runs(study), Path(folder), pool, show_no_progress, print, MAX_VEHICLES)
+            run_campaign(
+                study,
+                system,
+                all_runs(study),
+                Path(folder),
+                pool,
+                show_no_progress,
+                print,
+                MAX_VEHICLES,
+            )
 
         clock = clock_seconds(carry_out)
         return Cost(clock, processors() - before)
@@ -122,7 +140,9 @@ def ceiling(batches: list[Computed]) -> float:
 
 
 def floor(study: Study) -> float:
-    """Processor seconds that bare libsumo takes to load and step the network for one setting of a population."""
+    """Processor seconds that bare libsumo takes to load and step the network for one setting of a
+    population.
+    """
     system, n = assemble(study), study.search.population
     steps = len(simulate(system, drawn(study, n)).trace.time)
     network = stage_network(system.points[0].scenario)
@@ -164,7 +184,12 @@ def records_of(study: Study, turns: int) -> Iterator[Record]:
     """Measure one and two workers, and two of a cluster; medians of some turns."""
     ratios = [turn(study) for _ in range(turns)]
     for measure in ratios[0]:
-        yield Record(study.name, measure, study.search.population, statistics.median(one[measure] for one in ratios))
+        yield Record(
+            study.name,
+            measure,
+            study.search.population,
+            statistics.median(one[measure] for one in ratios),
+        )
 
 
 def main() -> None:
@@ -172,14 +197,19 @@ def main() -> None:
     parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
     parser.add_argument("--runs", type=int, default=30)
     parser.add_argument("--evaluations", type=int, default=500, help="of each run")
-    parser.add_argument("--turns", type=int, default=3, help="how often everything is measured; medians are told")
+    parser.add_argument(
+        "--turns", type=int, default=3, help="how often everything is measured; medians are told"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     study = load_study(arguments.study)
     search = msgspec.structs.replace(
         study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations
     )
-    print_records(records_of(msgspec.structs.replace(study, search=search), arguments.turns), as_json=arguments.json)
+    print_records(
+        records_of(msgspec.structs.replace(study, search=search), arguments.turns),
+        as_json=arguments.json,
+    )
 
 
 if __name__ == "__main__":

@@ -2,11 +2,12 @@
 
     python benchmarks/evaluation.py [STUDY...] [--json]
 
-The floor is bare libsumo that loads and steps the same network as many steps with nobody at the wheel; an evaluation
-finds its scene recorded, as all but the first of a worker does. The TraCI socket is what one would write otherwise: one
-`sumo` process, reloaded for every setting, the same controller; who starts a process for each waits a second more, as
-traci tries again only then. What is compared takes turns, and where one process does the work its processor time
-counts: so a machine that others use too disturbs them little.
+The floor is bare libsumo that loads and steps the same network as many steps with nobody at the
+wheel; an evaluation finds its scene recorded, as all but the first of a worker does. The TraCI
+socket is what one would write otherwise: one `sumo` process, reloaded for every setting, the same
+controller; who starts a process for each waits a second more, as traci tries again only then. What
+is compared takes turns, and where one process does the work its processor time counts: so a machine
+that others use too disturbs them little.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ class Coasting(ScalarAds):
 
 
 class Replayed:
-    """A vehicle or an ADS that computes in its first run alone, and returns the same in every later one of the same
-    settings.
+    """A vehicle or an ADS that computes in its first run alone, and returns the same in every later
+    one of the same settings.
 
     `begins` is the method that a run begins with, `goes_on` the one of every step.
     """
@@ -82,12 +83,14 @@ def settings_of(system: System, n: int) -> FloatArray:
     """The same settings in every run of a benchmark."""
     characteristics = system.characteristics
     rng = np.random.default_rng(1)
-    return characteristics.filter(rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics))))
+    return characteristics.filter(
+        rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+    )
 
 
 def bare(network: str, n: int, steps: int) -> tuple[float, float]:
-    """Processor seconds of loading n copies, stepping and closing them with SUMO's own model at the wheel; and of the
-    steps alone.
+    """Processor seconds of loading n copies, stepping and closing them with SUMO's own model at the
+    wheel; and of the steps alone.
     """
     stepping = 0.0
 
@@ -133,7 +136,9 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
         steps = len(simulate(system, settings).trace.time)
         floors = [bare(network, n, steps) for _ in range(2)]
 
-        def floor(floors: list[tuple[float, float]] = floors, n: int = n, steps: int = steps) -> float:
+        def floor(
+            floors: list[tuple[float, float]] = floors, n: int = n, steps: int = steps
+        ) -> float:
             floors.append(bare(network, n, steps))
             return floors[-1][0]
 
@@ -174,8 +179,13 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="What an evaluation costs, beside what it could cost.")
+    parser = argparse.ArgumentParser(
+        description="What an evaluation costs, beside what it could cost."
+    )
     parser.add_argument("studies", nargs="*", default=["rain", "lgsvl"], metavar="STUDY")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    print_records((record for study in arguments.studies for record in records_of(study)), as_json=arguments.json)
+    print_records(
+        (record for study in arguments.studies for record in records_of(study)),
+        as_json=arguments.json,
+    )

@@ -2,8 +2,8 @@
 
     python benchmarks/growth.py [STUDY] [--evaluations N] [--json]
 
-A worker answers batches of settings drawn at random; its processor time and its resident memory are those of its
-process.
+A worker answers batches of settings drawn at random; its processor time and its resident memory are
+those of its process.
 """
 
 from __future__ import annotations
@@ -25,11 +25,17 @@ FIRST = 5000
 
 
 def records_of(study: Study, evaluations: int) -> Iterator[Record]:
-    """Measure the first and the last `FIRST` evaluations of one worker, and its memory after both."""
+    """Measure the first and the last `FIRST` evaluations of one worker, and its memory after
+    both.
+    """
     task, spans = Task(study=study, batch_size=MAX_VEHICLES), []
     with open_pool(1) as pool:
         pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES))])
-        worker = next(child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
+        worker = next(
+            child
+            for child in psutil.Process().children()
+            if "spawn_main" in " ".join(child.cmdline())
+        )
         first = 0
         for done in range(0, evaluations, FIRST):
             before = sum(worker.cpu_times()[:2])
@@ -44,9 +50,13 @@ def records_of(study: Study, evaluations: int) -> Iterator[Record]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Whether a worker that lives long gets slower or larger.")
+    parser = argparse.ArgumentParser(
+        description="Whether a worker that lives long gets slower or larger."
+    )
     parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
     parser.add_argument("--evaluations", type=int, default=100_000)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    print_records(records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json)
+    print_records(
+        records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json
+    )

@@ -1,4 +1,6 @@
-"""What all benchmarks share: a record of a ratio, how it is printed, and times that a busy machine disturbs least."""
+"""What all benchmarks share: a record of a ratio, how it is printed, and times that a busy machine
+disturbs least.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,22 @@ from typing import NamedTuple
 REPETITIONS = 7
 
 MEANINGS = {
-    "bare_libsumo": "an evaluation takes so many times what bare libsumo takes to load and step the same network",
+    "bare_libsumo": (
+        "an evaluation takes so many times what bare libsumo takes to load and step the same"
+        " network"
+    ),
     "stepping_alone": "an evaluation takes so many times what bare libsumo takes to step it",
-    "replayed": "the same with a vehicle and an ADS that compute nothing: what no model can go below",
+    "replayed": (
+        "the same with a vehicle and an ADS that compute nothing: what no model can go below"
+    ),
     "batches_of_1": "so many times as fast as one setting after the other",
     "traci_socket": (
-        "so many times as fast as one setting after the other through a TraCI socket, the network reloaded for each"
+        "so many times as fast as one setting after the other through a TraCI socket, the network"
+        " reloaded for each"
     ),
     "scalar_ads": (
-        "an evaluation with a ScalarAds that does next to nothing takes so many times one with the study's own ADS"
+        "an evaluation with a ScalarAds that does next to nothing takes so many times one with the"
+        " study's own ADS"
     ),
     "campaign": "an evaluation of a campaign takes so many times a core's time of bare libsumo",
     "two_workers": "two workers are so many times as fast as one",
@@ -30,7 +39,9 @@ MEANINGS = {
     "answer": "an answer takes so many times what its simulations cost in large batches",
     "answer_simulating": "its simulations take so many times that",
     "growth_time": "the last evaluations take so many times what the first took",
-    "growth_memory": "a worker holds so many times the memory that it held after the first 5,000 evaluations",
+    "growth_memory": (
+        "a worker holds so many times the memory that it held after the first 5,000 evaluations"
+    ),
     "growth_mebibytes": "a worker holds so many MiB more than after the first 5,000 evaluations",
 }
 
@@ -51,16 +62,16 @@ def print_records(records: Iterable[Record], *, as_json: bool) -> None:
         return
     for record in records:
         print(
-            (
-                f"{record.study:8} {record.population:7d}  {record.measure:18} {record.ratio:7.2f}  "
-                f"{MEANINGS[record.measure]}"
-            ),
+            f"{record.study:8} {record.population:7d}  {record.measure:18} {record.ratio:7.2f}  "
+            f"{MEANINGS[record.measure]}",
             flush=True,
         )
 
 
 def medians_in_turn(*measured: Callable[[], float], repetitions: int = REPETITIONS) -> list[float]:
-    """Median seconds that every call tells, called in turns, so that what disturbs one disturbs the others too."""
+    """Median seconds that every call tells, called in turns, so that what disturbs one disturbs the
+    others too.
+    """
     turns = [[one() for one in measured] for _ in range(repetitions)]
     return [statistics.median(times) for times in zip(*turns, strict=True)]
 

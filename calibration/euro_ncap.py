@@ -1,8 +1,8 @@
-"""Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an environment that has the
-calculator.
+"""Derive `safevar_sumo/protocol/euro_ncap_2026.toml` from the official calculator, in an
+environment that has the calculator.
 
-`python calibration/euro_ncap.py > safevar_sumo/protocol/euro_ncap_2026.toml` after `pip install euroncap-rating-2026
-'pandas<3'`.
+`python calibration/euro_ncap.py > safevar_sumo/protocol/euro_ncap_2026.toml` after
+`pip install euroncap-rating-2026 'pandas<3'`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,21 @@ MASK = {matrix_processing.TestRange.STANDARD: "S", matrix_processing.TestRange.E
 
 
 HEADER = """\
-# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points and robustness layers.
+# Euro NCAP's crash avoidance, frontal collisions, protocol v1.2 (July 2026): matrices, points \
+and robustness layers.
 # Derived by calibration/euro_ncap.py from euroncap-rating-2026 {0} (PyPI, Apache-2.0):
-# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, robustness_layer. \
-Do not edit.
-# range_letters: one for each column, S standard, E extended, - no cell; has_function_choice: the manufacturer chooses
+# its template ca_template.xlsx and its modules crash_avoidance.data_model, matrix_processing, \
+robustness_layer. Do not edit.
+# range_letters: one for each column, S standard, E extended, - no cell; has_function_choice: \
+the manufacturer chooses
 # AEB or FCW.
 
 calculator_version = "{0}\""""
 BANDS = """
-# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle under test [km/h], the \
-last
-# row for all faster ones; and from which time to collision at the warning [s]. Measured values have two decimals.
+# From which relative speed at impact [km/h] a cell has a colour, by the speed of the vehicle \
+under test [km/h], the last
+# row for all faster ones; and from which time to collision at the warning [s]. \
+Measured values have two decimals.
 [starts_by_vut_speed]"""
 BEST_FIRST = ["green", "yellow", "orange", "brown", "red"]
 
@@ -42,15 +45,24 @@ def number(text: object) -> float:
 
 
 def quoted(values: object) -> str:
-    return "[" + ", ".join(f'"{value}"' if isinstance(value, str) else f"{value:g}" for value in values) + "]"
+    return (
+        "["
+        + ", ".join(f'"{value}"' if isinstance(value, str) else f"{value:g}" for value in values)
+        + "]"
+    )
 
 
 def block(sheet, frame, name: str) -> list[str]:
     """A matrix of a prediction sheet as TOML."""
     extent = matrix_processing.get_matrix_indices(frame, name)
-    # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way, and as FCW for CPLA
-    # and CBLA.
-    top, left, n_rows, n_columns = extent["start_row"] + 2, extent["start_col"] + 1, extent["n_rows"], extent["n_cols"]
+    # A choice of function is taken as AEB up to CCRs and CMRs, where AEB is assessed either way,
+    # and as FCW for CPLA and CBLA.
+    top, left, n_rows, n_columns = (
+        extent["start_row"] + 2,
+        extent["start_col"] + 1,
+        extent["n_rows"],
+        extent["n_cols"],
+    )
     headings = {sheet.cell(top - 2, column).value: column for column in range(2, left + 1)}
     test, _, light = name.partition(" ")
     column_key, convert = "target_speed", number
@@ -60,13 +72,22 @@ def block(sheet, frame, name: str) -> list[str]:
     points = {(p.row, p.col): p for p in matrix_processing.get_test_matrix(frame, name, KEY)}
     rows = []
     for k in range(n_rows):
-        function = sheet.cell(top + k, headings["Function"]).value if "Function" in headings else "AEB"
+        function = (
+            sheet.cell(top + k, headings["Function"]).value if "Function" in headings else "AEB"
+        )
         speeds = f"vut_speed = {number(sheet.cell(top + k, 1).value)}"
         if column_key == "impact_location":
-            speeds += f", target_speed = {number(sheet.cell(top + k, headings['Target speed']).value)}"
-        mask = "".join(MASK[points[k, j].test_range] if (k, j) in points else "-" for j in range(n_columns))
-        rows.append(f'  {{ {speeds}, range_letters = "{mask}"{"" if function else ", has_function_choice = true"} }},')
+            speeds += (
+                f", target_speed = {number(sheet.cell(top + k, headings['Target speed']).value)}"
+            )
+        mask = "".join(
+            MASK[points[k, j].test_range] if (k, j) in points else "-" for j in range(n_columns)
+        )
+        choice = "" if function else ", has_function_choice = true"
+        rows.append(f'  {{ {speeds}, range_letters = "{mask}"{choice} }},')
     total = data_model.TOTAL_SCORES[name]
+    kinds = ("Standard", "Extended", "Robustness")
+    points = ", ".join(f"{total[kind] or 0:g}" for kind in kinds)
     return [
         "",
         "[[matrices]]",
@@ -80,7 +101,7 @@ def block(sheet, frame, name: str) -> list[str]:
             if "Function" in headings
             else []
         ),
-        f"points = [{', '.join(f'{total[kind] or 0:g}' for kind in ('Standard', 'Extended', 'Robustness'))}]",
+        f"points = [{points}]",
         f"{column_key}s = {quoted(columns)}",
         "rows = [",
         *rows,
@@ -95,16 +116,22 @@ def measure(name: str) -> str:
 
 
 def bands(test: str, attributes: dict[str, str], colours: list[str]) -> str:
-    """Lower limits of the colours of a measured value, from the colours that the calculator gives at each hundredth."""
+    """Lower limits of the colours of a measured value, from the calculator's colours at each
+    hundredth.
+    """
     limits = []
     for hundredth in range(6001):
         point = matrix_processing.TestPoint(
             0, 0, common.PredictionColor.GREY, matrix_processing.TestRange.STANDARD, attributes
         )
-        colour = matrix_processing.ComputedTestPoint(point, test, hundredth / 100).measured_color.value
+        colour = matrix_processing.ComputedTestPoint(
+            point, test, hundredth / 100
+        ).measured_color.value
         if not limits or limits[-1][0] != colour:
             limits.append((colour, hundredth / 100))
-    assert [colour for colour, _ in limits] == [colour for colour in colours if colour in dict(limits)]
+    assert [colour for colour, _ in limits] == [
+        colour for colour in colours if colour in dict(limits)
+    ]
     return "{ " + ", ".join(f"{colour} = {start:g}" for colour, start in limits) + " }"
 
 
@@ -120,17 +147,26 @@ def main() -> None:
     print(BANDS)
     for vut in (10, 20, 30, 40, 50):
         print(f"{vut} = {bands('CCRs', {'VUT speed': f'{vut} km/h'}, BEST_FIRST)}")
-    assert bands("CCRs", {"VUT speed": "130 km/h"}, BEST_FIRST) == bands("CCRs", {"VUT speed": "50 km/h"}, BEST_FIRST)
+    assert bands("CCRs", {"VUT speed": "130 km/h"}, BEST_FIRST) == bands(
+        "CCRs", {"VUT speed": "50 km/h"}, BEST_FIRST
+    )
     print("[starts_by_measure]")
     print(f"avoidance = {bands('CCCscp', {'VUT speed': '50 km/h'}, BEST_FIRST)}")
-    print(f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, BEST_FIRST[::-1])}")
-    lines = ["", "# Points of every test of the stage: standard, extended, robustness.", "[points_by_test]"]
+    print(
+        f"warning = {bands('CBLA', {'VUT speed': '50 km/h', 'Function': 'FCW'}, BEST_FIRST[::-1])}"
+    )
+    lines = [
+        "",
+        "# Points of every test of the stage: standard, extended, robustness.",
+        "[points_by_test]",
+    ]
     scenario: dict[str, list[float]] = {}
     for row in book["Scenario Scores"].iter_rows(min_row=2, values_only=True):
         name = row[4] or name  # noqa: F821
         scenario.setdefault(name, []).append(row[7])
     lines += [
-        f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]' for name, points in scenario.items()
+        f'"{name}" = [{", ".join(f"{value:g}" for value in [*points, 0, 0][:3])}]'
+        for name, points in scenario.items()
     ]
     simulated_tests = []
     for part, names in data_model.STAGE_SUBELEMENT_TO_LOADCASES["FC"].items():
@@ -153,10 +189,17 @@ def layers(sheet, test: str) -> list[str]:
         cell, layer = sheet.cell(row, column), sheet.cell(row, 2).value
         if cell.fill.fill_type and cell.fill.fgColor.tint:
             pairs = next(
-                (conditions_by_layer[key].get(test, []) for key in conditions_by_layer if key.value == layer), []
+                (
+                    conditions_by_layer[key].get(test, [])
+                    for key in conditions_by_layer
+                    if key.value == layer
+                ),
+                [],
             )
             pairs = [pairs] if isinstance(pairs, tuple) else pairs
-            conditions = [f'{{ text = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs]
+            conditions = [
+                f'{{ text = "{text}", criterion = "{kind.value}" }}' for text, kind in pairs
+            ]
             lines += [
                 "",
                 "[[layers]]",

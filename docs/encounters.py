@@ -4,7 +4,8 @@
 
 With `count` it prints the numbers of the page, too.
 
-The car has the wear `WORN` besides its tread, with which the study wear, whose speeds are dotted, finds it safe.
+The car has the wear `WORN` besides its tread, with which the study wear, whose speeds are dotted,
+finds it safe.
 """
 
 from __future__ import annotations
@@ -21,7 +22,13 @@ from safevar_sumo.sumo.system import System, assemble
 
 FASTEST = 60.0
 """The fastest speed of the study [km/h]."""
-WORN = {"brakeTorque": 0.97, "brakeResponse": 0.25, "payload": 180.0, "sensorRange": 65.0, "sensorLatency": 0.12}
+WORN = {
+    "brakeTorque": 0.97,
+    "brakeResponse": 0.25,
+    "payload": 180.0,
+    "sensorRange": 65.0,
+    "sensorLatency": 0.12,
+}
 IMPACT_LOCATION = 25.0
 GRID_SPEEDS = (10, 20, 30, 40)
 """Speeds of the study wear [km/h]."""
@@ -57,19 +64,27 @@ def main(path: str) -> None:
         axis.axvline(grid_speed, color=BLUE, linewidth=1.2, linestyle=":")
     axis.set_xlabel("speed in all tests [km/h]")
     axis.set_ylabel("tread depth [mm]")
-    wear = ", ".join(f"{item.name} {WORN[item.name]:g}{item.suffix}" for item in members if item.name in WORN)
+    wear = ", ".join(
+        f"{item.name} {WORN[item.name]:g}{item.suffix}" for item in members if item.name in WORN
+    )
     axis.set_title(f"{wear},\nimpact location {IMPACT_LOCATION:g} %", fontsize=8)
-    colours = "orange: collision; grey: the original is not safe; blue, dotted: speeds of the study wear"
+    colours = (
+        "orange: collision; grey: the original is not safe; blue, dotted: speeds of the study wear"
+    )
     figure.supxlabel(colours, fontsize=8)
     figure.savefig(path, dpi=110)
 
 
 def count_between(fastest: float) -> None:
-    """Print how many vehicles are safe at all points of wear, and how many of these collide in encounters up to a speed
-    [km/h].
+    """Print how many vehicles are safe at all points of wear, and how many of these collide in
+    encounters up to a speed [km/h].
     """
     grid, joint = assemble(load_study("wear")), _up_to(fastest)
-    members, of_vehicle, rng = grid.characteristics, joint.characteristics.of_vehicle, np.random.default_rng(5)
+    members, of_vehicle, rng = (
+        grid.characteristics,
+        joint.characteristics.of_vehicle,
+        np.random.default_rng(5),
+    )
     drawn = rng.uniform(members.lower, members.upper, (VEHICLES, len(members)))
     vehicles = members.original + (drawn - members.original) * rng.uniform(0.2, 0.8, (VEHICLES, 1))
     safe = vehicles[~evaluate(grid, vehicles).collided]
@@ -79,16 +94,26 @@ def count_between(fastest: float) -> None:
     evaluations = evaluate(joint, settings)
     fails = evaluations.collided & (joint.measuring.scoring.violation(evaluations) == 0)
     found = int(fails.reshape(len(safe), -1).any(axis=1).sum())
-    print(f"{len(safe)} of {VEHICLES} vehicles are safe in wear, {found} of these collide in wear_joint")
+    print(
+        f"{len(safe)} of {VEHICLES} vehicles are safe in wear, {found} of these collide in"
+        " wear_joint"
+    )
 
 
 def compare_lines(fastest: float) -> None:
-    """Print on how many lines from the original to worn cars the first collision is earlier in wear_joint than in
-    wear, and on how many later.
+    """Print on how many lines from the original to worn cars the first collision is earlier in
+    wear_joint than in wear, and on how many later.
     """
     grid, joint = assemble(load_study("wear")), _up_to(fastest)
-    members, of_vehicle, rng = grid.characteristics, joint.characteristics.of_vehicle, np.random.default_rng(7)
-    ends, shares = rng.uniform(members.lower, members.upper, (LINES, len(members))), np.arange(1, PARTS + 1) / PARTS
+    members, of_vehicle, rng = (
+        grid.characteristics,
+        joint.characteristics.of_vehicle,
+        np.random.default_rng(7),
+    )
+    ends, shares = (
+        rng.uniform(members.lower, members.upper, (LINES, len(members))),
+        np.arange(1, PARTS + 1) / PARTS,
+    )
     vehicles = members.original + (ends - members.original)[:, np.newaxis] * shares[:, np.newaxis]
     vehicles = vehicles.reshape(-1, len(members))
     encounters = sobol_settings(joint.characteristics, ENCOUNTERS_ON_LINES)
@@ -97,11 +122,17 @@ def compare_lines(fastest: float) -> None:
     evaluations = evaluate(joint, settings)
     fails = evaluations.collided & (joint.measuring.scoring.violation(evaluations) == 0)
     firsts = []
-    for collided in (evaluate(grid, vehicles).collided, fails.reshape(len(vehicles), -1).any(axis=1)):
+    for collided in (
+        evaluate(grid, vehicles).collided,
+        fails.reshape(len(vehicles), -1).any(axis=1),
+    ):
         rows = collided.reshape(LINES, PARTS)
         firsts.append(np.where(rows.any(axis=1), shares[np.argmax(rows, axis=1)], np.inf))
     on_grid, between = firsts
-    print(f"of {LINES} lines earlier in wear_joint: {(between < on_grid).sum()}, later: {(between > on_grid).sum()}")
+    print(
+        f"of {LINES} lines earlier in wear_joint: {(between < on_grid).sum()}, later:"
+        f" {(between > on_grid).sum()}"
+    )
 
 
 if __name__ == "__main__":

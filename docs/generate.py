@@ -1,5 +1,5 @@
-"""Tables made from the code: `python docs/generate.py NAME` prints one. As a hook of MkDocs, it puts what the command
-prints in place of a line of a page that is this command alone.
+"""Tables made from the code: `python docs/generate.py NAME` prints one. As a hook of MkDocs, it
+puts what the command prints in place of a line of a page that is this command alone.
 """
 
 from __future__ import annotations
@@ -34,12 +34,20 @@ PLAIN = {
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Called by MkDocs for every page."""
-    return re.sub(r"^`python docs/generate.py (\w+)`$", lambda match: TABLES[match[1]](), markdown, flags=re.MULTILINE)
+    return re.sub(
+        r"^`python docs/generate.py (\w+)`$",
+        lambda match: TABLES[match[1]](),
+        markdown,
+        flags=re.MULTILINE,
+    )
 
 
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     heads = list(heads)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)) + "\n"
+    return (
+        "\n".join(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows))
+        + "\n"
+    )
 
 
 def _default(value: Any) -> str:
@@ -47,7 +55,11 @@ def _default(value: Any) -> str:
         return "required"
     if value is None:
         return "none"
-    return "its own defaults" if isinstance(value, msgspec.Struct) else f"`{msgspec.json.encode(value).decode()}`"
+    return (
+        "its own defaults"
+        if isinstance(value, msgspec.Struct)
+        else f"`{msgspec.json.encode(value).decode()}`"
+    )
 
 
 def _range(kind: Any) -> str:
@@ -93,19 +105,24 @@ def _structs(kind: Any) -> Iterator[Any]:
 def study_keys() -> str:
     """Every table of a study file with its keys."""
     parts = []
-    for kind in {one.cls: one for one in _structs(type_info(Study)) if one.cls.__name__ != "Origin"}.values():
+    for kind in {
+        one.cls: one for one in _structs(type_info(Study)) if one.cls.__name__ != "Origin"
+    }.values():
         rows = [
             (
                 f"`{field.encode_name}`",
                 _words(field.type),
-                _default(field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()),
+                _default(
+                    field.default
+                    if field.default_factory is msgspec.NODEFAULT
+                    else field.default_factory()
+                ),
             )
             for field in kind.fields
             if field.name != "origin"
         ]
-        parts.append(
-            f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{_table(('key', 'value', 'default'), rows)}"
-        )
+        table = _table(("key", "value", "default"), rows)
+        parts.append(f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{table}")
     return "\n".join(parts)
 
 
@@ -119,15 +136,26 @@ def models(classes: dict[str, Any]) -> Callable[[], str]:
             described = {
                 key.strip(): " ".join(meaning.split())
                 for keys, meaning in re.findall(
-                    r"^(\w[\w, ]*)\n((?:    .*\n?)+)", doc.partition("Parameters\n----------\n")[2], flags=re.MULTILINE
+                    r"^(\w[\w, ]*)\n((?:    .*\n?)+)",
+                    doc.partition("Parameters\n----------\n")[2],
+                    flags=re.MULTILINE,
                 )
                 for key in keys.split(",")
             }
             rows = [
-                (f"`{one.name}`", described.get(one.name, ""), _bounds(one.annotation), _default(one.default))
+                (
+                    f"`{one.name}`",
+                    described.get(one.name, ""),
+                    _bounds(one.annotation),
+                    _default(one.default),
+                )
                 for one in inspect.signature(model).parameters.values()
             ]
-            table = _table(("parameter", "meaning", "range", "default"), rows) if rows else "No parameters.\n"
+            table = (
+                _table(("parameter", "meaning", "range", "default"), rows)
+                if rows
+                else "No parameters.\n"
+            )
             parts.append(f"### {name}\n\n{doc.partition('Parameters')[0].strip()}\n\n{table}")
         return "\n".join(parts)
 
@@ -136,15 +164,23 @@ def models(classes: dict[str, Any]) -> Callable[[], str]:
 
 def _bounds(annotation: Any) -> str:
     """The range of an annotated number, or of the number that may be None."""
-    metas = [meta for kind in (annotation, *get_args(annotation)) for meta in getattr(kind, "__metadata__", ())]
+    metas = [
+        meta
+        for kind in (annotation, *get_args(annotation))
+        for meta in getattr(kind, "__metadata__", ())
+    ]
     return _range(metas[0]).removeprefix(", ") if metas else ""
 
 
 def metric_columns() -> str:
     """Columns of metrics and objectives in solutions.csv."""
-    objectives = [(f"`{one.name}`", one.unit, f"objective: {one.title}") for one in PUBLISHED_SCORING.objectives]
+    objectives = [
+        (f"`{one.name}`", one.unit, f"objective: {one.title}")
+        for one in PUBLISHED_SCORING.objectives
+    ]
     metrics = [
-        (f"`{name}`", metric.unit, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
+        (f"`{name}`", metric.unit, metric.description)
+        for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
     ]
     return _table(("column", "unit", "content"), [*objectives, *metrics])
 
@@ -152,7 +188,8 @@ def metric_columns() -> str:
 def results_files() -> str:
     """Every file of a results directory."""
     return _table(
-        ("file", "content", "written by"), [(f"`{name}`", content, writer) for name, content, writer in FILES]
+        ("file", "content", "written by"),
+        [(f"`{name}`", content, writer) for name, content, writer in FILES],
     )
 
 
@@ -167,12 +204,18 @@ def characteristics() -> str:
     for study in map(load_study, study_names()):
         for key, row in study.vehicle.characteristics.items():
             model = study.vehicle.model
-            seen.setdefault((model, key), (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart))
-    return _table(("vehicle", "characteristic", "unit", "what it is", "real-world counterpart"), seen.values())
+            seen.setdefault(
+                (model, key), (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart)
+            )
+    return _table(
+        ("vehicle", "characteristic", "unit", "what it is", "real-world counterpart"), seen.values()
+    )
 
 
 def messages(folder: Path) -> Iterator[tuple[str, str]]:
-    """The refusals of the modules in a folder, with `...` for what a file says, and the name of the module."""
+    """The refusals of the modules in a folder, with `...` for what a file says, and the name of the
+    module.
+    """
 
     def text(node: ast.expr) -> str:
         match node:
@@ -191,7 +234,9 @@ def messages(folder: Path) -> Iterator[tuple[str, str]]:
         ]
         for call in ast.walk(tree):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
-                place = {"unsupported": 0, "InputError": 1, "unknown_name": 1}.get(call.func.id, len(call.args))
+                place = {"unsupported": 0, "InputError": 1, "unknown_name": 1}.get(
+                    call.func.id, len(call.args)
+                )
                 for argument in call.args[place : place + 1]:
                     known = getattr(argument, "id", getattr(argument, "attr", ""))
                     values = [value for name, value in named if name == known]

@@ -2,9 +2,9 @@
 
     python docs/landscape.py rain rain_nsga2.csv rain_rs.csv rain_fuzzer.csv
 
-A regression forest learns the safety degree from the rows of the published files. NSGA-II then searches twice with the
-study's settings: on the forest's predictions, and on the study itself. The first file holds the published solutions of
-NSGA-II, which the table compares with both.
+A regression forest learns the safety degree from the rows of the published files. NSGA-II then
+searches twice with the study's settings: on the forest's predictions, and on the study itself. The
+first file holds the published solutions of NSGA-II, which the table compares with both.
 """
 
 from __future__ import annotations
@@ -30,18 +30,27 @@ TREES, POPULATION = 300, 50
 Evaluate = Callable[[FloatArray], Evaluations]
 
 
-def predict(forest: RandomForestRegressor, characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
-    """Evaluations with the forest's safety degrees of settings, shape (M, n); other metrics are undefined."""
+def predict(
+    forest: RandomForestRegressor, characteristics: CharacteristicSet, settings: FloatArray
+) -> Evaluations:
+    """Evaluations with the forest's safety degrees of settings, shape (M, n); other metrics are
+    undefined.
+    """
     undefined = np.full(len(settings), np.nan)
     metrics = dict.fromkeys(METRICS, undefined) | {SAFETY_DEGREE: forest.predict(settings)}
     return evaluations_of(ReferenceData(settings, metrics), characteristics)
 
 
-def search(evaluate: Evaluate, characteristics: CharacteristicSet, evaluations: int, runs: int) -> Evaluations:
+def search(
+    evaluate: Evaluate, characteristics: CharacteristicSet, evaluations: int, runs: int
+) -> Evaluations:
     """The solutions of several runs of NSGA-II, which request their evaluations together."""
     original = evaluate(characteristics.original[np.newaxis])
     problem = Problem(
-        characteristics=characteristics, original=original, evaluations=evaluations, population=POPULATION
+        characteristics=characteristics,
+        original=original,
+        evaluations=evaluations,
+        population=POPULATION,
     )
     searches = [Nsga2().search(problem, np.random.default_rng(run)) for run in range(runs)]
     requests, solutions = [next(run) for run in searches], list[Evaluations]()
@@ -59,7 +68,9 @@ def search(evaluate: Evaluate, characteristics: CharacteristicSet, evaluations: 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("study")
     parser.add_argument("files", nargs="+", type=Path, help="published rows, NSGA-II's first")
     parser.add_argument("--runs", type=int, default=6)
@@ -67,15 +78,27 @@ def main() -> None:
     arguments = parser.parse_args()
     study = load_study(arguments.study)
     characteristics = CharacteristicSet.of(study)
-    files = [evaluations_of(read_reference(path, characteristics), characteristics) for path in arguments.files]
+    files = [
+        evaluations_of(read_reference(path, characteristics), characteristics)
+        for path in arguments.files
+    ]
     published = Evaluations.concatenate(files)
-    forest = RandomForestRegressor(TREES, random_state=0, n_jobs=-1).fit(published.settings, published.f_safe)
-    run = partial(search, characteristics=characteristics, evaluations=arguments.evaluations, runs=arguments.runs)
+    forest = RandomForestRegressor(TREES, random_state=0, n_jobs=-1).fit(
+        published.settings, published.f_safe
+    )
+    run = partial(
+        search,
+        characteristics=characteristics,
+        evaluations=arguments.evaluations,
+        runs=arguments.runs,
+    )
     with open_evaluator(study, None, None, lambda *progress: None) as evaluator:
         solutions = {
             "published": files[0],
             "on a forest of the published rows": run(partial(predict, forest, characteristics)),
-            "on this package's model": run(lambda settings: evaluator.evaluate(settings, "settings")),
+            "on this package's model": run(
+                lambda settings: evaluator.evaluate(settings, "settings")
+            ),
         }
     table = pd.DataFrame(
         {

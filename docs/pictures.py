@@ -1,6 +1,7 @@
 """All pictures of the pages, drawn anew: `python docs/pictures.py [NAME]...`, by default every one.
 
-Those of published data need the files that `SAFEVAR_PUBLISHED` names the folder of; that of the page needs Chromium.
+Those of published data need the files that `SAFEVAR_PUBLISHED` names the folder of; that of the
+page needs Chromium.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from pathlib import Path
 
 DOCS = Path(__file__).parent
 PROGRAM = f"{shlex.quote(sys.executable)} -m safevar_sumo"
-FAILURE = f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1.008 --set tireFric=1.004 --set maxBrakeTorque=1201"
+FAILURE = (
+    f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1.008 --set tireFric=1.004 --set"
+    " maxBrakeTorque=1201"
+)
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
 LIMITED = 'extends = "native"\nname = "native"\n[limits]\ndecel = { at_least = 8 }\n'
 """The study of the page."""
@@ -31,9 +35,11 @@ COMMANDS = {
     "sun_nsga2.png": f"{PROGRAM} validate sun {PUBLISHED}/sun_nsga2.csv --plot {{}}",
     "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
-    "report.png": f"{PROGRAM} study native.toml --runs 2 --evaluations 200 --out native --quiet && "
-    f"{PROGRAM} report native {ASKED} --out page.html && "
-    f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null",
+    "report.png": (
+        f"{PROGRAM} study native.toml --runs 2 --evaluations 200 --out native --quiet && "
+        f"{PROGRAM} report native {ASKED} --out page.html && "
+        f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null"
+    ),
 }
 """The command of each picture, in a folder that has the study of the page."""
 

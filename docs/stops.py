@@ -2,8 +2,8 @@
 
     python docs/stops.py docs/pictures/stops.png
 
-Every line is the car of the study `stop` on one published test's road, with its grip and water, and brakes that the
-tyres alone limit.
+Every line is the car of the study `stop` on one published test's road, with its grip and water, and
+brakes that the tyres alone limit.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def stops(speed: float, water: float, grip: float) -> FloatArray:
     weather = {"name": "road", "road_friction": friction, "visibility": 1.0, "water": water}
     tables = {"extends": "stop", "name": "picture", "weather": weather}
     matrix = {"tests": [{"name": "stop", "over": {"speed": [speed]}}]}
-    study = load_study({**tables, "matrix": matrix, "vehicle": {"parameters": {"brake_force": 4e4}}})
+    study = load_study(
+        {**tables, "matrix": matrix, "vehicle": {"parameters": {"brake_force": 4e4}}}
+    )
     system = assemble(study)
     settings = np.tile(system.characteristics.original, (len(TREADS), 1))
     settings[:, 0] = TREADS
@@ -50,13 +52,17 @@ def main(path: str) -> None:
         rows = [row for row in csv.DictReader(file) if row["distance_m"]]
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for colour, (label, (source, grip, speed)) in zip(COLOURS, TESTS.items(), strict=True):
-        published = [row for row in rows if row["source"].startswith(source) and row["speed_kmh"] == speed]
+        published = [
+            row for row in rows if row["source"].startswith(source) and row["speed_kmh"] == speed
+        ]
         water = float(published[0]["water_mm"] or WET_FRICTION["water"]["AutoBild"])
         distances = stops(float(speed), water, WET_FRICTION["grip"][grip])
         axes.plot(TREADS, distances, color=colour, label=label)
         points = [(float(row["tread_mm"]), float(row["distance_m"])) for row in published]
         axes.plot(*np.transpose(points), "o", color=colour)
-    axes.set(xlabel="tread depth [mm]", ylabel="stopping distance on a wet road [m]", ylim=(0, None))
+    axes.set(
+        xlabel="tread depth [mm]", ylabel="stopping distance on a wet road [m]", ylim=(0, None)
+    )
     axes.set_title("Stops on a wet road with worn tyres", loc="left")
     axes.legend(title="lines: here; dots: published", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,7 +1,9 @@
-"""Every shipped driving system under the same wear: how far each part may wear, alone and together, and the repair.
+"""Every shipped driving system under the same wear: how far each part may wear, alone and together,
+and the repair.
 
-`python docs/systems.py` prints the two tables of the page on repair, in Markdown. A system has the parameters of a
-shipped study that it drives in, or else its defaults; its repair has to survive `PROMISE`.
+`python docs/systems.py` prints the two tables of the page on repair, in Markdown. A system has the
+parameters of a shipped study that it drives in, or else its defaults; its repair has to survive
+`PROMISE`.
 """
 
 from __future__ import annotations
@@ -12,7 +14,12 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE
 
-STUDIES = {"aeb": "wear", "apollo": "lgsvl", "autoware_aeb": "autoware_july", "world_on_rails": "sun"}
+STUDIES = {
+    "aeb": "wear",
+    "apollo": "lgsvl",
+    "autoware_aeb": "autoware_july",
+    "world_on_rails": "sun",
+}
 """Studies with the parameters of driving systems."""
 PROMISE = "treadDepth >= 2", "brakeTorque >= 0.8"
 
@@ -27,14 +34,23 @@ def limits_of(study: sv.Study) -> dict[str, str]:
     answer = sv.tolerance(study, unsafe="collision", fits=0)
     for one in answer.table("limits").itertuples():
         domain = study.vehicle.characteristics[one.characteristic]
-        ends = [(one.alone_low, domain.lower, one.together_low), (one.alone_high, domain.upper, one.together_high)]
-        limits = [f"{alone:.4g} (together {together:.4g})" for alone, last, together in ends if alone != last]
+        ends = [
+            (one.alone_low, domain.lower, one.together_low),
+            (one.alone_high, domain.upper, one.together_high),
+        ]
+        limits = [
+            f"{alone:.4g} (together {together:.4g})"
+            for alone, last, together in ends
+            if alone != last
+        ]
         row[f"{one.characteristic} [{one.unit}]"] = " to ".join(limits) or "any"
     return row
 
 
 def repair_of(study: sv.Study) -> tuple[str, str, str]:
-    """The smallest repair, how much earlier it brakes on a new car, and needless braking before and after."""
+    """The smallest repair, how much earlier it brakes on a new car, and needless braking before and
+    after.
+    """
     answer = sv.repair(study, promise=PROMISE)
     if not answer.numbers["repairs"]:
         return ("none is needed" if answer.numbers["kept_today"] else "none"), "-", "-"

@@ -1,7 +1,7 @@
 """SafeVar on SUMO: which smallest variations of a vehicle make its automated driving system unsafe?
 
-`import safevar_sumo as sv`, and then `sv.simulate("rain", {"tireFric": 1.1})`. `__init__.pyi` lists all public names;
-each is loaded on first use, so importing the package is fast.
+`import safevar_sumo as sv`, and then `sv.simulate("rain", {"tireFric": 1.1})`. `__init__.pyi` lists
+all public names; each is loaded on first use, so importing the package is fast.
 """
 
 from typing import Any

@@ -2,7 +2,11 @@ from .api.evaluation import evaluate as evaluate
 from .api.running import run as run
 from .api.simulation import Simulation as Simulation, load_study as load_study, simulate as simulate
 from .campaign.pool import Pool as Pool
-from .errors import InputError as InputError, SafevarError as SafevarError, SimulationError as SimulationError
+from .errors import (
+    InputError as InputError,
+    SafevarError as SafevarError,
+    SimulationError as SimulationError,
+)
 from .metrics import Criterion as Criterion, Unsafe as Unsafe
 from .questions.answer import Answer as Answer
 from .questions.ask import question as question
@@ -23,7 +27,12 @@ from .replay.comparison import Comparison as Comparison, comparison_of as compar
 from .replay.figure import draw_comparison as draw_comparison
 from .replay.gui import show_in_gui as show_in_gui
 from .report import report as report
-from .study import Study as Study, StudyLike as StudyLike, Weather as Weather, study_names as study_names
+from .study import (
+    Study as Study,
+    StudyLike as StudyLike,
+    Weather as Weather,
+    study_names as study_names,
+)
 from .terminal import Progress as Progress
 
 __version__: str

@@ -7,7 +7,9 @@ import sys
 
 
 def main() -> None:
-    """Run the program; it is imported here and not above, because every worker process loads this module too."""
+    """Run the program; it is imported here and not above, because every worker process loads this
+    module too.
+    """
     _put_installed_modules_first()
     from safevar_sumo import cli
 
@@ -15,8 +17,8 @@ def main() -> None:
 
 
 def _put_installed_modules_first() -> None:
-    """Move the working directory, which `python -m` puts first, to the end of the path: a `numpy.py` there must not
-    replace numpy.
+    """Move the working directory, which `python -m` puts first, to the end of the path: a
+    `numpy.py` there must not replace numpy.
     """
     if sys.path[0] in ("", os.getcwd()):
         sys.path.append(sys.path.pop(0))

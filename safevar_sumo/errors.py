@@ -21,7 +21,8 @@ INTERRUPT_EXIT_CODE = 130
 
 
 _subject: ContextVar[str] = ContextVar("subject", default="study")
-"""What the code that runs now is about: a study, a file or a command's argument, as errors name it."""
+"""What the code that runs now is about: a study, a file or a command's argument, as errors name it.
+"""
 
 
 def subject() -> str:
@@ -51,7 +52,8 @@ class InputError(SafevarError):
     Parameters
     ----------
     source
-        Where the value comes from: a file, a flag or a command's argument; "" for what the code that runs now is about.
+        Where the value comes from: a file, a flag or a command's argument; "" for what the code
+        that runs now is about.
     problem
         The key and the value, and what is wrong with them.
     legal
@@ -62,7 +64,9 @@ class InputError(SafevarError):
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
         self.source = source or subject()
-        self.problem = problem.encode(errors="backslashreplace").decode()  # a user's text may have lone surrogates
+        self.problem = problem.encode(
+            errors="backslashreplace"
+        ).decode()  # a user's text may have lone surrogates
         self.legal = legal
         super().__init__(self.source, self.problem, legal)
 
@@ -72,8 +76,8 @@ class InputError(SafevarError):
 
 
 class UserCodeError(InputError):
-    """User code that a study names failed or returned an illegal value; `place` is its file and line, "" if they are
-    unknown.
+    """User code that a study names failed or returned an illegal value; `place` is its file and
+    line, "" if they are unknown.
     """
 
     def __init__(self, source: object, problem: str, legal: str = "", place: str = "") -> None:
@@ -86,14 +90,19 @@ class SimulationError(SafevarError):
 
 
 class EnvironmentFault(SafevarError):
-    """A simulation failed for a reason outside its setting: a disk, memory, netconvert, SUMO's start."""
+    """A simulation failed for a reason outside its setting: a disk, memory, netconvert, SUMO's
+    start.
+    """
 
 
 def warn(message: str) -> None:
     """Warn, and name the line of user code that called this package."""
     frame = inspect.currentframe()
     level = 1
-    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]:
+    while (
+        frame is not None
+        and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]
+    ):
         frame = frame.f_back
         level = level + 1
     warnings.warn(message, stacklevel=level)
@@ -104,17 +113,24 @@ MAX_MESSAGE_LENGTH = 500
 
 
 def describe_error(error: BaseException) -> str:
-    """Describe an error by its class and its message, cut at `MAX_MESSAGE_LENGTH`, even if `str(error)` fails."""
+    """Describe an error by its class and its message, cut at `MAX_MESSAGE_LENGTH`, even if
+    `str(error)` fails.
+    """
     try:
         message = " ".join(str(error).split())
     except Exception:
         message = ""
-    excerpt = message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:MAX_MESSAGE_LENGTH]}..."
+    excerpt = (
+        message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:MAX_MESSAGE_LENGTH]}..."
+    )
     return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
 
 
-def unknown_name(source: object, problem: str, name: object, names: Iterable[str], otherwise: str = "") -> InputError:
-    """Make the error for an unknown name: it suggests the nearest known name, and lists all known names.
+def unknown_name(
+    source: object, problem: str, name: object, names: Iterable[str], otherwise: str = ""
+) -> InputError:
+    """Make the error for an unknown name: it suggests the nearest known name, and lists all known
+    names.
 
     Parameters
     ----------
@@ -128,7 +144,9 @@ def unknown_name(source: object, problem: str, name: object, names: Iterable[str
         What is accepted besides the names.
     """
     known_names = list(names)
-    return InputError(source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}")
+    return InputError(
+        source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}"
+    )
 
 
 def check_whole(option: str, value: object, highest: int) -> None:
@@ -144,15 +162,17 @@ def check_text(argument: str, value: Any) -> Any:
     return value
 
 
-def check_name(source: object, problem: str, name: object, names: Collection[str], otherwise: str = "") -> None:
+def check_name(
+    source: object, problem: str, name: object, names: Collection[str], otherwise: str = ""
+) -> None:
     """Refuse a name that is not known; raises the error of `unknown_name`."""
     if name not in names:
         raise unknown_name(source, problem, name, names, otherwise)
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if no name is
-    similar.
+    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if
+    no name is similar.
     """
     names_in_lower_case = {known_name.lower(): known_name for known_name in names}
     matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)

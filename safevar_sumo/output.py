@@ -1,5 +1,5 @@
-"""Files that users name: output files, written as a whole or not at all; and files beside a study. Temporary files and
-folders, also those of killed processes.
+"""Files that users name: output files, written as a whole or not at all; and files beside a study.
+Temporary files and folders, also those of killed processes.
 """
 
 from __future__ import annotations
@@ -22,23 +22,29 @@ ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
 SETTLING_TIME = 0.1
 """Time within which a process locks a temporary file that it has made [s]."""
 PREFIX, LOCK = "safevar-", "lock"
-"""Beginning of the names of temporary folders, and the file in them that their process has locked."""
+"""Beginning of the names of temporary folders, and the file in them that their process has locked.
+"""
 WRITABLE = "a file in a directory that can be written, with space for it"
 """What an error about an output file expects."""
 
 
 @contextmanager
 def whole_file(path: Path, option: str = "") -> Iterator[Path]:
-    """Give the path of a temporary file to write, which then replaces `path`; after an error `path` is as it was.
+    """Give the path of a temporary file to write, which then replaces `path`; after an error `path`
+    is as it was.
 
-    The temporary file lies beside `path` and has the same ending. Those that killed processes have left there are
-    removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an InputError that names `option`, if it
-    is given.
+    The temporary file lies beside `path` and has the same ending. Those that killed processes have
+    left there are removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an
+    InputError that names `option`, if it is given.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
     is_stream = target.exists() and not target.is_file()
     short_stem = target.stem[:100]  # file systems limit the length of names
-    file = path if is_stream else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
+    file = (
+        path
+        if is_stream
+        else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
+    )
     try:
         pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
         with nullcontext() if is_stream else _owned(file, file.parent.glob(pattern)):
@@ -57,7 +63,9 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
-    """Give a temporary folder, which ends with the block; those that killed processes have left are removed."""
+    """Give a temporary folder, which ends with the block; those that killed processes have left are
+    removed.
+    """
     with tempfile.TemporaryDirectory(prefix=PREFIX, dir=parent, ignore_cleanup_errors=True) as text:
         folder = Path(text)
         with _owned(folder / LOCK, folder.parent.glob(f"{PREFIX}*/{LOCK}")):
@@ -66,7 +74,9 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def _owned(file: Path, others: Iterable[Path]) -> Iterator[None]:
-    """Make a temporary file and lock it within the block; remove those of the others that nobody has locked."""
+    """Make a temporary file and lock it within the block; remove those of the others that nobody
+    has locked.
+    """
     with open(file, "xb") as own:
         if os.name != "nt":  # where a lock would keep out this process, too
             for other in others:
@@ -78,8 +88,8 @@ def _owned(file: Path, others: Iterable[Path]) -> Iterator[None]:
 
 
 def _remove_left_behind(file: Path) -> None:
-    """Remove a temporary file, of a `LOCK` its folder, that no process has locked, unless it is so new that one may be
-    about to.
+    """Remove a temporary file, of a `LOCK` its folder, that no process has locked, unless it is so
+    new that one may be about to.
     """
     with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
         portalocker.lock(stream, ALONE)
@@ -88,8 +98,8 @@ def _remove_left_behind(file: Path) -> None:
 
 
 def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: str = "") -> None:
-    """Refuse an output file that cannot be written, before the work begins, whose name has another ending, or that
-    exists and is named `but`; raises InputError.
+    """Refuse an output file that cannot be written, before the work begins, whose name has another
+    ending, or that exists and is named `but`; raises InputError.
     """
     if endings and path.suffix.lower() not in endings:
         raise InputError(option, str(path), f"a file that ends in {', '.join(endings)}")
@@ -104,14 +114,19 @@ def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: st
 
 def unwritable(path: Path, option: str, error: Exception) -> InputError:
     """The error for an output file that cannot be written."""
-    return InputError(option, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE)
+    return InputError(
+        option, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE
+    )
 
 
 def file_beside(text: str, folders: Sequence[str]) -> str:
-    """The file that a text names, relative to the folder of the study's file or of a file that it extends; "" if there
-    is none.
+    """The file that a text names, relative to the folder of the study's file or of a file that it
+    extends; "" if there is none.
     """
     try:
-        return next((os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()), "")
+        return next(
+            (os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()),
+            "",
+        )
     except (OSError, ValueError):  # the text is no path
         return ""

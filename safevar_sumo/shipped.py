@@ -1,4 +1,6 @@
-"""Folders of the shipped studies and SUMO networks, the program's name, and the command that starts it."""
+"""Folders of the shipped studies and SUMO networks, the program's name, and the command that starts
+it.
+"""
 
 from __future__ import annotations
 

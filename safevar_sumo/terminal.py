@@ -1,5 +1,6 @@
-"""Text on the terminal: users' text without markup and control characters; tables in which nothing is cut off; and the
-progress of long work, as a bar or elsewhere a line every half minute, with the time left.
+"""Text on the terminal: users' text without markup and control characters; tables in which nothing
+is cut off; and the progress of long work, as a bar or elsewhere a line every half minute, with the
+time left.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the stage, the amount done in it, and its total, 0 where it is unknown;
-first with nothing done.
+"""A function that shows progress, called with the stage, the amount done in it, and its total, 0
+where it is unknown; first with nothing done.
 """
 SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
 SETTLING_TIME = 2.0
-"""Work before the time left is shown [s]: batches that end together make earlier estimates meaningless."""
+"""Work before the time left is shown [s]: batches that end together make earlier estimates
+meaningless.
+"""
 UNLIMITED_WIDTH = 1_000_000
 """Width in which no line is broken [characters]."""
 
@@ -31,8 +34,8 @@ UNLIMITED_WIDTH = 1_000_000
 class WholeTable(Table):
     """A table of plain text that cuts nothing off.
 
-    In a narrow terminal it breaks lines between words; then it goes without padding; only then it breaks words. Each
-    column has a head, whether it holds numbers, and its cells.
+    In a narrow terminal it breaks lines between words; then it goes without padding; only then it
+    breaks words. Each column has a head, whether it holds numbers, and its cells.
     """
 
     def __init__(self, title: str, columns: Iterable[tuple[str, bool, Sequence[str]]]) -> None:
@@ -51,8 +54,13 @@ class WholeTable(Table):
         count = len(self.columns)
         for column in self.columns:
             cells = (column.header, *column.cells)
-            measures = [Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell) for cell in cells]
-            sizes.append((max(one.minimum for one in measures), max(one.maximum for one in measures)))
+            measures = [
+                Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell)
+                for cell in cells
+            ]
+            sizes.append(
+                (max(one.minimum for one in measures), max(one.maximum for one in measures))
+            )
             column.overflow = "fold"
         words, whole = (sum(size) for size in zip(*sizes, strict=True))
         space = options.max_width - count - 1  # beside the lines
@@ -62,14 +70,22 @@ class WholeTable(Table):
             spare = space - words - (0 if words + 2 * count > space else 2 * count)
             for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
                 if spare >= 0:
-                    column.width = longest_word + (full_width - longest_word) * spare // max(whole - words, 1)
+                    column.width = longest_word + (full_width - longest_word) * spare // max(
+                        whole - words, 1
+                    )
         yield from super().__rich_console__(console, options)
 
 
 def printable_text(text: object, style: str = "") -> Text:
-    """Make text printable by rich: white space becomes a space, any other unprintable character a question mark."""
+    """Make text printable by rich: white space becomes a space, any other unprintable character a
+    question mark.
+    """
     return Text(
-        "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in str(text)), style
+        "".join(
+            letter if letter.isprintable() else " " if letter.isspace() else "?"
+            for letter in str(text)
+        ),
+        style,
     )
 
 
@@ -128,7 +144,9 @@ class _Pace(ProgressColumn):
 
 @contextmanager
 def open_progress(progress: bool | Progress, console: Console | None = None) -> Iterator[Progress]:
-    """Yield the function to call: `progress` itself, or one that moves a bar or prints lines (True) or does nothing."""
+    """Yield the function to call: `progress` itself, or one that moves a bar or prints lines (True)
+    or does nothing.
+    """
     if progress is not True:
         yield progress or show_no_progress
         return

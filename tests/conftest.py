@@ -1,5 +1,5 @@
-"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools that compute in this
-process.
+"""Fixtures for many tests: systems, results, an own cache folder and working directory, and pools
+that compute in this process.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from safevar_sumo.study import load_study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched
 
-collect_ignore = [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
+collect_ignore = (
+    [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
+)
 """Tests that send POSIX signals to processes; other systems skip them."""
 
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
@@ -53,14 +55,17 @@ runs = 1
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_cache_and_pools_of_this_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Each session of tests builds its own networks, once for all of its processes; commands start no worker
-    processes.
+def _own_cache_and_pools_of_this_process(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[None]:
+    """Each session of tests builds its own networks, once for all of its processes; commands start
+    no worker processes.
     """
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(
-            "XDG_CACHE_HOME", str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache")
+            "XDG_CACHE_HOME",
+            str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"),
         )
         patch.setattr(local, "ProcessWorker", inline_worker)
         yield
@@ -76,8 +81,12 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
         if answer.question in COMMANDS:
             declared = contents_of(function_of(answer.question))
             assert declared is not None
-            keys = Contents(answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}).keys
-            by = next((key.removeprefix("limits.by_") for key in keys if key.startswith("limits.by_")), "")
+            keys = Contents(
+                answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}
+            ).keys
+            by = next(
+                (key.removeprefix("limits.by_") for key in keys if key.startswith("limits.by_")), ""
+            )
             for key in keys:
                 declared.with_options({"by": f"{by}=20,30"}).check_key(key)
 
@@ -88,7 +97,9 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _own_import_path() -> Iterator[None]:
-    """Folders of one test's user code are on the path of no other, also where the test changes the path itself."""
+    """Folders of one test's user code are on the path of no other, also where the test changes the
+    path itself.
+    """
     path = ImportPath.here()
     yield
     path.inherit()
@@ -102,7 +113,9 @@ def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(params=[name for name in study_names() if not is_rated(load_study(name))])
 def any_system(request: pytest.FixtureRequest) -> System:
-    """The system of each shipped study in turn, except a study that is rated in thousands of cells."""
+    """The system of each shipped study in turn, except a study that is rated in thousands of
+    cells.
+    """
     system = assemble(load_study(request.param))
     return replace(system, matrix=system.matrix[::30])  # only some points of a long matrix
 

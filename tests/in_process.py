@@ -1,5 +1,5 @@
-"""Campaigns and commands in this process: a pool that computes at once, commands as users type them; and the blocks of
-the manual's pages.
+"""Campaigns and commands in this process: a pool that computes at once, commands as users type
+them; and the blocks of the manual's pages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ ROOT = Path(__file__).parents[1]
 
 
 class Block(NamedTuple):
-    """A fenced block of a page: its language, the file that it is the content of (or ""), and its text."""
+    """A fenced block of a page: its language, the file that it is the content of (or ""), and its
+    text.
+    """
 
     language: str
     title: str
@@ -79,7 +81,15 @@ def inline_worker(last_words: Path) -> InlinePool:
 
 def searched(study: Study, out: Path) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
-    run_campaign(study, assemble(study), all_runs(study), out, InlinePool(), show_no_progress, lambda message: None)
+    run_campaign(
+        study,
+        assemble(study),
+        all_runs(study),
+        out,
+        InlinePool(),
+        show_no_progress,
+        lambda message: None,
+    )
     return out
 
 
@@ -91,8 +101,8 @@ class CommandOutput(NamedTuple):
 
 
 def run(*arguments: str, expect: int = 0) -> CommandOutput:
-    """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules that it took from
-    the test's folder.
+    """Run a command as a user types it; its exit code must be `expect`. Afterwards, unload modules
+    that it took from the test's folder.
     """
     out = io.StringIO()
     err = io.StringIO()
@@ -102,7 +112,9 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
     loaded_modules = set(sys.modules)
     with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
-        patch.setattr(os, "_exit", sys.exit)  # the program calls it if a thread still runs; this process must continue
+        patch.setattr(
+            os, "_exit", sys.exit
+        )  # the program calls it if a thread still runs; this process must continue
         try:
             main()
         except SystemExit as end:
@@ -123,11 +135,15 @@ def json_of(*arguments: str) -> Any:
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command must end with exit code 2 and print, warnings and notes apart, all of `message` in one or two lines,
-    or a line for each mistake.
+    """The command must end with exit code 2 and print, warnings and notes apart, all of `message`
+    in one or two lines, or a line for each mistake.
     """
     output = run(*arguments, expect=2)
     for part in message:
         assert part in output.stderr, output.stderr
-    lines = [line for line in output.stderr.strip().splitlines() if not line.startswith(("warning: ", "note: "))]
+    lines = [
+        line
+        for line in output.stderr.strip().splitlines()
+        if not line.startswith(("warning: ", "note: "))
+    ]
     assert len(lines) <= 2 or lines[0].endswith("mistakes"), output.stderr

@@ -1,4 +1,6 @@
-"""Made-up records: what vehicles see, their runs by speeds and gaps, and evaluations by safety degrees."""
+"""Made-up records: what vehicles see, their runs by speeds and gaps, and evaluations by safety
+degrees.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,15 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.questions.case import Case, build_case
-from safevar_sumo.records import Encounter, Evaluations, FloatArray, Observation, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import (
+    Encounter,
+    Evaluations,
+    FloatArray,
+    Observation,
+    Outcome,
+    SimulationRuns,
+    Trace,
+)
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
 
@@ -19,9 +29,15 @@ def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case
 
 
 def made_up_runs(
-    step: float, speed: FloatArray, gap: FloatArray | float = 0.0, collision_speed: Any = np.nan, **columns: FloatArray
+    step: float,
+    speed: FloatArray,
+    gap: FloatArray | float = 0.0,
+    collision_speed: Any = np.nan,
+    **columns: FloatArray,
 ) -> SimulationRuns:
-    """Vehicles of these speeds, shape (T, N), that end by standing or colliding; other columns of the trace are 0."""
+    """Vehicles of these speeds, shape (T, N), that end by standing or colliding; other columns of
+    the trace are 0.
+    """
     zero = np.zeros_like(speed)
     gaps = np.broadcast_to(gap, speed.shape)
     names = ("position", "lateral", "lateral_speed", "throttle", "brake", "gear")
@@ -57,7 +73,15 @@ def seen(
     across_speed = zero + lateral_speed
     ahead = zero + leader
     return Observation(
-        time, zero + speed, zero + gap, speed - ahead, across, across_speed, visibility, ahead, zero + throttle
+        time,
+        zero + speed,
+        zero + gap,
+        speed - ahead,
+        across,
+        across_speed,
+        visibility,
+        ahead,
+        zero + throttle,
     )
 
 
@@ -69,7 +93,9 @@ def original_of(system: Any) -> FloatArray:
 def drawn(system: Any, number: int, seed: int) -> FloatArray:
     """The original vehicle and settings at random, those that a region allows."""
     members = system.characteristics
-    settings = np.random.default_rng(seed).uniform(members.lower, members.upper, (number, len(members)))
+    settings = np.random.default_rng(seed).uniform(
+        members.lower, members.upper, (number, len(members))
+    )
     settings[0] = members.original
     settings = np.asarray(members.filter(settings))
     return settings[system.region.feasible(settings)]

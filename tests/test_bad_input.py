@@ -1,5 +1,5 @@
-"""What a user may type wrongly, and what the command says in one or two lines before it ends with code 2; whatever is
-in a study file is a study or an error of one kind, never a traceback.
+"""What a user may type wrongly, and what the command says in one or two lines before it ends with
+code 2; whatever is in a study file is a study or an error of one kind, never a traceback.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ FILES = {
     "child.toml": 'extends = "base.toml"\nname = "child"\n',
     "mine.csv": "mass,radius\n1,2\n",
     "broken.py": "1 / 0\n",
-    "twice.toml": 'extends = "euro_ncap_pedestrian"\nname = "twice"\n[[matrix.tests]]\nname = "near"\n'
-    'model = "crossing"\nparameters = { speed = 20 }\nover = { speed = [30] }\n',
+    "twice.toml": (
+        'extends = "euro_ncap_pedestrian"\nname = "twice"\n[[matrix.tests]]\nname = "near"\n'
+        'model = "crossing"\nparameters = { speed = 20 }\nover = { speed = [30] }\n'
+    ),
     "mine.py": "class Mine: ...\n",
     "other/manifest.json": '{"study": {}, "versions": {}, "original": {}}',
     "results/smoke/manifest.json": "{}",
@@ -59,8 +61,14 @@ TYPED = [
     ("simulate sun --set mass=+8", "or mass=+8% of the original, or any with --beyond"),
     ("simulate sensing --set sensorAngle=+10%", "'sensorAngle=+10%': the original is 0"),
     ("simulate sun --set weight=1", "weight"),
-    ("simulate sun_joint --beyond --set distance=1000", "distance is 959.67 m longer than the lane"),
-    ("simulate sun_joint --beyond --set recognition_delay=-1", "a finite number from 0, up to 300 s"),
+    (
+        "simulate sun_joint --beyond --set distance=1000",
+        "distance is 959.67 m longer than the lane",
+    ),
+    (
+        "simulate sun_joint --beyond --set recognition_delay=-1",
+        "a finite number from 0, up to 300 s",
+    ),
     ("simulate sun --set mass=nan", "NAME=VALUE"),
     ("simulate sun --set mass=2300 --set mass=2400", "mass is set twice"),
     ("simulate sun --set mass=+50%", "mass = 3606"),
@@ -82,8 +90,14 @@ TYPED = [
     ("explain smoke --solution nsga2:0:0", "has no solutions"),
     ("tolerance rain --characteristics mas", "did you mean 'mass'?"),
     ("tolerance smoke --margin -1", "a number from 0 to 100"),
-    ("tolerance smoke --limits mas>=2100", "--limits: mas: there is no such characteristic; did you mean 'mass'?"),
-    ("tolerance smoke --limits mass<=2500 --characteristics radius", "mass does not vary with these"),
+    (
+        "tolerance smoke --limits mas>=2100",
+        "--limits: mas: there is no such characteristic; did you mean 'mass'?",
+    ),
+    (
+        "tolerance smoke --limits mass<=2500 --characteristics radius",
+        "mass does not vary with these",
+    ),
     ("repair wear", "nothing is promised"),
     ("repair wear --promise treadDepth", "NAME >= X"),
     ("repair wear --promise all --change braking", "did you mean 'braking_share'?"),
@@ -121,7 +135,10 @@ TYPED = [
     ("list wether", "did you mean 'weathers'?"),
     ("tables results/smoke --table rq9", "there is no table 'rq9'"),
     ("check", "Missing argument 'NAME'"),
-    ("export file --solution nsga2:0:0 --to carla --out x", "file: is a study and has no solutions"),
+    (
+        "export file --solution nsga2:0:0 --to carla --out x",
+        "file: is a study and has no solutions",
+    ),
     ("simulate euro_ncap_pedestrian --point CPNA", "72 points, such as CPNA, speed 10"),
 ]
 
@@ -153,18 +170,31 @@ def test_bad_input_ends_with_code_2_and_changes_no_file(
 
 TABLES = tables_of(load_study("smoke"))
 SCALARS = st.one_of(
-    st.integers(), st.floats(), st.text(max_size=20), st.booleans(), st.dates(), st.datetimes(), st.times()
+    st.integers(),
+    st.floats(),
+    st.text(max_size=20),
+    st.booleans(),
+    st.dates(),
+    st.datetimes(),
+    st.times(),
 )
 ANYTHING = st.recursive(
     SCALARS,
-    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=6,
 )
 
 
 def paths(tables: JsonObject, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
     """Every key of nested tables."""
-    inner = [path for key, value in tables.items() if isinstance(value, dict) for path in paths(value, (*before, key))]
+    inner = [
+        path
+        for key, value in tables.items()
+        if isinstance(value, dict)
+        for path in paths(value, (*before, key))
+    ]
     return [*((*before, key) for key in tables), *inner]
 
 
@@ -176,7 +206,9 @@ def replaced(tables: JsonObject, path: tuple[str, ...], value: object) -> JsonOb
 @pytest.mark.slow
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(path=st.sampled_from(paths(TABLES)), value=ANYTHING)
-def test_a_study_with_anything_in_one_place_is_read_or_refused(path: tuple[str, ...], value: object) -> None:
+def test_a_study_with_anything_in_one_place_is_read_or_refused(
+    path: tuple[str, ...], value: object
+) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "mine.toml"
         try:

@@ -1,5 +1,5 @@
-"""README and tutorials true to the letter: every block of every page is put where it says, and run in the order of the
-page.
+"""README and tutorials true to the letter: every block of every page is put where it says, and run
+in the order of the page.
 """
 
 from __future__ import annotations
@@ -23,18 +23,26 @@ from PIL import Image
 from safevar_sumo.ads import ADS
 from safevar_sumo.cli.program import commands
 from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.results.manifest import KEYS_WITHOUT_EFFECT_ON_EVALUATIONS, KEYS_WITHOUT_EFFECT_ON_RESULTS
+from safevar_sumo.results.manifest import (
+    KEYS_WITHOUT_EFFECT_ON_EVALUATIONS,
+    KEYS_WITHOUT_EFFECT_ON_RESULTS,
+)
 from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import ROOT, blocks
 
-PAGES = ["README.md", *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md")))]
+PAGES = [
+    "README.md",
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
+]
 PROGRAM = "python -m safevar_sumo "
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
-def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_block_of_a_page_does_what_it_says(
+    page: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)  # coarse limits, to save time
     names = {}
     for block in blocks(page):
@@ -46,7 +54,9 @@ def test_every_block_of_a_page_does_what_it_says(page: str, in_tmp: Path, monkey
             for line in block.text.splitlines():
                 run(line)
         else:
-            assert block.language in ("text", "bibtex"), f"{page}: a block of {block.language!r} that nothing runs"
+            assert block.language in ("text", "bibtex"), (
+                f"{page}: a block of {block.language!r} that nothing runs"
+            )
 
 
 def run(line: str) -> None:
@@ -57,9 +67,13 @@ def run(line: str) -> None:
         )
         assert done.exit_code == 0, f"{line}\n{done.output}"
     elif line.startswith("make "):
-        assert re.search(rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
+        assert re.search(
+            rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE
+        ), line
     else:
-        assert line.startswith(("pip install", "eval ", "#")) or not line, f"a line that nothing runs: {line}"
+        assert line.startswith(("pip install", "eval ", "#")) or not line, (
+            f"a line that nothing runs: {line}"
+        )
 
 
 def script_of_docs(name: str) -> Any:
@@ -75,13 +89,25 @@ def script_of_docs(name: str) -> Any:
 def test_every_picture_has_its_command_and_its_page() -> None:
     texts = "".join((ROOT / page).read_text() for page in PAGES)
     names = {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
-    assert names == script_of_docs("pictures").COMMANDS.keys() == set(re.findall(r"pictures/([\w.]+)\)", texts))
+    assert (
+        names
+        == script_of_docs("pictures").COMMANDS.keys()
+        == set(re.findall(r"pictures/([\w.]+)\)", texts))
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["failure.png", "failure.gif", "stops.png", "encounters.png", "report.png"])
-def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(name: str, tmp_path: Path) -> None:
-    if name == "report.png" and not shutil.which("chromium") and not os.environ.get("SAFEVAR_BROWSER"):
+@pytest.mark.parametrize(
+    "name", ["failure.png", "failure.gif", "stops.png", "encounters.png", "report.png"]
+)
+def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
+    name: str, tmp_path: Path
+) -> None:
+    if (
+        name == "report.png"
+        and not shutil.which("chromium")
+        and not os.environ.get("SAFEVAR_BROWSER")
+    ):
         pytest.skip("chromium is not installed")
     drawn_anew = script_of_docs("pictures").draw(name, tmp_path)
     with Image.open(drawn_anew) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
@@ -89,14 +115,16 @@ def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(name: str, tm
         assert getattr(drawn, "n_frames", 1) == getattr(stored, "n_frames", 1)
 
 
-def test_the_version_of_setup_cfg_is_that_of_the_program_its_results_its_citation_and_its_changes() -> None:
+def test_the_version_of_setup_cfg_is_that_of_results_citation_and_changelog() -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     version = config["metadata"]["version"]
     output = CliRunner().invoke(commands, ["--version"]).stdout
     assert output.endswith(f", version {version}\n"), "install again: pip install --editable ."
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    assert re.findall("^## (.*) [(]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0] == version
+    assert (
+        re.findall("^## (.*) [(]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0] == version
+    )
 
 
 def test_every_command_that_a_page_names_exists() -> None:
@@ -112,11 +140,22 @@ def test_every_shipped_characteristic_is_explained(name: str) -> None:
         assert row.counterpart, key
 
 
-def test_the_map_of_the_code_names_every_package_and_no_drawing_a_folder_that_is_not_there() -> None:
+def test_the_map_of_the_code_names_every_package_and_no_drawing_a_folder_that_is_not_there() -> (
+    None
+):
     package = ROOT / "safevar_sumo"
-    tree, drawing = ((ROOT / page).read_text().split("```")[1] for page in ("CONTRIBUTING.md", "docs/architecture.md"))
-    assert {path.parent.name for path in package.glob("*/**/__init__.py")} <= set(re.findall(r"\w+", tree))
-    there = {path.name for path in (*ROOT.iterdir(), *(ROOT / "tests").iterdir(), *package.rglob("*")) if path.is_dir()}
+    tree, drawing = (
+        (ROOT / page).read_text().split("```")[1]
+        for page in ("CONTRIBUTING.md", "docs/architecture.md")
+    )
+    assert {path.parent.name for path in package.glob("*/**/__init__.py")} <= set(
+        re.findall(r"\w+", tree)
+    )
+    there = {
+        path.name
+        for path in (*ROOT.iterdir(), *(ROOT / "tests").iterdir(), *package.rglob("*"))
+        if path.is_dir()
+    }
     assert set(re.findall(r"(?<![\w/])(\w+)/(?=[\s,;`])", tree + drawing)) <= there
 
 
@@ -133,7 +172,10 @@ def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() 
     ]
     assert ("docs/architecture.md", "verify_in_sumo", "sumo/verification.py") in mentions
     for page, name, file in mentions:
-        path = next((place / file for place in (ROOT / "safevar_sumo", ROOT) if (place / file).is_file()), None)
+        path = next(
+            (place / file for place in (ROOT / "safevar_sumo", ROOT) if (place / file).is_file()),
+            None,
+        )
         assert path is not None, f"{page}: {file}"
         defined = rf"^ *(def |class )?{name.rpartition('.')[2]}\b *[(:=]"
         assert re.search(defined, path.read_text(), re.MULTILINE), f"{page}: {name} in {file}"
@@ -144,19 +186,28 @@ def test_every_file_of_code_that_is_named_exists() -> None:
     code = [*(ROOT / "studies").rglob("*.toml"), *(ROOT / "safevar_sumo").rglob("*.py")]
     there = [
         *code,
-        *(path for folder in ("benchmarks", "calibration", "docs", "tests") for path in (ROOT / folder).rglob("*.py")),
+        *(
+            path
+            for folder in ("benchmarks", "calibration", "docs", "tests")
+            for path in (ROOT / folder).rglob("*.py")
+        ),
     ]
     for file in ["CONTRIBUTING.md", *PAGES, *(str(path.relative_to(ROOT)) for path in code)]:
         made = {block.title for block in blocks(file)}
         for name in re.findall(
-            r"(?<![\w/.])((?:[a-z_]+/)*(?:[a-z_]+/[a-z_]+|test_\w+)\.py)\b", (ROOT / file).read_text()
+            r"(?<![\w/.])((?:[a-z_]+/)*(?:[a-z_]+/[a-z_]+|test_\w+)\.py)\b",
+            (ROOT / file).read_text(),
         ):
-            assert name in made or any(path.as_posix().endswith(f"/{name}") for path in there), f"{file}: {name}"
+            assert name in made or any(path.as_posix().endswith(f"/{name}") for path in there), (
+                f"{file}: {name}"
+            )
 
 
 def test_the_page_on_results_lists_every_key_that_may_change() -> None:
     page = (ROOT / "docs" / "results.md").read_text()
-    (listed,) = re.findall(r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL)
+    (listed,) = re.findall(
+        r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL
+    )
     keys = re.findall(r"`\[*(\w+)\]*`", listed)
     assert sorted(keys) == sorted(
         [*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS]
@@ -176,16 +227,21 @@ def test_the_line_that_stands_for_a_table_is_the_command_that_prints_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (name,) = re.findall(
-        r"^`python docs/generate.py (\w+)`$", (ROOT / "docs" / "study_file.md").read_text(), re.MULTILINE
+        r"^`python docs/generate.py (\w+)`$",
+        (ROOT / "docs" / "study_file.md").read_text(),
+        re.MULTILINE,
     )
     monkeypatch.setattr(sys, "argv", ["generate.py", name])
     runpy.run_path(str(ROOT / "docs" / "generate.py"), run_name="__main__")
-    assert "| `evaluations` | integer, at least 1, at most 1e+07 | required |" in capsys.readouterr().out
+    assert (
+        "| `evaluations` | integer, at least 1, at most 1e+07 | required |"
+        in capsys.readouterr().out
+    )
 
 
 class Numbers(NamedTuple):
-    """A comment of a page: commands, and of the last one's JSON the values at some paths, as the page's next paragraph
-    has them.
+    """A comment of a page: commands, and of the last one's JSON the values at some paths, as the
+    page's next paragraph has them.
     """
 
     page: str
@@ -195,14 +251,18 @@ class Numbers(NamedTuple):
 
 
 def marked(page: str) -> list[Numbers]:
-    """Every comment that begins with `numbers:`: lines of commands, then lines of `path = number`."""
+    """Every comment that begins with `numbers:`: lines of commands, then lines of `path =
+    number`.
+    """
     result = []
     for comment, paragraph in re.findall(
         r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL
     ):
         lines = [line.strip() for line in comment.splitlines() if line.strip()]
         values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
-        result.append(Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph))
+        result.append(
+            Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph)
+        )
     return result
 
 
@@ -217,15 +277,26 @@ def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lines", sorted({tuple(one.commands) for one in MARKED}), ids=lambda lines: lines[-1])
-def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ...], in_tmp: Path) -> None:
-    """Shares are given in whole per cent, limits as they are rounded, others with two decimals and their unit."""
+@pytest.mark.parametrize(
+    "lines", sorted({tuple(one.commands) for one in MARKED}), ids=lambda lines: lines[-1]
+)
+def test_marked_numbers_are_those_that_their_commands_print(
+    lines: tuple[str, ...], in_tmp: Path
+) -> None:
+    """Shares are given in whole per cent, limits as they are rounded, others with two decimals and
+    their unit.
+    """
     for command in lines:
-        done = CliRunner().invoke(commands, shlex.split(command.removeprefix(PROGRAM)), catch_exceptions=False)
+        done = CliRunner().invoke(
+            commands, shlex.split(command.removeprefix(PROGRAM)), catch_exceptions=False
+        )
         assert done.exit_code == 0, f"{command}\n{done.output}"
     records = json.loads(done.stdout)
     for page, path, value in (
-        (one.page, *item) for one in MARKED if tuple(one.commands) == lines for item in one.values.items()
+        (one.page, *item)
+        for one in MARKED
+        if tuple(one.commands) == lines
+        for item in one.values.items()
     ):
         result = records
         for key in path.split("."):
@@ -234,5 +305,9 @@ def test_marked_numbers_are_those_that_their_commands_print(lines: tuple[str, ..
             else:
                 result = result[int(key) if isinstance(result, list) else key]
         unit = value.partition(" ")[2]
-        text = f"{result:.10g}" if path.startswith("tables.limits.") else f"{result:.2f} {unit}".strip()
+        text = (
+            f"{result:.10g}"
+            if path.startswith("tables.limits.")
+            else f"{result:.2f} {unit}".strip()
+        )
         assert value == (f"{100 * result:.0f} %" if unit == "%" else text), f"{page}: {path}"

@@ -1,4 +1,6 @@
-"""The notebooks: stored with what they show, and each runs from its first cell to its last in a folder of its own."""
+"""The notebooks: stored with what they show, and each runs from its first cell to its last in a
+folder of its own.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +55,10 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
 
 def test_stored_outputs_are_of_todays_vehicle() -> None:
     """`python -m tests.test_notebooks [NAME]...` stores them anew."""
-    texts = {name: _texts(nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)) for name in (*SHOWN, "answers")}
+    texts = {
+        name: _texts(nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4))
+        for name in (*SHOWN, "answers")
+    }
     assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
     assert results == results[:1] * len(SHOWN)
@@ -63,7 +68,9 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHOWN)
-def test_a_notebook_shows_its_tables_and_pictures(name: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_shows_its_tables_and_pictures(
+    name: str, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With a smaller study than the one that its stored outputs come from."""
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
@@ -82,13 +89,22 @@ def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
     )
     rows = sv.evaluate("sun", settings).rename(columns=COLUMNS)
     for name in ("nsga2", "rs", "fuzzer"):
-        rows[[*characteristics.names, *COLUMNS.values()]].fillna(0).to_csv(tmp_path / f"sun_{name}.csv", index=False)
+        rows[[*characteristics.names, *COLUMNS.values()]].fillna(0).to_csv(
+            tmp_path / f"sun_{name}.csv", index=False
+        )
     monkeypatch.setenv("SAFEVAR_PUBLISHED", str(tmp_path))
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
-    for notebook in (nbformat.read(NOTEBOOKS / "paper.ipynb", as_version=4), _executed("paper", place, timeout=240)):
+    for notebook in (
+        nbformat.read(NOTEBOOKS / "paper.ipynb", as_version=4),
+        _executed("paper", place, timeout=240),
+    ):
         assert _shown(notebook) == (0, 0)
-        tables = [text for text in _texts(notebook) if "results/small" in text and "results/published" in text]
+        tables = [
+            text
+            for text in _texts(notebook)
+            if "results/small" in text and "results/published" in text
+        ]
         assert len(tables) == 6
 
 
@@ -105,18 +121,27 @@ def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
 
 
 def _outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
-    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    return [
+        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+    ]
 
 
 def _texts(notebook: nbformat.NotebookNode) -> list[str]:
     """Everything that a notebook's cells print or return, as text."""
-    return [output.get("text") or output.get("data", {}).get("text/plain", "") for output in _outputs(notebook)]
+    return [
+        output.get("text") or output.get("data", {}).get("text/plain", "")
+        for output in _outputs(notebook)
+    ]
 
 
 def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
     """Number of answers and of pictures that a notebook shows; refuses outputs on stderr."""
     outputs = _outputs(notebook)
-    assert not [output for output in outputs if output.get("name") == "stderr" or output.output_type == "error"]
+    assert not [
+        output
+        for output in outputs
+        if output.get("name") == "stderr" or output.output_type == "error"
+    ]
     data = [output.get("data", {}) for output in outputs]
     answers = sum("<caption>" in one.get("text/html", "") for one in data)
     return answers, sum("image/png" in one for one in data)
@@ -127,9 +152,16 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     notebook = _executed("answers", tmp_path, timeout=900)
     outputs = _outputs(notebook)
     shown = [output.get("data", {}) for output in outputs]
-    assert (sum("text/html" in data for data in shown), sum("image/png" in data for data in shown)) == (5, 3)
+    assert (
+        sum("text/html" in data for data in shown),
+        sum("image/png" in data for data in shown),
+    ) == (5, 3)
     printed = "".join(_texts(notebook))
-    for result in ("All may go to their limits together", "The probability of an unsafe vehicle is", "of them have "):
+    for result in (
+        "All may go to their limits together",
+        "The probability of an unsafe vehicle is",
+        "of them have ",
+    ):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]
 
@@ -137,21 +169,27 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) -> None:
     file = NOTEBOOKS / "rating.ipynb"
-    for notebook in (nbformat.read(file, as_version=4), _executed("rating", tmp_path, timeout=1800)):
+    for notebook in (
+        nbformat.read(file, as_version=4),
+        _executed("rating", tmp_path, timeout=1800),
+    ):
         texts = _texts(notebook)
         assert any("the vehicle loses" in text for text in texts)
         assert sum("Axes" in text for text in texts) == 2
 
 
 def main() -> None:
-    """Execute notebooks, by default all, and store them with their outputs, pictures in 128 colours: a third of the
-    size. `paper` needs the published files.
+    """Execute notebooks, by default all, and store them with their outputs, pictures in 128
+    colours: a third of the size. `paper` needs the published files.
     """
     with tempfile.TemporaryDirectory() as folder:
         for name in sys.argv[1:] or (*SHOWN, *OTHERS):
             notebook = _executed(name, Path(folder), timeout=1800)
             for data in [
-                output["data"] for cell in notebook.cells for output in cell.get("outputs", []) if "data" in output
+                output["data"]
+                for cell in notebook.cells
+                for output in cell.get("outputs", [])
+                if "data" in output
             ]:
                 if "image/png" in data:
                     drawn = Image.open(io.BytesIO(base64.b64decode(data["image/png"])))

@@ -20,9 +20,13 @@ def unrelated_assignments(function: ast.AST) -> Iterator[ast.Assign]:
         ):
             targets = [ast.unparse(target) for target in node.targets[0].elts]
             read = [{ast.unparse(part) for part in ast.walk(value)} for value in node.value.elts]
-            is_starred = any(isinstance(part, ast.Starred) for part in [*node.targets[0].elts, *node.value.elts])
+            is_starred = any(
+                isinstance(part, ast.Starred) for part in [*node.targets[0].elts, *node.value.elts]
+            )
             if not is_starred and not any(
-                target in later for number, target in enumerate(targets) for later in read[number + 1 :]
+                target in later
+                for number, target in enumerate(targets)
+                for later in read[number + 1 :]
             ):
                 yield node
 

@@ -1,7 +1,7 @@
 """Automatic emergency braking by braking distance on top of a cruise control.
 
-`Aeb` brakes like production systems; `AutowareAeb` replaces Autoware's module, with its published formula, parameters
-and stop operator.
+`Aeb` brakes like production systems; `AutowareAeb` replaces Autoware's module, with its published
+formula, parameters and stop operator.
 """
 
 from __future__ import annotations
@@ -59,15 +59,16 @@ class _Memory(NamedTuple):
 
 
 class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls below its braking
-    distances.
+    """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls
+    below its braking distances.
 
-    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with
-    speed v and deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and `response_time`
-    rt; b is `braking_share` of the original vehicle's greatest deceleration. After braking it never accelerates again.
+    distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with speed v and
+    deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and
+    `response_time` rt; b is `braking_share` of the original vehicle's greatest deceleration. After
+    braking it never accelerates again.
 
-    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`, and while it
-    brakes. The simulated driver does not react to warnings.
+    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`,
+    and while it brakes. The simulated driver does not react to warnings.
 
     Parameters
     ----------
@@ -86,13 +87,14 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     reach
         Range of its sensors in clear weather [m].
     warning_time
-        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default is an assumption:
-        Euro NCAP requires a warning by 1.7 s, and 0.3 s allow for late sensors.
+        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default
+        is an assumption: Euro NCAP requires a warning by 1.7 s, and 0.3 s allow for late sensors.
 
     Notes
     -----
-    The defaults are assumptions, not measurements: with them the original vehicle of `carla` just avoids a collision at
-    the standard points of Euro NCAP's pedestrian and car-to-car tests. docs/scenarios.md lists the exceptions.
+    The defaults are assumptions, not measurements: with them the original vehicle of `carla` just
+    avoids a collision at the standard points of Euro NCAP's pedestrian and car-to-car tests.
+    docs/scenarios.md lists the exceptions.
     """
 
     cruise_speed: PositiveParameter | None = None
@@ -110,7 +112,14 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         zeros = np.zeros(n)
         nobody = np.zeros(n, dtype=bool)
         return _Memory(
-            nominal, step, None, zeros, intervened=nobody, obstacle=zeros, obstacle_speed=zeros, warns=nobody
+            nominal,
+            step,
+            None,
+            zeros,
+            intervened=nobody,
+            obstacle=zeros,
+            obstacle_speed=zeros,
+            warns=nobody,
         )
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -119,7 +128,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
         has_intervened = memory.intervened | (stage > NO_BRAKING)
-        pedals = pedals_for(nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim)
+        pedals = pedals_for(
+            nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim
+        )
         throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
         command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
@@ -138,13 +149,21 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return memory.warns
 
     def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
-        """The braking stage; it does not fall while the obstacle blocks the way, nor at standstill."""
+        """The braking stage; it does not fall while the obstacle blocks the way, nor at
+        standstill.
+        """
         speed = seen.speed
         obstacle_speed = seen.obstacle_speed
         deceleration = self.braking_share * memory.nominal.decel
-        lost_speed = np.where(seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0)
+        lost_speed = np.where(
+            seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0
+        )
         obstacle_deceleration = lost_speed / memory.step
-        obstacle_stop = obstacle_speed * obstacle_speed / (2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
+        obstacle_stop = (
+            obstacle_speed
+            * obstacle_speed
+            / (2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
+        )
         stop_difference = speed * speed / (2 * deceleration) - obstacle_stop
         closing_speed = np.maximum(seen.closing_speed, 0.0)
         braking_distance = np.maximum(
@@ -154,7 +173,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
         stage_at_gap = np.where(
-            seen.gap < full_gap, FULL_BRAKING, np.where(seen.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING)
+            seen.gap < full_gap,
+            FULL_BRAKING,
+            np.where(seen.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING),
         )
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
         is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
@@ -183,11 +204,12 @@ class _AutowareMemory(NamedTuple):
 
 
 class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Holds its speed until an obstacle in its way is nearer than the distance of Autoware's emergency braking; then
-    stops with a target acceleration, reached with a target jerk.
+    """Holds its speed until an obstacle in its way is nearer than the distance of Autoware's
+    emergency braking; then stops with a target acceleration, reached with a target jerk.
 
-    distance = v t_response + v^2 / (2 a_ego_min) - u^2 / (2 a_obj_min) + longitudinal_offset_margin, with the speeds v
-    and u of vehicle and obstacle. Once it has decided to brake, it brakes until it stands.
+    distance = v t_response + v^2 / (2 a_ego_min) - u^2 / (2 a_obj_min) +
+    longitudinal_offset_margin, with the speeds v and u of vehicle and obstacle. Once it has decided
+    to brake, it brakes until it stands.
 
     Parameters
     ----------
@@ -196,7 +218,8 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     t_response, longitudinal_offset_margin
         Response time [s] and gap [m] in the distance.
     a_ego_min, a_obj_min
-        Decelerations of vehicle and obstacle in the distance [m/s^2]; Autoware states them as negative accelerations.
+        Decelerations of vehicle and obstacle in the distance [m/s^2]; Autoware states them as
+        negative accelerations.
     target_acceleration, target_jerk
         Deceleration of the emergency stop [m/s^2], and the rate at which it is reached [m/s^3].
     command_delay
@@ -206,8 +229,9 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     Notes
     -----
-    The formula is that of the README of autoware_autonomous_emergency_braking; the defaults are the values of
-    autoware_launch since commit 1ded9c3a of 2024-12-12. It is a stand-in for one module of several in that stack.
+    The formula is that of the README of autoware_autonomous_emergency_braking; the defaults are the
+    values of autoware_launch since commit 1ded9c3a of 2024-12-12. It is a stand-in for one module
+    of several in that stack.
     """
 
     cruise_speed: PositiveParameter | None = None
@@ -228,13 +252,19 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         nominal, step, cruise, decision_time = memory
         cruise = cruise or cruise_at(nominal, seen, self.cruise_speed)
         cruise_speed, cruise_trim = cruise
-        is_near = is_in_the_way(seen, self.corridor) & (seen.gap < self.distance(seen.speed, seen.obstacle_speed))
-        decision_time = np.where(decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0))
+        is_near = is_in_the_way(seen, self.corridor) & (
+            seen.gap < self.distance(seen.speed, seen.obstacle_speed)
+        )
+        decision_time = np.where(
+            decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
+        )
         # The mean over the coming step:
         ramp = self.target_jerk * np.maximum(decision_time + step / 2 - self.command_delay, 0.0)
         is_braking = (decision_time >= 0) & (decision_time + TIME_ROUNDING >= self.command_delay)
         acceleration = np.where(
-            is_braking, -np.minimum(ramp, self.target_acceleration), self.cruise_gain * (cruise_speed - seen.speed)
+            is_braking,
+            -np.minimum(ramp, self.target_acceleration),
+            self.cruise_gain * (cruise_speed - seen.speed),
         )
         pedals = pedals_for(nominal, seen.speed, acceleration, cruise_trim)
         return pedals, _AutowareMemory(nominal, step, cruise, decision_time)

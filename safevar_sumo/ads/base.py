@@ -21,7 +21,9 @@ PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
 REACTION_PARAMETERS = ("recognition_delay", "hesitation")
-"""Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad weather."""
+"""Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad
+weather.
+"""
 
 Memory = Any
 """What an ADS remembers of N vehicles: an object of its own class with named attributes."""
@@ -30,9 +32,9 @@ Memory = Any
 class Ads:
     """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
 
-    It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
-    Element i of a command depends only on element i of the observations, bit for bit: neither on N nor on other
-    vehicles.
+    It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting. Element
+    i of a command depends only on element i of the observations, bit for bit: neither on N nor on
+    other vehicles.
 
     Attributes
     ----------
@@ -41,7 +43,8 @@ class Ads:
     max_vehicles
         Largest number of vehicles at once; None if any number will do.
     tau_parameter
-        The parameter in whose place an ADS that is SUMO's driver takes the headway `tau` of the setting; "" for others.
+        The parameter in whose place an ADS that is SUMO's driver takes the headway `tau` of the
+        setting; "" for others.
     RETURNS
         What the methods of a user's class must return.
     """
@@ -57,7 +60,9 @@ class Ads:
 
     @abstractmethod
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
-        """Create the memory of a run of `n` vehicles with `step` seconds between two calls of `drive`."""
+        """Create the memory of a run of `n` vehicles with `step` seconds between two calls of
+        `drive`.
+        """
 
     @abstractmethod
     def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
@@ -90,13 +95,17 @@ class ScalarAds(ABC):
     """Whether the ADS warns its driver; `drive` may set it."""
 
     def start(self, nominal: Nominal, step: float) -> None:
-        """Called once before the run, with the original vehicle and the time between two calls of `drive` [s]."""
+        """Called once before the run, with the original vehicle and the time between two calls of
+        `drive` [s].
+        """
         self.nominal = nominal
         self.step = step
 
     @abstractmethod
     def drive(self, seen: Observation) -> tuple[float, float]:
-        """Command throttle and brake, each in [0, 1], from an observation whose fields are numbers."""
+        """Command throttle and brake, each in [0, 1], from an observation whose fields are
+        numbers.
+        """
 
 
 class PerVehicleAds(Ads):
@@ -117,7 +126,9 @@ class PerVehicleAds(Ads):
         observations = list(_scalar_observations(seen))
         pedals = [(0.0, 0.0)] * len(memory)
         with np.errstate():
-            for i in open_rows(np.ones(len(memory), dtype=bool)).tolist():  # vehicles whose run has not ended
+            for i in open_rows(
+                np.ones(len(memory), dtype=bool)
+            ).tolist():  # vehicles whose run has not ended
                 pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
@@ -132,22 +143,29 @@ class PerVehicleAds(Ads):
         if not isinstance(command, tuple | list) or len(command) != 2:
             raise self._code.wrong("drive", quoted(command), "(throttle, brake), each in [0, 1]")
         pedals = zip(Command._fields, command, strict=True)
-        throttle, brake = (self._code.check_numbers("drive", name, value, (), SHARE) for name, value in pedals)
+        throttle, brake = (
+            self._code.check_numbers("drive", name, value, (), SHARE) for name, value in pedals
+        )
         return float(throttle), float(brake)
 
 
 def _scalar_observations(seen: Observation) -> Iterator[Observation]:
     """The observation of each vehicle, as plain numbers."""
     columns = [
-        value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value)) for value in seen
+        value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value))
+        for value in seen
     ]
     return map(Observation._make, zip(*columns, strict=False))  # a repeated number is endless
 
 
-def interpolate_tables(table_speeds: FloatArray, speed: FloatArray, *tables: FloatArray) -> list[FloatArray]:
+def interpolate_tables(
+    table_speeds: FloatArray, speed: FloatArray, *tables: FloatArray
+) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
     spacing = table_speeds[1]
-    position = np.minimum(speed / spacing, len(table_speeds) - 1.001)  # just before the last row: there is a next one
+    position = np.minimum(
+        speed / spacing, len(table_speeds) - 1.001
+    )  # just before the last row: there is a next one
     row = position.astype(np.intp)
     share = position - row
     next_row = row + 1
@@ -160,8 +178,8 @@ STEP_DECIMALS = 6
 
 
 class DelayLine(NamedTuple):
-    """A delay line: the delay as `steps` and a `fraction` of a step, one for all vehicles or one for each, and the past
-    values, oldest first.
+    """A delay line: the delay as `steps` and a `fraction` of a step, one for all vehicles or one
+    for each, and the past values, oldest first.
     """
 
     steps: int
@@ -183,8 +201,8 @@ class DelayLine(NamedTuple):
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
         """The values one delay ago, linear between two steps, and the next delay line.
 
-        Before the first step the first values hold. A value that appears or vanishes between the two steps, infinite
-        in one of them, is that of the earlier step.
+        Before the first step the first values hold. A value that appears or vanishes between the
+        two steps, infinite in one of them, is that of the earlier step.
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older = past[0]
@@ -193,13 +211,17 @@ class DelayLine(NamedTuple):
             with np.errstate(invalid="ignore"):  # the difference of two infinities
                 mixture = newer + (older - newer) * self.fraction
             if not (is_defined := np.isfinite(mixture)).all():
-                mixture = np.where(is_defined, mixture, np.where(np.equal(self.fraction, 0), newer, older))
+                mixture = np.where(
+                    is_defined, mixture, np.where(np.equal(self.fraction, 0), newer, older)
+                )
             newer = mixture
         return newer, DelayLine(self.steps, self.fraction, past)
 
 
 class Trim(NamedTuple):
-    """The pedals of a rolling vehicle beyond those that hold the speed of the original vehicle on a level road [-]."""
+    """The pedals of a rolling vehicle beyond those that hold the speed of the original vehicle on a
+    level road [-].
+    """
 
     throttle: FloatArray
     brake: FloatArray
@@ -208,7 +230,9 @@ class Trim(NamedTuple):
 def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
     is_rolling = seen.speed > 0
-    coasting, full_throttle = interpolate_tables(nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle)
+    coasting, full_throttle = interpolate_tables(
+        nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle
+    )
     holding_throttle = coasting / (full_throttle + coasting)
     holding_brake = -coasting / nominal.braking  # negative: it would have to push the vehicle
     throttle = np.where(is_rolling, seen.throttle - holding_throttle, 0.0)
@@ -220,9 +244,15 @@ def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple
     return seen.speed if speed is None else np.full_like(seen.speed, speed), trim_at(nominal, seen)
 
 
-def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim) -> Command:
-    """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle and a trim."""
-    coasting, full_throttle = interpolate_tables(nominal.speeds, speed, nominal.coasting, nominal.full_throttle)
+def pedals_for(
+    nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim
+) -> Command:
+    """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle
+    and a trim.
+    """
+    coasting, full_throttle = interpolate_tables(
+        nominal.speeds, speed, nominal.coasting, nominal.full_throttle
+    )
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
     brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
     throttle = (acceleration + coasting) / (full_throttle + coasting) + pedal_trim.throttle
@@ -230,24 +260,32 @@ def pedals_for(nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pe
 
 
 CORRIDOR = 1.15
-"""Half the width of the corridor that a driver watches [m]: an adult in it has his middle up to 1.4 m from the lane's
-middle, a car, which is 1.7 m wide, up to 2.0 m.
+"""Half the width of the corridor that a driver watches [m]: an adult in it has his middle up to 1.4
+m from the lane's middle, a car, which is 1.7 m wide, up to 2.0 m.
 """
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a positive closing speed [m/s]; keeps times finite."""
 LARGEST_GAP = 1e6
-"""Upper bound of gaps [m], also the time [s] or lateral position [m] without an obstacle; keeps them finite."""
+"""Upper bound of gaps [m], also the time [s] or lateral position [m] without an obstacle; keeps
+them finite.
+"""
 
 
 def time_to_reach(seen: Observation) -> FloatArray:
-    """Time to collision, gap over closing speed [s], shape (N,); `LARGEST_GAP` while the gap does not shrink."""
+    """Time to collision, gap over closing speed [s], shape (N,); `LARGEST_GAP` while the gap does
+    not shrink.
+    """
     gap = np.minimum(np.maximum(seen.gap, 0.0), LARGEST_GAP)
-    return np.where(seen.closing_speed > 0, gap / np.maximum(seen.closing_speed, LEAST_CLOSING_SPEED), LARGEST_GAP)
+    return np.where(
+        seen.closing_speed > 0,
+        gap / np.maximum(seen.closing_speed, LEAST_CLOSING_SPEED),
+        LARGEST_GAP,
+    )
 
 
 def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
-    """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or will be when the
-    vehicle reaches it.
+    """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or
+    will be when the vehicle reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
@@ -255,8 +293,8 @@ def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> 
 
 
 def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> FloatArray:
-    """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle reaches it [m];
-    below 0 outside, and `-LARGEST_GAP` without an obstacle.
+    """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle
+    reaches it [m]; below 0 outside, and `-LARGEST_GAP` without an obstacle.
     """
     is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
@@ -267,6 +305,8 @@ def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) 
 
 
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
-    """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards the middle."""
+    """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards
+    the middle.
+    """
     moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
     return (np.abs(seen.lateral) <= corridor + seen.obstacle_width / 2) | moves_inwards

@@ -1,4 +1,6 @@
-"""SUMO's car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise control."""
+"""SUMO's car-following models as ADSs: Krauss, the intelligent driver model, and adaptive cruise
+control.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from safevar_sumo.ads.base import (
 )
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 
-# Defaults of MSCFModel_ACC: the gain of the speed error [1/s]; for each other mode the gains of speed [1/s] and gap
-# [1/s^2]; and thresholds.
+# Defaults of MSCFModel_ACC: the gain of the speed error [1/s]; for each other mode the gains of
+# speed [1/s] and gap [1/s^2]; and thresholds.
 SPEED_GAIN = -0.4
 CLOSING_GAINS = 0.8, 0.04
 KEEPING_GAINS = 0.07, 0.23
@@ -30,11 +32,15 @@ AVOIDING_GAINS = 0.23, 0.8
 FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
 GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
-LAST_DECELERATION = 0.5  # m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop
+LAST_DECELERATION = (
+    0.5  # m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop
+)
 
 
 class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are ignored."""
+    """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are
+    ignored.
+    """
 
     cruise_speed: PositiveParameter = 13.89
     headway: PositiveParameter = 1.0
@@ -54,13 +60,17 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return pedals_for(nominal, seen.speed, acceleration, initial_trim), (nominal, initial_trim)
 
     @abstractmethod
-    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape (N,)."""
+    def acceleration_at(
+        self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
+    ) -> FloatArray:
+        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape
+        (N,).
+        """
 
 
 class Acc(CarFollowing, frozen=True, kw_only=True):
-    """Holds a speed, or a time headway behind a leader (Milanes and Shladover 2014; Xiao, Wang, van Arem 2017;
-    `MSCFModel_ACC`).
+    """Holds a speed, or a time headway behind a leader (Milanes and Shladover 2014; Xiao, Wang, van
+    Arem 2017; `MSCFModel_ACC`).
 
     Parameters
     ----------
@@ -72,9 +82,11 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         Half the width of the corridor that it watches [m].
     """
 
-    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """The control law of the mode that applies; near standstill it keeps 2 m more than the headway (Xiao et al.
-        2017).
+    def acceleration_at(
+        self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
+    ) -> FloatArray:
+        """The control law of the mode that applies; near standstill it keeps 2 m more than the
+        headway (Xiao et al. 2017).
         """
         excess_speed = speed - self.cruise_speed
         relative_speed = leader_speed - speed
@@ -86,14 +98,16 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         )
         keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
         acceleration = np.where(keeps_gap, keeping, np.where(gap_error < 0, avoiding, closing))
-        return np.where(gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration)
+        return np.where(
+            gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration
+        )
 
 
 class Idm(CarFollowing, frozen=True, kw_only=True):
     """The intelligent driver model (Treiber, Hennecke, Helbing 2000; `MSCFModel_IDM`).
 
-    dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at speed v, gap s, leader
-    speed u.
+    dv/dt = a (1 - (v / v0)^4 - (s* / s)^2), s* = s0 + max(0, v T + v (v - u) / (2 sqrt(a b))) at
+    speed v, gap s, leader speed u.
 
     Parameters
     ----------
@@ -111,21 +125,28 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
     acceleration: PositiveParameter = 2.6
     deceleration: PositiveParameter = 4.5
 
-    def acceleration_at(self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
+    def acceleration_at(
+        self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
+    ) -> FloatArray:
         """dv/dt [m/s^2]."""
         speed_ratio = speed / self.cruise_speed
-        closing_term = speed * (speed - leader_speed) / (2 * np.sqrt(self.acceleration * self.deceleration))
+        closing_term = (
+            speed * (speed - leader_speed) / (2 * np.sqrt(self.acceleration * self.deceleration))
+        )
         desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
         positive_gap = np.maximum(gap, LEAST_GAP)
         free_road = 1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
-        return np.asarray(self.acceleration * (free_road - desired_gap * desired_gap / (positive_gap * positive_gap)))
+        return np.asarray(
+            self.acceleration
+            * (free_road - desired_gap * desired_gap / (positive_gap * positive_gap))
+        )
 
 
 class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
-    It never drives faster than a speed from which the original vehicle can stop behind the obstacle after a reaction
-    time.
+    It never drives faster than a speed from which the original vehicle can stop behind the obstacle
+    after a reaction time.
 
     Parameters
     ----------
@@ -148,18 +169,26 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, float]:
         return nominal, step
 
-    def drive(self, seen: Observation, memory: tuple[Nominal, float]) -> tuple[Command, tuple[Nominal, float]]:
-        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the reaction time t.
+    def drive(
+        self, seen: Observation, memory: tuple[Nominal, float]
+    ) -> tuple[Command, tuple[Nominal, float]]:
+        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the
+        reaction time t.
 
-        From v_safe the vehicle comes to rest behind a standing obstacle, towards the end at `LAST_DECELERATION`.
+        From v_safe the vehicle comes to rest behind a standing obstacle, towards the end at
+        `LAST_DECELERATION`.
         """
         nominal, step = memory
         deceleration = self.braking_share * nominal.decel
         reaction_speed = deceleration * self.reaction_time
         gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), LARGEST_GAP)
-        safe_speed = np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+        safe_speed = (
+            np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+        )
         safe_speed = np.maximum(safe_speed, np.sqrt(2 * LAST_DECELERATION * gap))
-        acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (step + nominal.actuator_lag)
+        acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (
+            step + nominal.actuator_lag
+        )
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
         brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
         return Command(throttle, brake), memory

@@ -6,7 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.ads.base import NonNegativeParameter, PositiveParameter, is_in_the_way, time_to_reach
+from safevar_sumo.ads.base import (
+    NonNegativeParameter,
+    PositiveParameter,
+    is_in_the_way,
+    time_to_reach,
+)
 from safevar_sumo.ads.reaction import (
     DECELERATION_ROUNDING,
     HARDEST_BRAKING,
@@ -27,8 +32,8 @@ class _Perceiving(NamedTuple):
     reaction
         What every reference driver remembers.
     first_lateral, appeared_in_way
-        Lateral position at which the driver first saw the obstacle [m], infinite before; whether this position is in
-        the way, and nobody had strayed from his before.
+        Lateral position at which the driver first saw the obstacle [m], infinite before; whether
+        this position is in the way, and nobody had strayed from his before.
     stray_time
         Time since an obstacle first strayed from this position [s], negative before.
     braking_time
@@ -48,13 +53,14 @@ class _Perceiving(NamedTuple):
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
 
-    Holds the speed with which it began, and so the gap to a steady leader; perceives a danger, reacts, and brakes with
-    up to 0.774 g. The danger is
+    Holds the speed with which it began, and so the gap to a steady leader; perceives a danger,
+    reacts, and brakes with up to 0.774 g. The danger is
 
-    - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a standing car this is a
-      time headway of 2 s; a car that cuts in is a danger wherever the vehicle will meet it, also beside;
-    - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the regulation names no danger:
-      by the letter the driver does not react while the leader brakes.
+    - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a
+      standing car this is a time headway of 2 s; a car that cuts in is a danger wherever the
+      vehicle will meet it, also beside;
+    - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the
+      regulation names no danger: by the letter the driver does not react while the leader brakes.
 
     While it reacts it releases the accelerator, and it does not press it again while the cause of
     the danger blocks its way: after a stop it waits until the way is clear, and it does not follow
@@ -67,13 +73,15 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     critical_ttc, reaction_time
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
-        An obstacle that enters the way is perceived `perception_time` after it has moved `stray` from its first lateral
-        position [m, s]; one that a leader reveals when he leaves, the same time after the leader has.
+        An obstacle that enters the way is perceived `perception_time` after it has moved `stray`
+        from its first lateral position [m, s]; one that a leader reveals when he leaves, the same
+        time after the leader has.
     leader_braking
-        Deceleration of a leader above which its braking is a danger [m/s^2], perceived `perception_time` after it
-        begins; 5 by the letter of the regulation, 0.5 for any braking.
+        Deceleration of a leader above which its braking is a danger [m/s^2], perceived
+        `perception_time` after it begins; 5 by the letter of the regulation, 0.5 for any braking.
     lets_go
-        Deceleration with the accelerator released, while it reacts [m/s^2]; a vehicle that coasts with less is braked.
+        Deceleration with the accelerator released, while it reacts [m/s^2]; a vehicle that coasts
+        with less is braked.
     corridor
         Half the width of the corridor that it watches [m].
     start_throttle
@@ -126,11 +134,15 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         )
         command, reaction = self.react(seen, reaction, danger, self.start_throttle)
         braking_time = np.where(is_in_way, braking_time, -1.0)
-        return command, memory._replace(reaction=reaction, braking_time=braking_time, was_in_way=is_in_way)
+        return command, memory._replace(
+            reaction=reaction, braking_time=braking_time, was_in_way=is_in_way
+        )
 
-    def _perceive(self, seen: Observation, memory: _Perceiving, is_same: BoolArray) -> tuple[BoolArray, _Perceiving]:
-        """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from its first position
-        `perception_time` ago or earlier.
+    def _perceive(
+        self, seen: Observation, memory: _Perceiving, is_same: BoolArray
+    ) -> tuple[BoolArray, _Perceiving]:
+        """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from
+        its first position `perception_time` ago or earlier.
         """
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
@@ -143,7 +155,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         strays_now = is_sighted & (deviation >= self.stray)
         strayed = (deviation - self.stray) / np.maximum(np.abs(seen.lateral_speed), LEAST_DIVISOR)
         new_stray_time = np.where(strays_now, np.minimum(strayed, memory.reaction.step), -1.0)
-        stray_time = np.where(memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time)
+        stray_time = np.where(
+            memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time
+        )
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
@@ -151,6 +165,13 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
 
 
 def _cuts_in(seen: Observation) -> BoolArray:
-    """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than across it."""
+    """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than
+    across it.
+    """
     moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
-    return np.isfinite(seen.gap) & (seen.gap > 0) & moves_inwards & (seen.obstacle_speed >= np.abs(seen.lateral_speed))
+    return (
+        np.isfinite(seen.gap)
+        & (seen.gap > 0)
+        & moves_inwards
+        & (seen.obstacle_speed >= np.abs(seen.lateral_speed))
+    )

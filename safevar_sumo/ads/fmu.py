@@ -1,5 +1,5 @@
-"""A driving system that is an FMU of FMI 2.0 or 3.0 for co-simulation: its inputs are observations, its outputs are
-pedals or an acceleration, all in SI units; each vehicle has an instance.
+"""A driving system that is an FMU of FMI 2.0 or 3.0 for co-simulation: its inputs are observations,
+its outputs are pedals or an acceleration, all in SI units; each vehicle has an instance.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ UNITS: Mapping[str, str] = {
     **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
     **{"time": "s", "acceleration": "m/s2"},
 }
-"""Quantities that an FMU is given or returns, and their units. It is given observations; `detected` is 1 while an
-obstacle is detected. It returns throttle and brake or an acceleration; above 0.5, `warns` is a warning.
+"""Quantities that an FMU is given or returns, and their units. It is given observations; `detected`
+is 1 while an obstacle is detected. It returns throttle and brake or an acceleration; above 0.5,
+`warns` is a warning.
 """
 COMMANDS = ("throttle", "brake", "acceleration", "warns")
 MAX_INSTANCES = 200
@@ -46,16 +47,22 @@ class Fmu:
     def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
         self.code = code
         self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
-        expected = "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
+        expected = (
+            "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
+        )
         try:
             from fmpy import extract, read_model_description  # an extra
 
             extract(path, self._folder.name)
             self._model: Any = read_model_description(self._folder.name, validate=False)
         except ImportError:
-            raise InputError("", f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'") from None
+            raise InputError(
+                "", f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'"
+            ) from None
         except Exception as error:  # any error of FMPy about a user's file
-            raise InputError("", f"{table.model}: {type(error).__name__}: {error}", expected) from None
+            raise InputError(
+                "", f"{table.model}: {type(error).__name__}: {error}", expected
+            ) from None
         kind = self._model.coSimulation
         if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
             raise InputError("", f"{table.model} is another FMU", expected)
@@ -63,23 +70,41 @@ class Fmu:
             expected = "throttle, brake or both; alternatively acceleration"
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
         observed = [name for name in (*Observation._fields, "detected") if name in UNITS]
-        self.inputs = {key: self._variable("input", key, name, observed) for key, name in table.inputs.items()}
-        self.outputs = {key: self._variable("output", key, name, COMMANDS) for key, name in table.outputs.items()}
+        self.inputs = {
+            key: self._variable("input", key, name, observed) for key, name in table.inputs.items()
+        }
+        self.outputs = {
+            key: self._variable("output", key, name, COMMANDS)
+            for key, name in table.outputs.items()
+        }
         self._parameters = [
-            (self._variable("parameter", name, name, [name]), value) for name, value in table.parameters.items()
+            (self._variable("parameter", name, name, [name]), value)
+            for name, value in table.parameters.items()
         ]
 
     def _variable(self, causality: str, quantity: str, name: str, quantities: Any) -> Any:
-        """The real variable of a causality that takes or holds a quantity, one of some quantities, in its SI unit."""
+        """The real variable of a causality that takes or holds a quantity, one of some quantities,
+        in its SI unit.
+        """
         key = f"ads.{causality}s.{quantity}"
         check_name("", f"{key}: there is no such quantity", quantity, quantities)
-        variables = {one.name: one for one in self._model.modelVariables if one.causality == causality}
+        variables = {
+            one.name: one for one in self._model.modelVariables if one.causality == causality
+        }
         if name not in variables or variables[name].type not in REAL_TYPES:
-            raise unknown_name("", f"{key} = {name!r}: no real {causality} of the FMU", name, variables)
+            raise unknown_name(
+                "", f"{key} = {name!r}: no real {causality} of the FMU", name, variables
+            )
         variable = variables[name]
-        unit = (variable.unit or getattr(variable.declaredType, "unit", None) or "").replace("^", "").replace("-", "1")
+        unit = (
+            (variable.unit or getattr(variable.declaredType, "unit", None) or "")
+            .replace("^", "")
+            .replace("-", "1")
+        )
         if unit and unit != UNITS.get(quantity, unit):
-            raise InputError("", f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}")
+            raise InputError(
+                "", f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}"
+            )
         return variable
 
     def new_instance(self, step: float) -> Any:
@@ -92,10 +117,16 @@ class Fmu:
         if not kind.canHandleVariableCommunicationStepSize and experiment:
             own = own or experiment.stepSize
         if own and float(own) != step:
-            raise InputError("", f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s")
+            raise InputError(
+                "", f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s"
+            )
         for file in Path(self._folder.name, "resources").glob("*.py"):
-            sys.modules.pop(file.stem, None)  # an FMU in Python imports its own modules, not namesakes
-        slave = instantiate_fmu(self._folder.name, self._model, "CoSimulation", logger=lambda *_: None)
+            sys.modules.pop(
+                file.stem, None
+            )  # an FMU in Python imports its own modules, not namesakes
+        slave = instantiate_fmu(
+            self._folder.name, self._model, "CoSimulation", logger=lambda *_: None
+        )
         for variable, value in self._parameters:
             write(slave, variable, float(value))
         if self._model.fmiVersion < "3":
@@ -120,14 +151,18 @@ class FmuAds(ScalarAds):
         self._end.atexit = False
 
     def drive(self, seen: Observation) -> tuple[float, float]:
-        outputs = self._fmu.code.call("doStep", self._step, {**seen._asdict(), "detected": np.isfinite(seen.gap)})
+        outputs = self._fmu.code.call(
+            "doStep", self._step, {**seen._asdict(), "detected": np.isfinite(seen.gap)}
+        )
         self._calls += 1
         self.warns = outputs.get("warns", 0.0) > 0.5
         if "acceleration" not in outputs:
             return outputs.get("throttle", 0.0), outputs.get("brake", 0.0)
         now = Observation._make(np.array([value]) for value in seen)
         self._trim = self._trim or trim_at(self.nominal, now)
-        command = pedals_for(self.nominal, now.speed, np.array([outputs["acceleration"]]), self._trim)
+        command = pedals_for(
+            self.nominal, now.speed, np.array([outputs["acceleration"]]), self._trim
+        )
         return float(command.throttle[0]), float(command.brake[0])
 
     def _step(self, values: Mapping[str, float]) -> dict[str, float]:

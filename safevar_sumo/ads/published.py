@@ -1,5 +1,5 @@
-"""The two driving systems of the published study: Apollo, a modular system, and World On Rails, an end-to-end
-policy.
+"""The two driving systems of the published study: Apollo, a modular system, and World On Rails, an
+end-to-end policy.
 """
 
 from __future__ import annotations
@@ -10,7 +10,15 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import Ads, DelayLine, Trim, pedals_for
-from safevar_sumo.records import KMH_PER_MS, ZERO, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    ZERO,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -32,7 +40,8 @@ class _ApolloMemory(NamedTuple):
     has_begun_to_stop
         Whether it has begun to brake for its stop; it then stops for good.
     needed_after_lag
-        Deceleration needed to stop once the pedals have followed, which decides on the onset of braking [m/s^2].
+        Deceleration needed to stop once the pedals have followed, which decides on the onset of
+        braking [m/s^2].
     commanded_acceleration
         Acceleration of the last command [m/s^2].
     creeping_time
@@ -59,7 +68,8 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     perception_range
         Largest gap at which Apollo detects obstacles, in clear weather [m].
     cruise_speed, cruise_gain, cruise_acceleration
-        Speed to accelerate to [m/s], acceleration per speed error [1/s], and largest acceleration [m/s^2].
+        Speed to accelerate to [m/s], acceleration per speed error [1/s], and largest acceleration
+        [m/s^2].
     jerk
         Limit on the change of the commanded acceleration [m/s^3].
     stop_gap
@@ -106,39 +116,56 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         is_waiting = seen.speed == 0
         nominal, step, *old_arrays = memory
         _, _, *new_arrays = plan
-        arrays = (np.where(is_waiting, old, new) for old, new in zip(old_arrays, new_arrays, strict=True))
+        arrays = (
+            np.where(is_waiting, old, new) for old, new in zip(old_arrays, new_arrays, strict=True)
+        )
         pedals = (np.where(is_waiting, 0.0, pedal) for pedal in command)
         return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
 
     def _plan(self, seen: Observation, memory: _ApolloMemory) -> _ApolloMemory:
-        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d; then creep and
-        hold.
+        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d;
+        then creep and hold.
         """
         speed = seen.speed
         is_detected = seen.gap <= self.perception_range * seen.visibility
-        distance = np.where(is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf)
+        distance = np.where(
+            is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf
+        )
         needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
-        # The onset allows for the distance lost by the lag of the pedals and while the deceleration rises at the jerk
-        # limit.
+        # The onset allows for the distance lost by the lag of the pedals and while the deceleration
+        # rises at the jerk limit.
         lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
-        needed_after_lag = speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
-        begins_braking = (needed_after_lag > self.comfortable_deceleration) & ~memory.has_begun_to_stop
+        needed_after_lag = (
+            speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+        )
+        begins_braking = (
+            needed_after_lag > self.comfortable_deceleration
+        ) & ~memory.has_begun_to_stop
         has_begun_to_stop = memory.has_begun_to_stop | begins_braking
         last_acceleration = memory.commanded_acceleration
         largest_change = np.array(self.jerk * memory.step)
         if np.count_nonzero(begins_braking):
-            # Planning is continuous in time: braking began within the last step, when `needed_after_lag` passed
-            # `comfortable_deceleration`. The acceleration has changed since then only.
+            # Planning is continuous in time: braking began within the last step, when
+            # `needed_after_lag` passed `comfortable_deceleration`. The acceleration has changed
+            # since then only.
             rise = np.maximum(needed_after_lag - memory.needed_after_lag, LEAST_RISE)
-            share_since_onset = np.minimum((needed_after_lag - self.comfortable_deceleration) / rise, 1.0)
-            last_acceleration = np.where(begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration)
+            share_since_onset = np.minimum(
+                (needed_after_lag - self.comfortable_deceleration) / rise, 1.0
+            )
+            last_acceleration = np.where(
+                begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration
+            )
             largest_change = largest_change * np.where(begins_braking, share_since_onset, 1.0)
 
         taper = np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME
         braking = np.minimum(np.minimum(needed_deceleration, self.largest_deceleration), taper)
-        cruising = np.minimum(self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration)
+        cruising = np.minimum(
+            self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration
+        )
         change = np.where(has_begun_to_stop, -braking, cruising) - last_acceleration
-        acceleration = last_acceleration + np.minimum(np.maximum(change, -largest_change), largest_change)
+        acceleration = last_acceleration + np.minimum(
+            np.maximum(change, -largest_change), largest_change
+        )
 
         is_creeping = has_begun_to_stop & (speed < self.creep_speed + CREEP_MARGIN)
         creeping_time = memory.creeping_time + memory.step * is_creeping
@@ -152,8 +179,12 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         )
 
     def _pedals(self, seen: Observation, memory: _ApolloMemory) -> Command:
-        """Pedals for the commanded acceleration, from the calibration table of the original vehicle."""
-        pedals = pedals_for(memory.nominal, seen.speed, memory.commanded_acceleration, Trim(ZERO, ZERO))
+        """Pedals for the commanded acceleration, from the calibration table of the original
+        vehicle.
+        """
+        pedals = pedals_for(
+            memory.nominal, seen.speed, memory.commanded_acceleration, Trim(ZERO, ZERO)
+        )
         stops = memory.has_begun_to_stop
         return Command(np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0))
 
@@ -164,11 +195,13 @@ Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVEL = 8 / 3
-"""Distance between the policy's speed levels [m/s]: four, from 0 to 8 m/s, in its source code. The throttle is linear
-between the first three, and constant above.
+"""Distance between the policy's speed levels [m/s]: four, from 0 to 8 m/s, in its source code. The
+throttle is linear between the first three, and constant above.
 """
 PASSED_GAP = -0.5
-"""Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin to brake for it."""
+"""Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin
+to brake for it.
+"""
 
 
 class _RailsMemory(NamedTuple):
@@ -193,7 +226,8 @@ class _RailsMemory(NamedTuple):
 class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """World On Rails (Chen, Koltun, Kraehenbuehl 2021): a vision policy at 20 Hz.
 
-    It brakes fully for a near obstacle in its corridor; otherwise it opens the throttle up to its speed limit.
+    It brakes fully for a near obstacle in its corridor; otherwise it opens the throttle up to its
+    speed limit.
 
     Parameters
     ----------
@@ -202,28 +236,29 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     latency
         Time from an image to its command [s], rounded to whole steps.
     corridor
-        Half the width of the corridor in which the policy brakes for obstacles; it releases the brake when they leave
-        the corridor [m].
+        Half the width of the corridor in which the policy brakes for obstacles; it releases the
+        brake when they leave the corridor [m].
     brake_gap, brake_gap_per_speed
-        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an obstacle at the
-        lateral position `brake_place`.
+        The policy brakes at gaps up to `brake_gap` + `brake_gap_per_speed` * speed [m, s] for an
+        obstacle at the lateral position `brake_place`.
     brake_place
-        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the side that it comes
-        from.
+        Lateral position of an obstacle for which the policy brakes earliest [m], negative on the
+        side that it comes from.
     brake_gap_before, brake_gap_past
-        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle is short of
-        `brake_place`, and by `brake_gap_past` for each metre past it, so that the policy brakes later for obstacles
-        that enter or leave its path. The visibility multiplies the result.
+        Slopes [-]: the braking gap shrinks by `brake_gap_before` for each metre that the obstacle
+        is short of `brake_place`, and by `brake_gap_past` for each metre past it, so that the
+        policy brakes later for obstacles that enter or leave its path. The visibility multiplies
+        the result.
     throttle
         Throttle at the policy's speed levels 0, 2.7 and 5.3 m/s.
     recognition_delay
         Additional time to recognise an obstacle, compared with clear weather [s].
     hesitation
-        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It releases the brake
-        at once.
+        Time between releasing the accelerator and braking, while the policy is not yet sure [s]. It
+        releases the brake at once.
     release_gap
-        Obstacles nearer than this are below the camera's picture [m]: the policy releases the brake and opens the
-        throttle, whether or not the vehicle has stopped.
+        Obstacles nearer than this are below the camera's picture [m]: the policy releases the brake
+        and opens the throttle, whether or not the vehicle has stopped.
     """
 
     first_command: UpTo60
@@ -249,22 +284,37 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         )
 
     def drive(self, seen: Observation, memory: _RailsMemory) -> tuple[Command, _RailsMemory]:
-        (gap, lateral), recognition_line = memory.recognition_line.delayed(np.array([seen.gap, seen.lateral]))
+        (gap, lateral), recognition_line = memory.recognition_line.delayed(
+            np.array([seen.gap, seen.lateral])
+        )
         is_braking = self._decide_to_brake(seen, gap, lateral, memory.is_braking)
         is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
-        throttle = np.where(is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed))
-        command, *pending_commands = (*memory.pending_commands, Command(throttle, is_braking.astype(float)))
+        throttle = np.where(
+            is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed)
+        )
+        command, *pending_commands = (
+            *memory.pending_commands,
+            Command(throttle, is_braking.astype(float)),
+        )
         delayed_brake, hesitation_line = memory.hesitation_line.delayed(command.brake)
-        memory = _RailsMemory(is_braking, tuple(pending_commands), recognition_line, hesitation_line)
+        memory = _RailsMemory(
+            is_braking, tuple(pending_commands), recognition_line, hesitation_line
+        )
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
     def _decide_to_brake(
         self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
     ) -> BoolArray:
-        """Whether the policy brakes for the recognised obstacle, which is in the corridor and was near."""
+        """Whether the policy brakes for the recognised obstacle, which is in the corridor and was
+        near.
+        """
         past = lateral - self.brake_place  # negative before that place
-        reduction = self.brake_gap_past * np.maximum(past, 0.0) + self.brake_gap_before * np.maximum(-past, 0.0)
-        braking_gap = seen.visibility * (self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction)
+        reduction = self.brake_gap_past * np.maximum(
+            past, 0.0
+        ) + self.brake_gap_before * np.maximum(-past, 0.0)
+        braking_gap = seen.visibility * (
+            self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction
+        )
         is_seen = (np.abs(lateral) <= self.corridor) & (gap > self.release_gap)
         starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
         is_braking = is_seen & (starts_braking | was_braking)

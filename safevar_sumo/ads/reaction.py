@@ -20,7 +20,15 @@ from safevar_sumo.ads.base import (
     cruise_at,
     pedals_for,
 )
-from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    GRAVITY,
+    TIME_ROUNDING,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 HARDEST_BRAKING = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
@@ -240,7 +248,11 @@ def _new_time(seen: Observation, memory: Reaction, danger: Danger) -> FloatArray
 
 
 def _decelerations(
-    seen: Observation, memory: Reaction, danger: Danger, is_endangered: BoolArray, aware_time: FloatArray
+    seen: Observation,
+    memory: Reaction,
+    danger: Danger,
+    is_endangered: BoolArray,
+    aware_time: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Decelerations of vehicles in a danger, shape (N,) [m/s^2]: the mean one to reach in the next
     step, the one that is felt without braking, and the one at the step's end.

@@ -1,7 +1,8 @@
-"""Reference drivers, with which an ADS is compared: they hold their speed until they see a danger, react, and brake.
+"""Reference drivers, with which an ADS is compared: they hold their speed until they see a danger,
+react, and brake.
 
-UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their use for pedestrians
-is ours.
+UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their
+use for pedestrians is ours.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from safevar_sumo.ads.base import (
     is_in_the_way,
     time_to_reach,
 )
-from safevar_sumo.ads.reaction import HARDEST_BRAKING, LEAST_DIVISOR, Danger, Reaction, ReferenceDriver, StartThrottle
+from safevar_sumo.ads.reaction import (
+    HARDEST_BRAKING,
+    LEAST_DIVISOR,
+    Danger,
+    Reaction,
+    ReferenceDriver,
+    StartThrottle,
+)
 from safevar_sumo.records import KMH_PER_MS, Command, FloatArray, Observation
 
 UNLIMITED_BRAKING = 1e6
@@ -25,8 +33,8 @@ GAP_ROUNDING = 1e-6
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
-    """Brakes fully as soon as it approaches an obstacle that is in its way or will be there when the vehicle arrives:
-    the best that a driver can do.
+    """Brakes fully as soon as it approaches an obstacle that is in its way or will be there when
+    the vehicle arrives: the best that a driver can do.
 
     Parameters
     ----------
@@ -51,13 +59,13 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 class R157(ReferenceDriver, frozen=True, kw_only=True):
     """An automated lane keeping system that does what UN R157, 5.2.5, demands, and no more.
 
-    To who enters its way, and to who stands or drives steadily in it, it reacts at a TTC below
-    (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the obstacle,
-    and brakes with 6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind a leader that
-    brakes, 5.2.5.1 counts: no collision if the time gap was at least 1 s + v / (100 km/h) s before, as
-    far as the driver has seen the leader. Then it brakes in the same way as soon as the leader does,
-    which is enough; nearer the regulation demands nothing, and it does not react to the leader's
-    braking.
+    To who enters its way, and to who stands or drives steadily in it, it reacts at a TTC below (v -
+    u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the obstacle,
+    and brakes with 6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind a leader
+    that brakes, 5.2.5.1 counts: no collision if the time gap was at least 1 s + v / (100 km/h) s
+    before, as far as the driver has seen the leader. Then it brakes in the same way as soon as the
+    leader does, which is enough; nearer the regulation demands nothing, and it does not react to
+    the leader's braking.
 
     Parameters
     ----------
@@ -77,7 +85,9 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         depth = depth_in_the_way(seen, self.corridor)
 
         # Towards somebody who does not brake, the time to collision decides.
-        critical_ttc = seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+        critical_ttc = (
+            seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+        )
         when_steady = np.minimum(depth, critical_ttc - time_to_reach(seen))
 
         # Was the leader too near before he braked, as far as the driver has seen him?
@@ -92,15 +102,17 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         # Behind a leader who brakes, that decides.
         when_braking = np.where(memory.leader_brakes & ~is_undercut, np.inf, -np.inf)
         nearness = np.where(memory.leader_has_braked, when_braking, when_steady)
-        danger = Danger(nearness > 0, self.deceleration, self.reaction_time, np.inf, nearness=nearness)
+        danger = Danger(
+            nearness > 0, self.deceleration, self.reaction_time, np.inf, nearness=nearness
+        )
         return self.react(seen, memory._replace(is_undercut=is_undercut), danger)
 
 
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    A gap below the safe distance is a danger, to which it reacts and brakes.
-    safe distance = v rt + a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
+    A gap below the safe distance is a danger, to which it reacts and brakes. safe distance = v rt +
+    a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
     leader.
 
     Parameters
@@ -110,8 +122,8 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time
         rt [s].
     acceleration, deceleration, leader_deceleration
-        Acceleration a while it reacts, decelerations b and b_u of its own and of the leader's braking, with which it
-        plans [m/s^2].
+        Acceleration a while it reacts, decelerations b and b_u of its own and of the leader's
+        braking, with which it plans [m/s^2].
     braking
         Deceleration with which it brakes, by default 0.774 g [m/s^2].
     corridor
@@ -136,15 +148,21 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
         rt = self.reaction_time
         reaction_speed = speed + self.reaction_time * self.acceleration
-        stop = speed * rt + self.acceleration * rt * rt / 2 + reaction_speed * reaction_speed / (2 * self.deceleration)
+        stop = (
+            speed * rt
+            + self.acceleration * rt * rt / 2
+            + reaction_speed * reaction_speed / (2 * self.deceleration)
+        )
         leader_stop = leader_speed * leader_speed / (2 * self.leader_deceleration)
         return np.maximum(stop - leader_stop, 0.0)
 
 
 class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
-    """The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), in UN R157 as amended.
+    """The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), in UN R157 as
+    amended.
 
-    It brakes according to two metrics: PFS rises as the gap falls below the safe distance, CFS as a collision nears.
+    It brakes according to two metrics: PFS rises as the gap falls below the safe distance, CFS as a
+    collision nears.
 
     Parameters
     ----------
@@ -173,15 +191,17 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
         cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, memory.acceleration(seen))
         critical_deceleration = cfs * (self.hardest - self.comfortable) + self.comfortable
-        deceleration = np.minimum(np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING)
+        deceleration = np.minimum(
+            np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING
+        )
         _, safe_distance = self.proactive_distances(seen.speed, seen.obstacle_speed)
         nearness = np.minimum(depth, safe_distance + self.margin - seen.gap)
         danger = Danger((pfs > 0) | (cfs > 0), deceleration, self.reaction_time, nearness=nearness)
         return self.react(seen, memory, danger)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
-        """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe distance, 1 below the unsafe
-        distance.
+        """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe
+        distance, 1 below the unsafe distance.
         """
         unsafe_distance, safe_distance = self.proactive_distances(v, u)
         return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
@@ -189,21 +209,30 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     def proactive_distances(self, v: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The unsafe and the safe distance [m] of PFS."""
         leader_stop = u * u / (2 * self.leader_deceleration)
-        safe_distance = v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+        safe_distance = (
+            v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+        )
         unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
         return unsafe_distance, safe_distance
 
-    def critical_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray) -> FloatArray:
-        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle [m/s^2], shape
-        (N,).
+    def critical_metric(
+        self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray
+    ) -> FloatArray:
+        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle
+        [m/s^2], shape (N,).
         """
         acceleration = np.maximum(a, -self.comfortable)
         speed_after_reaction = v + self.reaction_time * acceleration
-        # How much the gap shrinks within the reaction time and, if the vehicle is slower then, until speeds are equal:
+        # How much the gap shrinks within the reaction time and, if the vehicle is slower then,
+        # until speeds are equal:
         loss_in_reaction = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
-        loss_to_leader_speed = (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
+        loss_to_leader_speed = (
+            (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
+        )
         square = (speed_after_reaction - u) * (speed_after_reaction - u)
-        unsafe_distance, safe_distance = (loss_in_reaction + square / (2 * b) for b in (self.hardest, self.comfortable))
+        unsafe_distance, safe_distance = (
+            loss_in_reaction + square / (2 * b) for b in (self.hardest, self.comfortable)
+        )
         cfs_still_faster = _falling_ramp(gap, unsafe_distance, safe_distance)
         cfs = np.where(speed_after_reaction < u, gap < loss_to_leader_speed, cfs_still_faster)
         return np.where(v <= u, 0.0, cfs)

@@ -1,4 +1,6 @@
-"""An ADS whose parameters differ from vehicle to vehicle, and the parameters that a repair may change."""
+"""An ADS whose parameters differ from vehicle to vehicle, and the parameters that a repair may
+change.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,11 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observ
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import FreeParameter
 
-CHANGEABLE = msgspec.convert(shipped_table("ads/changeable.toml"), dict[str, dict[str, FreeParameter]])
-"""Parameters that a repair may change, by shipped ADS and name: changeable.toml beside this module."""
+CHANGEABLE = msgspec.convert(
+    shipped_table("ads/changeable.toml"), dict[str, dict[str, FreeParameter]]
+)
+"""Parameters that a repair may change, by shipped ADS and name: changeable.toml beside this module.
+"""
 
 
 class VariedAds(Ads):
@@ -28,7 +33,8 @@ class VariedAds(Ads):
     names
         Names of the parameters that vary.
     values
-        Their values, shape (m, number of names). N vehicles are N / m groups, and vehicle i of each group has row i.
+        Their values, shape (m, number of names). N vehicles are N / m groups, and vehicle i of each
+        group has row i.
     """
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
@@ -46,7 +52,9 @@ class VariedAds(Ads):
                 for driver, value in zip(drivers, column.tolist(), strict=True):
                     setattr(driver, name, value)
             return varied, drivers
-        set_field = force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__  # frozen ones, too
+        set_field = (
+            force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
+        )  # frozen ones, too
         for name, column in zip(self._names, columns, strict=True):
             set_field(varied, name, column)
         return varied, varied.start(n, nominal, step)

@@ -1,4 +1,6 @@
-"""The public library, which `import safevar_sumo` re-exports, without the questions of `safevar_sumo.questions`."""
+"""The public library, which `import safevar_sumo` re-exports, without the questions of
+`safevar_sumo.questions`.
+"""
 
 from safevar_sumo.api.evaluation import evaluate as evaluate
 from safevar_sumo.api.running import run as run

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
 
 
 SETTINGS_FORMAT = (
-    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each characteristic "
-    "that is changed, "
-    "or an array of numbers, shape (M, n)"
+    "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each"
+    " characteristic that is changed, or an array of numbers, shape (M, n)"
 )
 
 
@@ -48,11 +47,14 @@ def evaluate(
     settings
         M settings, with values in the characteristics' table units, in one of these forms:
 
-        - a list with a mapping for each setting, or a frame with a row for each setting, of the characteristics that
-          are changed; a missing value (no key, None or NaN) means the original's value;
-        - an array of shape (M, n) without missing values, with the n characteristics in the study's order.
+        - a list with a mapping for each setting, or a frame with a row for each setting, of the
+          characteristics that are changed; a missing value (no key, None or NaN) means the
+          original's value;
+        - an array of shape (M, n) without missing values, with the n characteristics in the study's
+          order.
     filtered
-        Put changes that are smaller than their thresholds back to the original, as every search does.
+        Put changes that are smaller than their thresholds back to the original, as every search
+        does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
     pool
@@ -60,16 +62,18 @@ def evaluate(
     jobs
         Worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function called with the stage, the number of settings done, and of all.
+        True for a bar on the terminal, or a function called with the stage, the number of settings
+        done, and of all.
 
     Returns
     -------
     pandas.DataFrame
-        One row per setting, in the order of `settings` and with the index of a frame: the characteristics as simulated,
-        f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined),
-        collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated, invalid-test if it leaves a
-        test's speed before the driving system acts. These have no metrics, and are neither failures nor successes. If
-        the study searches its scenario, feasible says whether the original is safe in the same encounter.
+        One row per setting, in the order of `settings` and with the index of a frame: the
+        characteristics as simulated, f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics
+        in their units (NaN where undefined), collision_speed [m/s], outcome: simulator-error if a
+        setting cannot be simulated, invalid-test if it leaves a test's speed before the driving
+        system acts. These have no metrics, and are neither failures nor successes. If the study
+        searches its scenario, feasible says whether the original is safe in the same encounter.
 
     Raises
     ------
@@ -102,15 +106,21 @@ def evaluate_settings(
     jobs: int | None = None,
     progress: Progress = show_no_progress,
 ) -> Evaluations:
-    """Simulate settings, shape (M, n), in worker processes, including settings that violate the study's constraints."""
+    """Simulate settings, shape (M, n), in worker processes, including settings that violate the
+    study's constraints.
+    """
     from safevar_sumo.questions.evaluator import open_evaluator
 
     with open_evaluator(study, pool, jobs, progress) as evaluator:
         return evaluator.evaluate(settings, "settings", ignore_constraints=True)
 
 
-def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bool) -> tuple[FloatArray, Any]:
-    """Convert a user's settings into an array of shape (M, n), and the index of its rows; refuses illegal values."""
+def _read_settings(
+    settings: Any, characteristics: CharacteristicSet, beyond: bool
+) -> tuple[FloatArray, Any]:
+    """Convert a user's settings into an array of shape (M, n), and the index of its rows; refuses
+    illegal values.
+    """
     import pandas as pd
 
     names = list(characteristics.names)
@@ -129,12 +139,17 @@ def _read_settings(settings: Any, characteristics: CharacteristicSet, beyond: bo
             array = np.array(settings, dtype=float)
             if array.ndim != 2 or array.shape[1] != len(names):
                 raise InputError(
-                    "settings", f"an array of shape {array.shape}", f"shape (M, {len(names)}): {', '.join(names)}"
+                    "settings",
+                    f"an array of shape {array.shape}",
+                    f"shape (M, {len(names)}): {', '.join(names)}",
                 )
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
-    is_legal = [row.is_legal(values, beyond=beyond) for row, values in zip(characteristics, array.T, strict=True)]
+    is_legal = [
+        row.is_legal(values, beyond=beyond)
+        for row, values in zip(characteristics, array.T, strict=True)
+    ]
     for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
         with about(f"settings, row {row}"):
             characteristics.members[column].check(float(array[row, column]), beyond=beyond)

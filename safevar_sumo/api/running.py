@@ -33,7 +33,8 @@ def run(
     engine: str = Engine.RECORDED,
     retry_failed: bool = False,
 ) -> Results:
-    """Search a study; a call with the same study and directory continues where an earlier one was stopped.
+    """Search a study; a call with the same study and directory continues where an earlier one was
+    stopped.
 
     Parameters
     ----------
@@ -48,15 +49,16 @@ def run(
     pool
         Pool that simulates, in place of new worker processes or a cluster.
     progress
-        True for a bar on the terminal; or a function called with a stage (the study's name and its finished runs), the
-        number of evaluations done, and the number to do at most.
+        True for a bar on the terminal; or a function called with a stage (the study's name and its
+        finished runs), the number of evaluations done, and the number to do at most.
     only
-        The only runs to carry out, as (algorithm, number from 0); the results are complete once every run is finished.
+        The only runs to carry out, as (algorithm, number from 0); the results are complete once
+        every run is finished.
     batch
         Maximum number of settings per batch, gathered from several runs; never changes a result.
     engine
-        "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else in SUMO; "sumo":
-        always in SUMO. Never changes a result.
+        "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else
+        in SUMO; "sumo": always in SUMO. Never changes a result.
     retry_failed
         Whether to simulate again the settings that failed before (simulator-error).
 
@@ -65,14 +67,19 @@ def run(
     InputError
         If the study cannot be used, or the directory belongs to another study.
     SafevarError
-        If nothing can be computed, a file cannot be written, or another process works on one of the runs.
+        If nothing can be computed, a file cannot be written, or another process works on one of the
+        runs.
     """
     loaded_study, system = load_for_search(study)
     keys = all_runs(loaded_study)
     if only is not None:
         for key in only:
             if tuple(key) not in keys:
-                raise InputError("only", repr(key), "(algorithm of the study, run from 0 to less than `search.runs`)")
+                raise InputError(
+                    "only",
+                    repr(key),
+                    "(algorithm of the study, run from 0 to less than `search.runs`)",
+                )
         keys = [RunKey(*key) for key in only]
     if batch is not None:
         check_whole("batch", batch, MAX_BATCH)
@@ -82,7 +89,16 @@ def run(
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)
     with pool_context as workers, open_progress(progress) as show:
         run_campaign(
-            loaded_study, system, keys, directory, workers, show, warn, batch, engine, retry_failed=retry_failed
+            loaded_study,
+            system,
+            keys,
+            directory,
+            workers,
+            show,
+            warn,
+            batch,
+            engine,
+            retry_failed=retry_failed,
         )
     results = load(directory)
     if remark := few_evaluations(results.case):
@@ -102,7 +118,10 @@ def load_for_search(study: StudyLike) -> tuple[Study, System]:
     characteristics = system.characteristics
     search = loaded_study.search
     if search.population > search.evaluations:
-        excess = f"search.population = {search.population} is more than search.evaluations = {search.evaluations}"
+        excess = (
+            f"search.population = {search.population} is more than search.evaluations ="
+            f" {search.evaluations}"
+        )
         raise InputError(loaded_study.source, excess, "a run of at least one population")
     problem = problem_of(loaded_study, system, Evaluations.none(len(characteristics), METRICS))
     for name in loaded_study.search.labels:

@@ -1,4 +1,6 @@
-"""Simulate one setting beside the original vehicle, with a trace of every step, or many settings at once."""
+"""Simulate one setting beside the original vehicle, with a trace of every step, or many settings at
+once.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +49,15 @@ OBSERVATION_HEADS = {
 }
 
 
-def trace_frame(runs: SimulationRuns, observations: Sequence[Observation], row: int = 0) -> pd.DataFrame:
-    """One row for each step of a simulation of one vehicle, until its end; it is in this row of the observations.
+def trace_frame(
+    runs: SimulationRuns, observations: Sequence[Observation], row: int = 0
+) -> pd.DataFrame:
+    """One row for each step of a simulation of one vehicle, until its end; it is in this row of the
+    observations.
 
-    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold the obstacle's true
-    position; the columns that begin with "seen" hold what the ADS observed. `ttc` is empty while no gap closes or the
-    vehicle stands, `gap` while no obstacle is ahead.
+    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold
+    the obstacle's true position; the columns that begin with "seen" hold what the ADS observed.
+    `ttc` is empty while no gap closes or the vehicle stands, `gap` while no obstacle is ahead.
     """
     import pandas as pd  # takes longer to load than the simulation
 
@@ -72,13 +77,19 @@ def trace_frame(runs: SimulationRuns, observations: Sequence[Observation], row: 
     }
     active = trace.active[:, 0]
     frame = pd.DataFrame(
-        {"time [s]": trace.time[active], **{name: column[active, 0] for name, column in columns.items()}}
+        {
+            "time [s]": trace.time[active],
+            **{name: column[active, 0] for name, column in columns.items()},
+        }
     )
     observed = pd.DataFrame(
         [
             {
                 "time [s]": round(float(observation.time), TIME_DECIMALS),
-                **{head: float(getattr(observation, name)[row]) for name, head in OBSERVATION_HEADS.items()},
+                **{
+                    head: float(getattr(observation, name)[row])
+                    for name, head in OBSERVATION_HEADS.items()
+                },
             }
             for observation in observations
         ]
@@ -87,9 +98,11 @@ def trace_frame(runs: SimulationRuns, observations: Sequence[Observation], row: 
 
 
 class Pair(NamedTuple):
-    """The original vehicle (row 0) and a changed one (row 1, if it differs), which `system` drove together at a point.
+    """The original vehicle (row 0) and a changed one (row 1, if it differs), which `system` drove
+    together at a point.
 
-    `observations` hold what the driving systems observed at every sample, arrays of shape (1,) or (2,).
+    `observations` hold what the driving systems observed at every sample, arrays of shape (1,) or
+    (2,).
     """
 
     point: Point
@@ -125,8 +138,8 @@ class Simulation:
 
     @cached_property
     def original(self) -> Simulation:
-        """The simulation of the original vehicle in the same encounter, at the same point of a matrix; for the original
-        vehicle, the simulation itself.
+        """The simulation of the original vehicle in the same encounter, at the same point of a
+        matrix; for the original vehicle, the simulation itself.
         """
         return self if self.row == 0 else replace(self, row=0, reset_values={})
 
@@ -168,8 +181,13 @@ class Simulation:
 
     @property
     def objectives(self) -> dict[str, float]:
-        """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all are minimised."""
-        return {name: float(self.evaluation.column(name)[0]) for name in ("f_safe", "f_diff", "f_num_diff")}
+        """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all
+        are minimised.
+        """
+        return {
+            name: float(self.evaluation.column(name)[0])
+            for name in ("f_safe", "f_diff", "f_num_diff")
+        }
 
     @property
     def units(self) -> dict[str, str]:
@@ -196,13 +214,15 @@ class Simulation:
 
     @property
     def gap(self) -> float:
-        """The least distance between bodies during the encounter [m]; 0 on a collision, NaN without an encounter."""
+        """The least distance between bodies during the encounter [m]; 0 on a collision, NaN without
+        an encounter.
+        """
         return float(self.evaluation.gaps(self.runs.middles_apart)[0])
 
     @property
     def numbers(self) -> JsonObject:
-        """Outcome, metrics, objectives and gap as plain values, None where undefined; `driven` is false if simulations
-        of the study tell nothing about its ADS.
+        """Outcome, metrics, objectives and gap as plain values, None where undefined; `driven` is
+        false if simulations of the study tell nothing about its ADS.
         """
         gap = finite_or_none(self.gap)
         return {"driven": not self.no_verdict, **record(self.evaluation, row=0), "gap": gap}
@@ -219,14 +239,20 @@ class Simulation:
         )
 
     def to_dict(self) -> JsonObject:
-        """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain values."""
+        """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain
+        values.
+        """
         return {"study": self.study.name, "vcs": dict(self.setting), **self.numbers}
 
     def _repr_html_(self) -> str:
         import pandas as pd
 
-        rows = [{**vehicle.setting, **vehicle.metrics, **vehicle.objectives} for vehicle in (self.original, self)]
-        return f"<p>{escape(repr(self))}</p>\n{pd.DataFrame(rows, ['original', 'simulated']).T.to_html()}"
+        rows = [
+            {**vehicle.setting, **vehicle.metrics, **vehicle.objectives}
+            for vehicle in (self.original, self)
+        ]
+        table = pd.DataFrame(rows, ["original", "simulated"]).T
+        return f"<p>{escape(repr(self))}</p>\n{table.to_html()}"
 
     def __repr__(self) -> str:
         metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
@@ -234,7 +260,11 @@ class Simulation:
 
 
 def simulate(
-    study: StudyLike, changes: Mapping[str, float] | None = None, *, filtered: bool = True, beyond: bool = False
+    study: StudyLike,
+    changes: Mapping[str, float] | None = None,
+    *,
+    filtered: bool = True,
+    beyond: bool = False,
 ) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
 
@@ -243,9 +273,11 @@ def simulate(
     study
         A study, or anything that `load_study` accepts.
     changes
-        Values by characteristic, in their table units; all other characteristics keep the original's value.
+        Values by characteristic, in their table units; all other characteristics keep the
+        original's value.
     filtered
-        Put changes that are smaller than their thresholds back to the original, as every search does.
+        Put changes that are smaller than their thresholds back to the original, as every search
+        does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
 
@@ -285,9 +317,11 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     return loaded_study
 
 
-def changed_setting(system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or, after the filter if
-    `filtered`, infeasible.
+def changed_setting(
+    system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool
+) -> FloatArray:
+    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or,
+    after the filter if `filtered`, infeasible.
     """
     with about("changes"):
         setting = system.characteristics.setting({} if changes is None else changes, beyond=beyond)
@@ -296,9 +330,11 @@ def changed_setting(system: System, changes: Mapping[str, float] | None, filtere
         return setting
 
 
-def simulate_with_original(study: Study, system: System, requested: FloatArray, *, filtered: bool) -> Simulation:
-    """Simulate a setting, shape (n,), which is filtered first if `filtered`, beside the original vehicle; in a matrix,
-    both at the setting's worst point.
+def simulate_with_original(
+    study: Study, system: System, requested: FloatArray, *, filtered: bool
+) -> Simulation:
+    """Simulate a setting, shape (n,), which is filtered first if `filtered`, beside the original
+    vehicle; in a matrix, both at the setting's worst point.
     """
     characteristics = system.characteristics
     setting = characteristics.filter(requested) if filtered else requested
@@ -320,7 +356,9 @@ def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
 
 
 def _drive_pair(system: System, setting: FloatArray) -> Pair:
-    """Drive a setting, shape (n,), at its worst point beside the original vehicle, unless it is that one."""
+    """Drive a setting, shape (n,), at its worst point beside the original vehicle, unless it is
+    that one.
+    """
     original = system.characteristics.with_original_vehicle(setting)
     settings = np.stack([original] if np.array_equal(original, setting) else [original, setting])
     point = worst_point(system, setting)

@@ -25,7 +25,11 @@ from safevar_sumo.questions.ask import Criterion, Jobs, Range
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, as_printed
 from safevar_sumo.questions.measure import cases_by, study_by
-from safevar_sumo.questions.research_questions.answer import REMARKS, answer_questions, remarks_on_runs
+from safevar_sumo.questions.research_questions.answer import (
+    REMARKS,
+    answer_questions,
+    remarks_on_runs,
+)
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
@@ -50,7 +54,9 @@ ALGORITHMS: Columns = {
     "runs": "runs",
     "simulated": "different settings simulated so far",
     "collisions": "those that collide, and the original vehicle is safe in the same encounter",
-    "invalid_tests": "those that leave a test's speed before the ADS acts: neither failure nor success",
+    "invalid_tests": (
+        "those that leave a test's speed before the ADS acts: neither failure nor success"
+    ),
     "simulator_errors": "those that cannot be simulated",
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
     "solutions": "solutions of finished runs",
@@ -60,7 +66,15 @@ RUN_TESTS = ("rq1-runs", "rq2-runs")
 
 
 @contents(
-    *("results", "finished", "runs", "evaluations", "solutions", "original_outcome", "original_degree"),
+    *(
+        "results",
+        "finished",
+        "runs",
+        "evaluations",
+        "solutions",
+        "original_outcome",
+        "original_degree",
+    ),
     *("engine", "evaluations_per_second", "seconds"),
     algorithms=[*ALGORITHMS, ...],
     **{name: TABLES[name].columns for name in RUN_TESTS},
@@ -99,12 +113,14 @@ def study(
     seed
         Seed of the whole study.
     unsafe
-        What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as "drac > 6".
+        What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as
+        "drac > 6".
     batch
-        Maximum settings per batch, gathered from several runs; does not change results. By default the fastest.
+        Maximum settings per batch, gathered from several runs; does not change results. By default
+        the fastest.
     engine
-        What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor reacts to the
-        vehicles; results are verified in SUMO. sumo: always SUMO.
+        What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor
+        reacts to the vehicles; results are verified in SUMO. sumo: always SUMO.
     out
         Directory of the results, by default results/STUDY.
     jobs
@@ -127,7 +143,11 @@ def study(
     as_written = load_study(study)
     directory = out or Path("results") / as_written.name
     if unsafe is not None and (status or dry_run):
-        raise InputError("unsafe", f"beside {'status' if status else 'dry_run'}, which judge no vehicle", "a search")
+        raise InputError(
+            "unsafe",
+            f"beside {'status' if status else 'dry_run'}, which judge no vehicle",
+            "a search",
+        )
     if status:
         return summarise(load(directory))
     search = as_written.search
@@ -148,19 +168,31 @@ def study(
     if dry_run:
         with open_pool(jobs, cluster) as pool:
             used, reason = choose_engine(system, engine)
-            task = Task(study=loaded, engine=used, batch_size=batch or settings_per_batch(system, used))
+            task = Task(
+                study=loaded, engine=used, batch_size=batch or settings_per_batch(system, used)
+            )
             return _forecast(loaded, len(keys), measure_speed(task, pool), f"{used}: {reason}")
-    options: dict[str, Any] = {"jobs": jobs, "cluster": cluster, "only": keys, "batch": batch, "engine": engine}
+    options: dict[str, Any] = {
+        "jobs": jobs,
+        "cluster": cluster,
+        "only": keys,
+        "batch": batch,
+        "engine": engine,
+    }
     try:
         results = run(loaded, directory, progress=not quiet, retry_failed=retry_failed, **options)
     except KeyboardInterrupt:
-        warn(f"finished evaluations are kept in {directory}: run the same command again to continue")
+        warn(
+            f"finished evaluations are kept in {directory}: run the same command again to continue"
+        )
         raise
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
-    following = ", ".join(question_command(name, str(directory)) + criterion for name in ("explain", "tolerance"))
+    following = ", ".join(
+        question_command(name, str(directory)) + criterion for name in ("explain", "tolerance")
+    )
     verdict = f"{reason or _verdict(results, case, system)} Next: {following}"
     return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
@@ -175,7 +207,10 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
             raise InputError("only", repr(only), legal)
     if shard is not None:
         rank, _, count = shard.partition("/")
-        if not (all(text.isdecimal() and len(text) < 10 for text in (rank, count)) and 1 <= int(rank) <= int(count)):
+        if not (
+            all(text.isdecimal() and len(text) < 10 for text in (rank, count))
+            and 1 <= int(rank) <= int(count)
+        ):
             raise InputError("shard", repr(shard), "K/N, with K in 1..N")
         keys = keys[int(rank) - 1 :: int(count)]
     return keys
@@ -190,7 +225,10 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
     return Answer(
         question="study",
         study=study,
-        verdict=f"About {time} for at most {evaluations} evaluations, {runs} runs of {names}; nothing was written.",
+        verdict=(
+            f"About {time} for at most {evaluations} evaluations, {runs} runs of {names}; nothing"
+            " was written."
+        ),
         numbers={
             "runs": runs,
             "engine": engine,
@@ -208,12 +246,18 @@ def _verdict(results: Results, case: Case, system: System) -> str:
     if not system.rater and not system.characteristics.scenario:
         original = evaluate(assemble(case.study), system.characteristics.original[np.newaxis])
         if case.unsafe.of(original)[0]:
-            return f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is needed."
+            return (
+                f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is"
+                " needed."
+            )
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
         return "No solution."
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
-    counts = f"{len(failures)} of {len(solutions)} different solutions are unsafe: {case.unsafe.description}."
+    counts = (
+        f"{len(failures)} of {len(solutions)} different solutions are unsafe:"
+        f" {case.unsafe.description}."
+    )
     counts = " ".join([counts, *demanded_in_words(results.study)])
     if failures.empty:
         return counts
@@ -237,8 +281,8 @@ def _verdict(results: Results, case: Case, system: System) -> str:
 
 
 def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:
-    """A solution simulated with its values as they are printed, with as many digits as it needs to be unsafe; None if
-    it is safe with all of them.
+    """A solution simulated with its values as they are printed, with as many digits as it needs to
+    be unsafe; None if it is safe with all of them.
     """
     for further in FURTHER_DIGITS:
         printed = evaluate(system, as_printed(system.characteristics, setting, further)[np.newaxis])
@@ -248,7 +292,8 @@ def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Eval
 
 
 def summarise(results: Results) -> Answer:
-    """How far a study is: a row for each algorithm, and RQ1 and RQ2 over runs as far as they have an answer.
+    """How far a study is: a row for each algorithm, and RQ1 and RQ2 over runs as far as they have
+    an answer.
 
     Raises
     ------
@@ -263,7 +308,9 @@ def summarise(results: Results) -> Answer:
     finished = Counter(name for name, _ in results.finished)
     rows = []
     for name in study.search.labels:
-        simulated, solutions = (frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions))
+        simulated, solutions = (
+            frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions)
+        )
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
         counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
@@ -272,7 +319,10 @@ def summarise(results: Results) -> Answer:
         best = feasible["f_safe"].min()
         ends = (collisions, *counts, best, len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
-    metrics = {metric.name: Column(metric.unit, "mean over solutions", ".2f") for metric in case.scoring.metrics}
+    metrics = {
+        metric.name: Column(metric.unit, "mean over solutions", ".2f")
+        for metric in case.scoring.metrics
+    }
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     tables = {"algorithms": table}
     untold = list[str]()
@@ -287,7 +337,9 @@ def summarise(results: Results) -> Answer:
     return Answer(
         question="study",
         study=study,
-        verdict=f"{len(results.finished)} of {number_of(runs, 'run')} finished in {results.directory}.",
+        verdict=(
+            f"{len(results.finished)} of {number_of(runs, 'run')} finished in {results.directory}."
+        ),
         numbers={
             "results": str(results.directory),
             "finished": len(results.finished),

@@ -1,4 +1,6 @@
-"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and how fast they will be."""
+"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and how fast they will
+be.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ def run_campaign(
     *,
     retry_failed: bool = False,
 ) -> Campaign:
-    """Carry out runs of a study, or resume unfinished ones; write the solutions if these are all runs of the study.
+    """Carry out runs of a study, or resume unfinished ones; write the solutions if these are all
+    runs of the study.
 
     Parameters
     ----------
@@ -67,7 +70,8 @@ def run_campaign(
     batch_size
         Maximum number of settings in a batch, which may hold settings of several runs.
     engine
-        What moves the vehicles; before a run is finished, results from recorded scenes are verified in SUMO.
+        What moves the vehicles; before a run is finished, results from recorded scenes are verified
+        in SUMO.
     retry_failed
         Whether to simulate settings again that failed before.
 
@@ -77,21 +81,32 @@ def run_campaign(
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
     use = check_code(study, pool)
-    results = ResultsDirectory(directory, study, identity_of(study, system, use.modules), system.measuring.scoring)
+    results = ResultsDirectory(
+        directory, study, identity_of(study, system, use.modules), system.measuring.scoring
+    )
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
     algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
     results.manifest["titles"] = {name: one.title for name, one in algorithms.items() if one.title}
-    results.manifest["stop_by_themselves"] = [name for name, one in algorithms.items() if one.stops_by_itself]
-    task = Task(study=study, engine=engine_used, batch_size=batch_size or settings_per_batch(system, engine_used))
+    results.manifest["stop_by_themselves"] = [
+        name for name, one in algorithms.items() if one.stops_by_itself
+    ]
+    task = Task(
+        study=study,
+        engine=engine_used,
+        batch_size=batch_size or settings_per_batch(system, engine_used),
+    )
     show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])
     compile_vehicle(study, pool, progress)
     if undeclared := [name for name in use.opened if name not in results.manifest["files"]]:
         files = ", ".join(undeclared)
-        warn(f"study {study.name!r}: user code reads {files}, which no `files` of the study names: edits go unnoticed")
+        warn(
+            f"study {study.name!r}: user code reads {files}, which no `files` of the study names:"
+            " edits go unnoticed"
+        )
     no_verdict = ask_why_no_verdict(study, pool)
     if no_verdict:
         warn(f"study {study.name!r}: {no_verdict}")
@@ -102,7 +117,10 @@ def run_campaign(
     results.begin(original)
     verifies = engine_used is Engine.RECORDED
     shares = [
-        (task, Share(dealt, directory.absolute(), results.manifest, original, verifies, retry_failed))
+        (
+            task,
+            Share(dealt, directory.absolute(), results.manifest, original, verifies, retry_failed),
+        )
         for dealt in deal(keys, pool.workers, task.batch_size, study.search.population)
     ]
     runs = list[RunResult]()
@@ -122,33 +140,41 @@ def evaluate_original(task: Task, pool: Pool) -> Evaluations:
     original: Evaluations = carry_out(evaluate_settings, [(task, settings)], pool)[0]
     if original.failed[0]:
         raise SimulationError(
-            f"study {task.study.name!r}: the original vehicle cannot be simulated: {original.reason(0)}"
+            f"study {task.study.name!r}: the original vehicle cannot be simulated:"
+            f" {original.reason(0)}"
         )
     if not original.valid[0]:
         raise InputError(
             task.study.source,
-            "the original vehicle violates a test's speed tolerance before the ADS acts (invalid-test), "
-            "so there is no baseline",
+            "the original vehicle violates a test's speed tolerance before the ADS acts"
+            " (invalid-test), so there is no baseline",
             "tests whose speed the vehicle can hold",
         )
     return original
 
 
-def deal(keys: Sequence[RunKey], workers: int, batch_size: int, population: int) -> list[Sequence[RunKey]]:
+def deal(
+    keys: Sequence[RunKey], workers: int, batch_size: int, population: int
+) -> list[Sequence[RunKey]]:
     """Deal runs out in shares; their number is a multiple of the number of workers.
 
-    All runs of a share are under way at the same time: they fill large batches, which cost least for each setting.
+    All runs of a share are under way at the same time: they fill large batches, which cost least
+    for each setting.
     """
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / population), MAX_RUNS)
     count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
-    return [keys[number::count] for number in range(count)]  # like cards: each share gets runs of all algorithms
+    return [
+        keys[number::count] for number in range(count)
+    ]  # like cards: each share gets runs of all algorithms
 
 
 def journal_progress(
     study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
 ) -> Callable[[Sequence[int]], None]:
     """A function that shows the evaluations that runs have asked for, as their journals tell."""
-    readers = [JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys]
+    readers = [
+        JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys
+    ]
 
     def show(ended: Sequence[int]) -> None:
         asked = [reader.asked() for reader in readers]
@@ -160,25 +186,33 @@ def journal_progress(
 
 
 def choose_engine(system: System, name: str) -> tuple[Engine, str]:
-    """Choose the engine that moves a system's vehicles, and say why; raises InputError for an unknown engine."""
+    """Choose the engine that moves a system's vehicles, and say why; raises InputError for an
+    unknown engine.
+    """
     if name not in ENGINES:
         raise InputError("engine", repr(name), one_of(ENGINES))
     if name == Engine.LIBSUMO:
         return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)
-    return (Engine.LIBSUMO, reason) if reason else (Engine.RECORDED, "nobody reacts to the vehicle under test")
+    return (
+        (Engine.LIBSUMO, reason)
+        if reason
+        else (Engine.RECORDED, "nobody reacts to the vehicle under test")
+    )
 
 
 def measure_speed(task: Task, pool: Pool) -> float:
-    """Evaluations per second of all workers, measured with one batch of random settings for each; the search costs
-    little beside them.
+    """Evaluations per second of all workers, measured with one batch of random settings for each;
+    the search costs little beside them.
     """
     system = system_of(task.study)
     characteristics = system.characteristics
     size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
     rng = np.random.default_rng(task.study.search.seed)
     shape = (pool.workers, size, len(characteristics))
-    jobs = [(task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)]
+    jobs = [
+        (task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)
+    ]
     carry_out(evaluate_settings, jobs, pool)  # workers load the study, and warm up
     start = time.perf_counter()
     carry_out(evaluate_settings, jobs, pool)

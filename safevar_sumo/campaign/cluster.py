@@ -15,8 +15,8 @@ from safevar_sumo.errors import InputError, SafevarError, describe_error
 from safevar_sumo.plugins.process import this_process
 
 CLUSTER = (
-    "the address of a Dask scheduler, such as tcp://host:8786; for tls:// certificates in Dask's configuration: "
-    "distributed.comm.tls.ca-file and .client.cert, .client.key"
+    "the address of a Dask scheduler, such as tcp://host:8786; for tls:// certificates in Dask's"
+    " configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
 )
 CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
@@ -35,20 +35,24 @@ def connect(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError("cluster", "Dask is not installed", "in the checkout: pip install '.[cluster]'") from None
+        raise InputError(
+            "cluster", "Dask is not installed", "in the checkout: pip install '.[cluster]'"
+        ) from None
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # this package reports errors itself
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError("cluster", f"no scheduler answers at {address!r}: {describe_error(error)}", CLUSTER) from None
+        raise InputError(
+            "cluster", f"no scheduler answers at {address!r}: {describe_error(error)}", CLUSTER
+        ) from None
     with client:
         yield client
 
 
 class ClusterWorker:
-    """Any worker of a cluster. Dask itself gives the job of a dead worker to others, as often as its configuration
-    says (`distributed.scheduler.allowed-failures`).
+    """Any worker of a cluster. Dask itself gives the job of a dead worker to others, as often as
+    its configuration says (`distributed.scheduler.allowed-failures`).
     """
 
     def __init__(self, client: Any) -> None:
@@ -78,7 +82,9 @@ def _carry_out(packed_job: bytes) -> Any:
 
 
 def has_caller() -> bool:
-    """Whether somebody waits for this job: false in a worker of a cluster if its command has ended."""
+    """Whether somebody waits for this job: false in a worker of a cluster if its command has
+    ended.
+    """
     if "distributed" not in sys.modules:
         return True
     from distributed import get_worker

@@ -1,5 +1,6 @@
-"""What a worker computes with the settings of a study: a task, the evaluation of a batch of settings, a pure function
-for any process on any machine, and the comparison of its results with SUMO.
+"""What a worker computes with the settings of a study: a task, the evaluation of a batch of
+settings, a pure function for any process on any machine, and the comparison of its results with
+SUMO.
 """
 
 from __future__ import annotations
@@ -31,13 +32,15 @@ from safevar_sumo.vehicles import CharacteristicSet
 VERIFIED_SETTINGS = 50
 """Number of settings of a study to verify in SUMO in questions."""
 KNOWN_SYSTEMS = 64
-"""Number of systems that a process keeps: questions about the fits of a vehicle change between them."""
+"""Number of systems that a process keeps: questions about the fits of a vehicle change between
+them.
+"""
 COMMAND_PREFIX = "; to reproduce it: "
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Restricts a task to some points of a study, and varies parameters of its ADS; no original vehicle drives in the
-    encounters of a study that searches its scenario.
+    """Restricts a task to some points of a study, and varies parameters of its ADS; no original
+    vehicle drives in the encounters of a study that searches its scenario.
 
     Attributes
     ----------
@@ -114,21 +117,27 @@ def carry_out(
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
         work = ", ".join(
-            f"{len(argument)} settings" if isinstance(argument, np.ndarray) else str(argument) for argument in arguments
+            f"{len(argument)} settings" if isinstance(argument, np.ndarray) else str(argument)
+            for argument in arguments
         )
         names = user_code_names(task.study)
-        problem = f"two workers were lost at the same work, {work or function.__name__.strip('_')}: {error}"
+        problem = (
+            f"two workers were lost at the same work, {work or function.__name__.strip('_')}:"
+            f" {error}"
+        )
         if names:
-            raise UserCodeError(f"study {task.study.name!r}", f"{problem}, probably in {' and '.join(names)}") from None
+            raise UserCodeError(
+                f"study {task.study.name!r}", f"{problem}, probably in {' and '.join(names)}"
+            ) from None
         raise SafevarError(f"study {task.study.name!r}: {problem}") from None
 
 
 def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate settings of n characteristics, and values of the selected parameters, shape (k, n + p), in equal
-    batches.
+    """Evaluate settings of n characteristics, and values of the selected parameters, shape (k, n +
+    p), in equal batches.
 
-    A batch that fails is halved until the failing settings are alone: a setting that SUMO cannot simulate gets the
-    outcome `simulator-error`.
+    A batch that fails is halved until the failing settings are alone: a setting that SUMO cannot
+    simulate gets the outcome `simulator-error`.
 
     Raises
     ------
@@ -145,7 +154,9 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     except (SimulationError, UserCodeError) as error:
         failure = error
     except (OSError, MemoryError) as error:
-        raise EnvironmentFault(f"a batch cannot be computed: {str(error) or 'no memory is left'}") from None
+        raise EnvironmentFault(
+            f"a batch cannot be computed: {str(error) or 'no memory is left'}"
+        ) from None
     if len(rows) == 1:
         return _failed_evaluation(task.study, rows, failure)
     halves = [evaluate_settings(task, half) for half in np.array_split(rows, 2)]
@@ -154,14 +165,20 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     return Evaluations.concatenate(halves)
 
 
-def _failed_evaluation(study: Study, row: FloatArray, failure: SimulationError | UserCodeError) -> Evaluations:
-    """The evaluation of a setting that SUMO cannot simulate; raises the error of user code, with a command."""
+def _failed_evaluation(
+    study: Study, row: FloatArray, failure: SimulationError | UserCodeError
+) -> Evaluations:
+    """The evaluation of a setting that SUMO cannot simulate; raises the error of user code, with a
+    command.
+    """
     characteristics = CharacteristicSet.of(study)
     undefined = np.full(1, np.nan)
     setting = row[:, : len(characteristics)]  # without the ADS's parameters
     if isinstance(failure, UserCodeError):
         command = reproduction_command(study, setting[0])
-        raise UserCodeError(failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal) from None
+        raise UserCodeError(
+            failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal
+        ) from None
     return Evaluations(
         settings=row,
         outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
@@ -174,8 +191,8 @@ def _failed_evaluation(study: Study, row: FloatArray, failure: SimulationError |
 
 
 def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate settings as a task says, shape (k, n + p), in one batch. A worker that takes longer than the study's
-    time limit ends.
+    """Evaluate settings as a task says, shape (k, n + p), in one batch. A worker that takes longer
+    than the study's time limit ends.
     """
     system = system_of(task.study)
     system.vehicle.compile()  # outside the time limit
@@ -203,12 +220,16 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     rows_of_groups = []
     for number, parameter_set in enumerate(parameter_sets.tolist()):
         group = np.flatnonzero(set_of_row.ravel() == number)
-        study = with_parameters(task.study, dict(zip(selection.parameters, parameter_set, strict=True)))
+        study = with_parameters(
+            task.study, dict(zip(selection.parameters, parameter_set, strict=True))
+        )
         driven = replace(system, ads=assemble(study).ads)
         evaluations = evaluate(driven, settings[group], task.engine, with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
-    return Evaluations.concatenate(groups).take(np.argsort(np.concatenate(rows_of_groups)))  # in the order of the rows
+    return Evaluations.concatenate(groups).take(
+        np.argsort(np.concatenate(rows_of_groups))
+    )  # in the order of the rows
 
 
 def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
@@ -218,8 +239,8 @@ def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the only point to which
-    the study was reduced.
+    """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the
+    only point to which the study was reduced.
     """
     characteristics = CharacteristicSet.of(study)
     origin = study.origin
@@ -231,7 +252,11 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
         if value != characteristic.original
     ]
     words += ["--no-filter"] if (characteristics.filter(setting) != setting).any() else []
-    words += ["--beyond"] if ((setting < characteristics.lower) | (setting > characteristics.upper)).any() else []
+    words += (
+        ["--beyond"]
+        if ((setting < characteristics.lower) | (setting > characteristics.upper)).any()
+        else []
+    )
     return " ".join(words)
 
 

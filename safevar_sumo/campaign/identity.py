@@ -1,4 +1,6 @@
-"""The identity of a study: all inputs of its results besides the study itself, among them the digests of files."""
+"""The identity of a study: all inputs of its results besides the study itself, among them the
+digests of files.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +21,9 @@ from safevar_sumo.sumo.system import System
 def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
     """The layers of a manifest except the study: plain values that are the same in every process.
 
-    `used` are names of further files, which user code was seen to load; those that exist belong to the identity.
-    `files` are digests of files; `results` is the version of the results; `platform` are properties of the machine
-    that may affect the last bit of a result.
+    `used` are names of further files, which user code was seen to load; those that exist belong to
+    the identity. `files` are digests of files; `results` is the version of the results; `platform`
+    are properties of the machine that may affect the last bit of a result.
     """
     return {
         "files": files_of(study, system, used),
@@ -31,8 +33,8 @@ def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonO
 
 
 def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
-    """Digests, by name, of the files that a study's results depend on: of its networks, its user code and FMUs, the
-    data files that it names, and those of the names `used` that exist.
+    """Digests, by name, of the files that a study's results depend on: of its networks, its user
+    code and FMUs, the data files that it names, and those of the names `used` that exist.
     """
     places = study.origin.places
     networks = {point.scenario.network for point in system.points}

@@ -26,7 +26,8 @@ from safevar_sumo.shipped import PACKAGE
 
 
 class ProcessWorker:
-    """A process that starts at once. It is spawned, because libsumo must not be forked, and ends with this process.
+    """A process that starts at once. It is spawned, because libsumo must not be forked, and ends
+    with this process.
 
     Parameters
     ----------
@@ -42,7 +43,8 @@ class ProcessWorker:
         with _hide_main(), _show_package(), _block_interrupts():
             self._executor.submit(os.getpid)  # starts the process
         (self._process,) = self._executor._processes.values()
-        # Otherwise the result of a process that dies while it sends it is waited for until the end of time.
+        # Otherwise the result of a process that dies while it sends it is waited for until the end
+        # of time.
         self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
@@ -51,13 +53,23 @@ class ProcessWorker:
     def cause_of_death(self, error: BaseException) -> str:
         if not isinstance(error, BrokenExecutor):
             return ""
-        words = self._last_words.read_text(encoding="utf-8", errors="replace") if self._last_words.exists() else ""
-        frames = [(file, line) for file, line in re.findall(r'File "(.+)", line (\d+) in', words) if is_user_file(file)]
+        words = (
+            self._last_words.read_text(encoding="utf-8", errors="replace")
+            if self._last_words.exists()
+            else ""
+        )
+        frames = [
+            (file, line)
+            for file, line in re.findall(r'File "(.+)", line (\d+) in', words)
+            if is_user_file(file)
+        ]
         place = f" in {frames[0][0]}, line {frames[0][1]}" if frames else ""
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
         self._process.join()
-        for _ in range(1000):  # the executor's thread may have waited for the process, and be about to note its code
+        for _ in range(
+            1000
+        ):  # the executor's thread may have waited for the process, and be about to note its code
             if self._process.exitcode is not None:
                 break
             time.sleep(0.001)
@@ -80,7 +92,9 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
 
 
 def _end_with_caller() -> None:
-    """End this process with its caller. Otherwise a worker that hangs in a simulation would outlive a killed caller."""
+    """End this process with its caller. Otherwise a worker that hangs in a simulation would outlive
+    a killed caller.
+    """
     caller = multiprocessing.parent_process()
     assert caller is not None
     caller.join()
@@ -89,8 +103,8 @@ def _end_with_caller() -> None:
 
 @contextmanager
 def _hide_main() -> Iterator[None]:
-    """Hide the main module, which a spawned process would run again; scripts then need no `if __name__ ==
-    "__main__"`.
+    """Hide the main module, which a spawned process would run again; scripts then need no `if
+    __name__ == "__main__"`.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
@@ -112,8 +126,8 @@ def _show_package() -> Iterator[None]:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block Ctrl-C and the like in this thread: a process that it starts inherits that, and does not end while modules
-    load; the one that started it ends it.
+    """Block Ctrl-C and the like in this thread: a process that it starts inherits that, and does
+    not end while modules load; the one that started it ends it.
     """
     if sys.platform == "win32":  # Windows has no signal masks
         yield

@@ -1,7 +1,8 @@
-"""A pool of workers: processes of this machine, or the workers of a Dask cluster. Each carries out one job at a time.
+"""A pool of workers: processes of this machine, or the workers of a Dask cluster. Each carries out
+one job at a time.
 
-A job is a plain function with its arguments, which are sent to the worker. `carry_out` in `campaign/evaluation.py`
-gives jobs to a pool.
+A job is a plain function with its arguments, which are sent to the worker. `carry_out` in
+`campaign/evaluation.py` gives jobs to a pool.
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ class Pool:
     workers
         Number of jobs that are carried out at the same time.
     verified
-        Number of settings whose results were verified, by packed study; a study that it lacks is new to the pool.
+        Number of settings whose results were verified, by packed study; a study that it lacks is
+        new to the pool.
     compiled
         Names of the vehicle models that workers find compiled.
     """
@@ -81,10 +83,11 @@ class Pool:
         jobs: Sequence[tuple[Any, ...]],
         look: Callable[[Sequence[int]], None] = lambda ended: None,
     ) -> list[Any]:
-        """The results of a function for the arguments of each job, in their order; a job whose worker dies is carried
-        out once more.
+        """The results of a function for the arguments of each job, in their order; a job whose
+        worker dies is carried out once more.
 
-        `look` is called with the numbers of the jobs that have just ended, and at least twice a second.
+        `look` is called with the numbers of the jobs that have just ended, and at least twice a
+        second.
 
         Raises
         ------
@@ -128,8 +131,8 @@ class Pool:
         return [results[number] for number in range(len(jobs))]
 
     def share_out(self, functions: Sequence[Callable[[Pool], Result]]) -> list[Result]:
-        """The results of functions that give jobs to a pool, each in a thread with some of the workers; when one
-        raises an error, the others end.
+        """The results of functions that give jobs to a pool, each in a thread with some of the
+        workers; when one raises an error, the others end.
         """
         count = min(len(functions), self.workers)
         if count < 2:
@@ -185,20 +188,24 @@ def available_cores() -> int:
 
 @contextmanager
 def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
-    """A pool of `jobs` processes, by default one for each core, or of the workers of the Dask scheduler at an address;
-    they end with the context.
+    """A pool of `jobs` processes, by default one for each core, or of the workers of the Dask
+    scheduler at an address; they end with the context.
 
     Raises
     ------
     InputError
-        If `jobs` is no number of processes, the scheduler does not answer, or the extra `cluster` is not installed.
+        If `jobs` is no number of processes, the scheduler does not answer, or the extra `cluster`
+        is not installed.
     """
     if jobs is not None:
         check_whole("jobs", jobs, MAX_JOBS)
     with ExitStack() as stack:
         if cluster is None:
             folder = stack.enter_context(temporary_folder())
-            pool = Pool(jobs or available_cores(), lambda place: local.ProcessWorker(folder / f"{place}.txt"))
+            pool = Pool(
+                jobs or available_cores(),
+                lambda place: local.ProcessWorker(folder / f"{place}.txt"),
+            )
         else:
             client = stack.enter_context(dask.connect(cluster))
             pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))

@@ -1,5 +1,5 @@
-"""What a pool computes for a study besides its runs: many settings for a question; whether simulations tell anything
-about the ADS; and the check of user code.
+"""What a pool computes for a study besides its runs: many settings for a question; whether
+simulations tell anything about the ADS; and the check of user code.
 """
 
 from __future__ import annotations
@@ -38,13 +38,15 @@ from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle
 
 BATCHES_PER_WORKER = 4
-"""Largest number of batches per worker: with several, no worker waits long for another, and the time left is known."""
+"""Largest number of batches per worker: with several, no worker waits long for another, and the
+time left is known.
+"""
 COMPILING = "compiling the vehicle model, for the first time"
 """The stage of progress in which one worker compiles, and no simulation has begun."""
 ECONOMICAL_FRACTION = 1 / 4
-"""Fraction of the most economical batch size from which on the steps of a simulation cost no more than its vehicles.
-Settings that fill no larger batch make one: two would pay for the same steps twice. Where each vehicle takes a turn of
-its own, they make one for each worker.
+"""Fraction of the most economical batch size from which on the steps of a simulation cost no more
+than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
+twice. Where each vehicle takes a turn of its own, they make one for each worker.
 """
 
 
@@ -56,11 +58,12 @@ def evaluate_all(
     verified: int = VERIFIED_SETTINGS,
     selection: Selection = EVERYTHING,
 ) -> Evaluations:
-    """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated once.
+    """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated
+    once.
 
-    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also simulated in SUMO,
-    until `verified` ones of the study have been.
-    `done` is called with the number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO.
+    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also
+    simulated in SUMO, until `verified` ones of the study have been. `done` is called with the
+    number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO.
     """
     packed_study = msgspec.msgpack.encode(study)
     if packed_study not in pool.verified:
@@ -69,7 +72,10 @@ def evaluate_all(
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
     task = Task(study=study, batch_size=batches.best, selection=selection)
-    jobs = [(task, rows) for rows in np.array_split(distinct_settings, batches.number(len(distinct_settings), pool))]
+    jobs = [
+        (task, rows)
+        for rows in np.array_split(distinct_settings, batches.number(len(distinct_settings), pool))
+    ]
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
@@ -93,7 +99,8 @@ class Batches(NamedTuple):
     best
         The most economical number of settings in a batch.
     share_steps
-        Whether the vehicles of a batch take each step together, so that a small batch costs as much as a larger one.
+        Whether the vehicles of a batch take each step together, so that a small batch costs as much
+        as a larger one.
     are_recorded
         Whether a recorded scene replaces SUMO.
     """
@@ -118,12 +125,14 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
     system = selection.of(system_of(study))
     are_recorded = is_recorded(system)
     have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
-    return Batches(settings_per_batch(system, task.engine), are_recorded and not have_turns, are_recorded)
+    return Batches(
+        settings_per_batch(system, task.engine), are_recorded and not have_turns, are_recorded
+    )
 
 
 def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
-    """Have one worker compile what a study's vehicle computes with, unless an earlier process has, and say so; the
-    other workers load it.
+    """Have one worker compile what a study's vehicle computes with, unless an earlier process has,
+    and say so; the other workers load it.
     """
     if study.vehicle.model in pool.compiled:
         return
@@ -142,7 +151,9 @@ def _compile_vehicle(task: Task, only_load: bool) -> bool:
 
 
 def ask_why_no_verdict(study: Study, pool: Pool) -> str:
-    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker; "" if they do."""
+    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
+    "" if they do.
+    """
     return str(carry_out(_why_no_verdict, [(Task(study=study),)], pool)[0])
 
 
@@ -151,8 +162,8 @@ def _why_no_verdict(task: Task) -> str:
 
 
 def check_code(study: Study, pool: Pool) -> Use:
-    """Check the user code of a study in a worker, unless it has passed before with the same files; returns what it used
-    there.
+    """Check the user code of a study in a worker, unless it has passed before with the same files;
+    returns what it used there.
 
     Raises
     ------

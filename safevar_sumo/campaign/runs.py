@@ -1,5 +1,5 @@
-"""The runs of a study: their names, algorithms and random numbers; and a run under way, its search and its known
-evaluations.
+"""The runs of a study: their names, algorithms and random numbers; and a run under way, its search
+and its known evaluations.
 """
 
 from __future__ import annotations
@@ -13,7 +13,15 @@ from safevar_sumo.errors import InputError, about, unknown_name
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import Failure, Journal, failures_of, run_name
-from safevar_sumo.search import ALGORITHMS, DESCRIPTIONS, PYMOO_ALGORITHMS, Algorithm, Problem, Search, pymoo_algorithm
+from safevar_sumo.search import (
+    ALGORITHMS,
+    DESCRIPTIONS,
+    PYMOO_ALGORITHMS,
+    Algorithm,
+    Problem,
+    Search,
+    pymoo_algorithm,
+)
 from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 from safevar_sumo.sumo.system import System
 
@@ -29,8 +37,9 @@ class RunKey(NamedTuple):
 
 
 class RunResult(NamedTuple):
-    """A finished run: its solutions, settings that could not be simulated, and numbers of distinct settings: all that
-    were simulated, those that collided, and those that left the speed tolerance of a test.
+    """A finished run: its solutions, settings that could not be simulated, and numbers of distinct
+    settings: all that were simulated, those that collided, and those that left the speed tolerance
+    of a test.
     """
 
     key: RunKey
@@ -52,13 +61,16 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
     Raises
     ------
     InputError
-        If no algorithm has this label, or the algorithm does not meet its contract or does not take its parameters.
+        If no algorithm has this label, or the algorithm does not meet its contract or does not take
+        its parameters.
     """
     with about(study.source):
         search = study.search
         name = search.labels.get(label, label)
         key = f"search.{label}"
-        parameters_of = {label_of(table): parameters for table, parameters in search.parameters.items()}
+        parameters_of = {
+            label_of(table): parameters for table, parameters in search.parameters.items()
+        }
         if len(search.labels) < len(search.algorithms):
             raise InputError(
                 "",
@@ -66,10 +78,16 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
                 "algorithms with different names",
             )
         for table in search.parameters:
-            if not (table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels):
-                legal = dict.fromkeys((*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels))
+            if not (
+                table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels
+            ):
+                legal = dict.fromkeys(
+                    (*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels)
+                )
                 problem = f"search.{table}: there is no such key and no such algorithm"
-                raise unknown_name("", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal)
+                raise unknown_name(
+                    "", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
+                )
         lookup = Lookup.of(study)
         if PYMOO + name in PYMOO_ALGORITHMS:
             raise InputError("", f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
@@ -77,7 +95,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             member = Member(pymoo_algorithm(name))
             key = f"search.{name!r}"
         else:
-            member = lookup.class_of({**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm)
+            member = lookup.class_of(
+                {**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm
+            )
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
         algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
         return algorithm
@@ -97,7 +117,9 @@ def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
 
 def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
     """The random generator of a run, independent of those of other runs."""
-    sequence = np.random.SeedSequence(study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run))
+    sequence = np.random.SeedSequence(
+        study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run)
+    )
     return np.random.Generator(np.random.PCG64(sequence))
 
 
@@ -138,13 +160,15 @@ class Run:
             self.solutions = journal.content.take_positions(journal.content.results[budget])
 
     def look_up(self) -> FloatArray:
-        """Answer the search while all that it asks is known; returns the distinct settings that are missing, shape
-        (k, n), none once the search has ended.
+        """Answer the search while all that it asks is known; returns the distinct settings that are
+        missing, shape (k, n), none once the search has ended.
         """
         answer = None  # starts a generator
         while not (self._missing or self._has_ended):
             if len(self._request):
-                answer = self._content.evaluations.take([self._row_of[setting.tobytes()] for setting in self._request])
+                answer = self._content.evaluations.take(
+                    [self._row_of[setting.tobytes()] for setting in self._request]
+                )
                 self._asked += len(answer)
             try:
                 self._request = self._search.send(answer)  # type: ignore[arg-type]
@@ -155,18 +179,27 @@ class Run:
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)
-        return np.asarray(self._request[np.array([*self._missing.values()], dtype=int) - self._asked])
+        return np.asarray(
+            self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
+        )
 
     def receive(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of missing settings."""
         positions = [self._missing.pop(setting.tobytes()) for setting in evaluations.settings]
         if not self._journaled.isdisjoint(positions):
-            raise InputError(self._journal.path, "holds other settings than this search requests", "another `out`")
+            raise InputError(
+                self._journal.path,
+                "holds other settings than this search requests",
+                "another `out`",
+            )
         self._journal.append(positions, evaluations)
         known = self._content.evaluations
-        self._row_of |= {setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(known))}
+        self._row_of |= {
+            setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(known))
+        }
         self._content = self._content._replace(
-            positions=[*self._content.positions, *positions], evaluations=Evaluations.concatenate([known, evaluations])
+            positions=[*self._content.positions, *positions],
+            evaluations=Evaluations.concatenate([known, evaluations]),
         )
 
     def requested(self) -> Evaluations:

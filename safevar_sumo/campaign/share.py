@@ -1,4 +1,6 @@
-"""A share of a study's runs, which one worker carries out together: their searches wait for common batches."""
+"""A share of a study's runs, which one worker carries out together: their searches wait for common
+batches.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ import numpy as np
 from safevar_sumo.campaign.cluster import has_caller
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of, verify_settings
 from safevar_sumo.campaign.identity import identity_of
-from safevar_sumo.campaign.runs import Run, RunKey, RunResult, algorithm_of, problem_of, random_generator_of
+from safevar_sumo.campaign.runs import (
+    Run,
+    RunKey,
+    RunResult,
+    algorithm_of,
+    problem_of,
+    random_generator_of,
+)
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -62,13 +71,14 @@ class Share(NamedTuple):
     retry_failed: bool
 
     def __str__(self) -> str:
+        named = ", ".join(map(str, self.keys[:MAX_NAMES]))
         more = len(self.keys) - MAX_NAMES
-        return f"runs {', '.join(map(str, self.keys[:MAX_NAMES]))}{f' and {more} more' if more > 0 else ''}"
+        return f"runs {named}{f' and {more} more' if more > 0 else ''}"
 
 
 def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
-    """Carry out runs in rounds, each of which evaluates all settings that their searches wait for; then verify and
-    finish them. Also returns a remark on the verification, "" without any.
+    """Carry out runs in rounds, each of which evaluates all settings that their searches wait for;
+    then verify and finish them. Also returns a remark on the verification, "" without any.
 
     Raises
     ------
@@ -79,28 +89,39 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
     """
     if not (share.directory / MANIFEST).exists():
         raise InputError(
-            "out", f"a worker does not see {share.directory}", "a directory on a disk that all workers share"
+            "out",
+            f"a worker does not see {share.directory}",
+            "a directory on a disk that all workers share",
         )
     refuse_other_inputs(task, share)
     with about(task.study.source), ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
-        # Each search goes on until it asks for settings that are in no journal; a run's settings are neighbours.
+        # Each search goes on until it asks for settings that are in no journal; a run's settings
+        # are neighbours.
         while missing := [(run, setting) for run in runs for setting in run.look_up()]:
-            for rows in np.array_split(np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)):
+            for rows in np.array_split(
+                np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)
+            ):
                 if not has_caller():
                     raise SafevarError("nobody waits for these runs any more")
                 owners = [missing[row][0] for row in rows]
                 evaluations = evaluate_settings(task, np.stack([missing[row][1] for row in rows]))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
                     run.receive(evaluations.take([*rows_of_run]))
-        remark = _verify(task, share, [run for run in runs if not run.is_finished]) if share.verifies else ""
+        remark = (
+            _verify(task, share, [run for run in runs if not run.is_finished])
+            if share.verifies
+            else ""
+        )
         refuse_other_inputs(task, share)
         return [run.finish() for run in runs], remark
 
 
 def refuse_other_inputs(task: Task, share: Share) -> None:
     """Raise an error if the inputs of a study's results are not those with which it began."""
-    now = manifest_of(task.study, identity_of(task.study, system_of(task.study), share.manifest["files"]))
+    now = manifest_of(
+        task.study, identity_of(task.study, system_of(task.study), share.manifest["files"])
+    )
     for _, text, _ in differences(share.manifest, now):
         raise InputError(
             f"study {task.study.name!r}",
@@ -130,11 +151,16 @@ def _verify(task: Task, share: Share, runs: Sequence[Run]) -> str:
     return verify_settings(task, settings_to_verify(requested, solutions, share.original))
 
 
-def settings_to_verify(requested: Evaluations, solutions: Evaluations, original: Evaluations) -> FloatArray:
-    """Every distinct unsafe solution, by the criterion that questions about these solutions have by default, and
-    `VERIFIED_OTHERS` of the other settings that the searches requested, spread evenly over all; shape (k, n).
+def settings_to_verify(
+    requested: Evaluations, solutions: Evaluations, original: Evaluations
+) -> FloatArray:
+    """Every distinct unsafe solution, by the criterion that questions about these solutions have by
+    default, and `VERIFIED_OTHERS` of the other settings that the searches requested, spread evenly
+    over all; shape (k, n).
     """
-    criterion = Unsafe.default({name: float(values[0]) for name, values in original.metrics.items()}, solutions.outcome)
+    criterion = Unsafe.default(
+        {name: float(values[0]) for name, values in original.metrics.items()}, solutions.outcome
+    )
     unsafe = solutions.settings[criterion.of(solutions) & ~solutions.failed]
     known = {setting.tobytes() for setting in unsafe}
     is_known = np.array([setting.tobytes() in known for setting in requested.settings], dtype=bool)

@@ -1,3 +1,5 @@
-"""The command line: names and groups of the commands, and a command for any function of the library."""
+"""The command line: names and groups of the commands, and a command for any function of the
+library.
+"""
 
 from safevar_sumo.cli.program import main as main

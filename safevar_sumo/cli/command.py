@@ -1,4 +1,6 @@
-"""The command of a function: its parameters and its help are those of the function's signature and docstring."""
+"""The command of a function: its parameters and its help are those of the function's signature and
+docstring.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,13 @@ GATE_EXIT_CODE = 3
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 LIBRARY_ONLY = ("pool", "progress")
 """Options that only calls of the library have; a command shows its progress."""
-METAVARS = {"source": "STUDY|DIR", "subject": "STUDY|DIR", "case": "DIR", "results": "DIR", "directory": "DIR"}
+METAVARS = {
+    "source": "STUDY|DIR",
+    "subject": "STUDY|DIR",
+    "case": "DIR",
+    "results": "DIR",
+    "directory": "DIR",
+}
 """How the help names positional parameters, unless by their names."""
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
@@ -39,8 +47,8 @@ CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     """The command that calls a function.
 
-    An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a condition of --fail-if
-    holds, and 1 if its number `passed` is false. A text is printed, too.
+    An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a
+    condition of --fail-if holds, and 1 if its number `passed` is false. A text is printed, too.
     """
     signature = inspect.signature(function)
     positional = [one for one in signature.parameters.values() if one.kind is not one.KEYWORD_ONLY]
@@ -53,11 +61,18 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             value = values.pop(one.name)
             subjects += value if one.kind is one.VAR_POSITIONAL else [value]
         return function(
-            *subjects, **{option.name: option.check(values[option.name]) for option in options}, **constants
+            *subjects,
+            **{option.name: option.check(values[option.name]) for option in options},
+            **constants,
         )
 
     def print_answer(
-        form: str, as_json: bool, table: str | None, plot: Path | None, fail_if: tuple[str, ...], **values: Any
+        form: str,
+        as_json: bool,
+        table: str | None,
+        plot: Path | None,
+        fail_if: tuple[str, ...],
+        **values: Any,
     ) -> None:
         conditions = [_parse(text) for text in fail_if]
         if declared:
@@ -78,7 +93,10 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             from safevar_sumo.questions.figures import save
 
             save(answer.figure(), plot, "plot")
-        failures = [*answer.failures, *(text for condition in conditions for text in _fulfilments(answer, *condition))]
+        failures = [
+            *answer.failures,
+            *(text for condition in conditions for text in _fulfilments(answer, *condition)),
+        ]
         for sentence in failures:
             click.echo(f"failed: {sentence}", err=True)
         if failures:
@@ -93,14 +111,20 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     gives_answer = "Answer" in str(signature.return_annotation)
     return click.Command(
         name,
-        params=[*map(_argument, positional), *map(_flag, options), *(_output_options() if gives_answer else [])],
+        params=[
+            *map(_argument, positional),
+            *map(_flag, options),
+            *(_output_options() if gives_answer else []),
+        ],
         callback=print_answer if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
 
 
 def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Names of what the study of a simulation measures; in the table of a sweep also of its characteristics."""
+    """Names of what the study of a simulation measures; in the table of a sweep also of its
+    characteristics.
+    """
     from safevar_sumo.sumo import assemble  # takes long to load
 
     study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
@@ -110,8 +134,8 @@ def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:
 
 @contextmanager
 def prints_to_standard_error() -> Iterator[None]:
-    """Within the block, what user code, SUMO and workers print goes to standard error, so that standard output has the
-    answer alone.
+    """Within the block, what user code, SUMO and workers print goes to standard error, so that
+    standard output has the answer alone.
     """
     sys.stdout.flush()
     standard_output = os.dup(1)
@@ -135,7 +159,9 @@ def _argument(parameter: inspect.Parameter) -> click.Argument:
     )
 
 
-def _complete_study(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+def _complete_study(
+    _ctx: click.Context, _param: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
     """Complete names of studies, files and directories."""
     names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
     return [*names, CompletionItem(incomplete, type="file")]
@@ -154,13 +180,23 @@ def _flag(option: Option) -> click.Option:
     is_path = option.kind is Path
     return click.Option(
         [f"--{option.name.replace('_', '-')}", option.name],
-        type=click.Choice(option.choices) if option.choices else _Path(path_type=Path) if is_path else option.kind,
+        type=(
+            click.Choice(option.choices)
+            if option.choices
+            else _Path(path_type=Path)
+            if is_path
+            else option.kind
+        ),
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
         metavar=option.metavar or ("PATH" if is_path else None),
         help=option.meaning + (f"  [{option.limits}]" if option.limits else ""),
-        **({"required": True} if option.default is inspect.Parameter.empty else {"default": option.default}),
+        **(
+            {"required": True}
+            if option.default is inspect.Parameter.empty
+            else {"default": option.default}
+        ),
     )
 
 
@@ -169,22 +205,37 @@ def _output_options() -> list[click.Option]:
     path = _Path(path_type=Path)
     return [
         click.Option(
-            ["--format", "form"], type=click.Choice(FORMATS), default="text", show_default=True, help="How to print."
+            ["--format", "form"],
+            type=click.Choice(FORMATS),
+            default="text",
+            show_default=True,
+            help="How to print.",
         ),
         click.Option(["--json", "as_json"], is_flag=True, help="Short for --format json."),
-        click.Option(["--table"], metavar="NAME", help="Print this table only.  [default: all; of csv the first]"),
-        click.Option(["--plot"], type=path, metavar="FILE", help="Draw the answer: png, pdf or svg."),
+        click.Option(
+            ["--table"],
+            metavar="NAME",
+            help="Print this table only.  [default: all; of csv the first]",
+        ),
+        click.Option(
+            ["--plot"], type=path, metavar="FILE", help="Draw the answer: png, pdf or svg."
+        ),
         click.Option(
             ["--fail-if"],
             multiple=True,
             metavar='"KEY > X"',
-            help="End with exit code 3 if a number, or a table's column in any row, is so; may be repeated.",
+            help=(
+                "End with exit code 3 if a number, or a table's column in any row, is so; may be"
+                " repeated."
+            ),
         ),
     ]
 
 
 def _print(answer: Answer, form: str, table: str | None) -> None:
-    """Print an answer or one of its tables; the whole answer if it lacks the table, which may have taken long."""
+    """Print an answer or one of its tables; the whole answer if it lacks the table, which may have
+    taken long.
+    """
     try:
         shown = answer.only(table) if table else answer
     except InputError:
@@ -206,10 +257,14 @@ def _parse(text: str) -> tuple[str, str, float]:
 
 
 def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[str]:
-    """A sentence for each number of the answer for which a condition holds; a note if no number is there."""
+    """A sentence for each number of the answer for which a condition holds; a note if no number is
+    there.
+    """
     values = answer.values(key)
     if None in values or not values:
-        click.echo(f"note: --fail-if: {key} is {'undefined' if values else 'in no row'} here", err=True)
+        click.echo(
+            f"note: --fail-if: {key} is {'undefined' if values else 'in no row'} here", err=True
+        )
     rows = [""] * len(values)
     table = key.rpartition(".")[0]
     if table in answer.tables:  # a row by its first column

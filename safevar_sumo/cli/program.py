@@ -41,7 +41,10 @@ COMMANDS_BY_GROUP = {
         "verify": "report.evidence:verify",
         "export": "replay.export:export",
     },
-    "Your own code": {"check": "questions.catalogue:check", "list": "questions.catalogue:list_models"},
+    "Your own code": {
+        "check": "questions.catalogue:check",
+        "list": "questions.catalogue:list_models",
+    },
     "Published data": {
         "import": "reference.rows:import_published",
         "validate": "reference.agreement:validate",
@@ -49,7 +52,9 @@ COMMANDS_BY_GROUP = {
     },
 }
 """The function of each command, by the title of its group, in the order of the help."""
-COMMANDS = {name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()}
+COMMANDS = {
+    name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()
+}
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end the program as Ctrl-C does."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
@@ -57,7 +62,9 @@ ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 
 
 class LazyCommands(click.Group):
-    """The group of all commands; it loads a command's function, which takes long, only when the command is called."""
+    """The group of all commands; it loads a command's function, which takes long, only when the
+    command is called.
+    """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -85,13 +92,19 @@ class LazyCommands(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call a command; an error of the library, which names its arguments, then names the flags that set them."""
+        """Call a command; an error of the library, which names its arguments, then names the flags
+        that set them.
+        """
         try:
             return super().invoke(ctx)
         except InputError as error:
             command = self.get_command(ctx, str(ctx.invoked_subcommand))
             parameters = command.params if command else []
-            long_flags = {option.name: option.opts[-1] for option in parameters if isinstance(option, click.Option)}
+            long_flags = {
+                option.name: option.opts[-1]
+                for option in parameters
+                if isinstance(option, click.Option)
+            }
             if isinstance(error.source, str):  # only a text may name an argument
                 error.source = long_flags.get(error.source, error.source)
             to_flag = partial(_to_flag, long_flags)
@@ -102,13 +115,17 @@ class LazyCommands(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
-                formatter.write_dl([(name, first_paragraph(function)) for name, function in group.items()])
+                formatter.write_dl(
+                    [(name, first_paragraph(function)) for name, function in group.items()]
+                )
 
 
 def function_of(command: str) -> Callable[..., Any]:
     """The function of a command, by its name."""
     module, _, name = COMMANDS[command].partition(":")
-    return cast("Callable[..., Any]", getattr(importlib.import_module(f"safevar_sumo.{module}"), name))
+    return cast(
+        "Callable[..., Any]", getattr(importlib.import_module(f"safevar_sumo.{module}"), name)
+    )
 
 
 def first_paragraph(function: str) -> str:
@@ -117,23 +134,30 @@ def first_paragraph(function: str) -> str:
     path = Path(__file__).parents[1] / module.replace(".", "/")
     file = path.with_suffix(".py")
     source = (file if file.exists() else path / "__init__.py").read_text(encoding="utf-8")
-    docstring = re.search(rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE)
+    docstring = re.search(
+        rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE
+    )
     assert docstring is not None
     return " ".join(docstring[1].split())
 
 
 def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
-    """The flag that sets an argument, with its value unless the flag takes none; other words as they are."""
+    """The flag that sets an argument, with its value unless the flag takes none; other words as
+    they are.
+    """
     name, value = argument.groups()
     if name not in flags:
         return argument[0]
-    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"  # `beyond=True` is --beyond
+    return (
+        flags[name] if value in (None, "True") else f"{flags[name]} {value}"
+    )  # `beyond=True` is --beyond
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="safevar_sumo")
 def commands() -> None:
-    """Search for the smallest variations of a vehicle that make its automated driving system unsafe, on SUMO.
+    """Search for the smallest variations of a vehicle that make its automated driving system
+    unsafe, on SUMO.
 
     STUDY is the name of a study (see: list) or the path of a study file.
     """
@@ -142,8 +166,8 @@ def commands() -> None:
 def main() -> None:
     """Run the program.
 
-    Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a limit is not kept) or
-    130 (interrupted).
+    Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a
+    limit is not kept) or 130 (interrupted).
     """
     # Without its file and line.
     warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
@@ -183,8 +207,8 @@ def _error_in_two_lines(error: click.ClickException) -> str:
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception. Later, Ctrl-C raises
-    it.
+    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception.
+    Later, Ctrl-C raises it.
     """
 
     def exit_at_once(*_: object) -> None:

@@ -1,4 +1,6 @@
-"""Measures by name: the safety metrics of method section 4, metrics of comfort, measures of change."""
+"""Measures by name: the safety metrics of method section 4, metrics of comfort, measures of
+change.
+"""
 
 from safevar_sumo.metrics.base import (
     F_DIFF as F_DIFF,
@@ -24,12 +26,25 @@ from safevar_sumo.metrics.measures import (
     TTC_MIN,
     time_to_collision as time_to_collision,
 )
-from safevar_sumo.metrics.unsafe import Criterion as Criterion, Unsafe as Unsafe, margin_of as margin_of
+from safevar_sumo.metrics.unsafe import (
+    Criterion as Criterion,
+    Unsafe as Unsafe,
+    margin_of as margin_of,
+)
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {
     metric.name: metric
-    for metric in (MAX_JERK, RMS_ACCELERATION, BRAKE_HARSHNESS, STOPPING_DISTANCE, TTC_MIN, DRAC, PET, REACTION_TIME)
+    for metric in (
+        MAX_JERK,
+        RMS_ACCELERATION,
+        BRAKE_HARSHNESS,
+        STOPPING_DISTANCE,
+        TTC_MIN,
+        DRAC,
+        PET,
+        REACTION_TIME,
+    )
 }
 """Metrics that only the studies have that name them."""
 OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
@@ -38,6 +53,7 @@ OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
 }
 """What the objectives of a search may name besides metrics."""
 PUBLISHED_SCORING = Scoring(
-    metrics=tuple(metric.facts for metric in METRICS.values()), objectives=(F_SAFE, F_DIFF, F_NUM_DIFF)
+    metrics=tuple(metric.facts for metric in METRICS.values()),
+    objectives=(F_SAFE, F_DIFF, F_NUM_DIFF),
 )
 """Metrics and objectives of the published study (method sections 3 and 4)."""

@@ -22,7 +22,8 @@ TIME_TOLERANCE = 1e-6
 
 
 def sampling_stride(step: float, interval: float | None) -> int:
-    """Number of simulation steps between two samples that are `interval` seconds apart; 1 without an interval.
+    """Number of simulation steps between two samples that are `interval` seconds apart; 1 without
+    an interval.
 
     Raises
     ------
@@ -34,7 +35,9 @@ def sampling_stride(step: float, interval: float | None) -> int:
     steps = round(interval / step)
     if steps < 1 or abs(steps * step - interval) > TIME_TOLERANCE:
         raise InputError(
-            "", f"metrics.sampling_interval = {interval}", f"a whole multiple of the simulation's step, {step:g} s"
+            "",
+            f"metrics.sampling_interval = {interval}",
+            f"a whole multiple of the simulation's step, {step:g} s",
         )
     return steps
 
@@ -44,7 +47,11 @@ def sum_in_order(samples: FloatArray) -> FloatArray:
 
     In numpy's own sum the order depends on the shape, so that a vehicle's result would depend on N.
     """
-    return np.asarray(np.add.accumulate(samples, axis=0)[-1]) if len(samples) else np.zeros(samples.shape[1:])
+    return (
+        np.asarray(np.add.accumulate(samples, axis=0)[-1])
+        if len(samples)
+        else np.zeros(samples.shape[1:])
+    )
 
 
 MeasureName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
@@ -52,8 +59,8 @@ TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
 
 
 class Measure(Struct, frozen=True, kw_only=True):
-    """A column of results: a metric of simulation runs, or a measure of change of settings. A search may minimise it,
-    or maximise it if larger values are more unsafe.
+    """A column of results: a metric of simulation runs, or a measure of change of settings. A
+    search may minimise it, or maximise it if larger values are more unsafe.
 
     Attributes
     ----------
@@ -70,9 +77,10 @@ class Measure(Struct, frozen=True, kw_only=True):
     of
         What it measures: `runs` or `settings`.
     function
-        Takes N simulation runs and thresholds, or filtered settings of shape (N, n) and the characteristics; returns
-        shape (N,), of runs NaN where it is undefined. Element i depends only on run or setting i, bit for bit. None
-        in results, and for columns that all results have.
+        Takes N simulation runs and thresholds, or filtered settings of shape (N, n) and the
+        characteristics; returns shape (N,), of runs NaN where it is undefined. Element i depends
+        only on run or setting i, bit for bit. None in results, and for columns that all results
+        have.
     """
 
     name: MeasureName
@@ -119,14 +127,17 @@ def checked_measure(code: UserCode) -> Measure:
     is_of_runs = facts.of == "runs"
     count = (lambda runs: len(runs.outcome)) if is_of_runs else len
     legal = Legal(undefined=True) if is_of_runs else FINITE
-    return replace(facts, function=code.checked_function(measure.function, facts.name, legal, count))
+    return replace(
+        facts, function=code.checked_function(measure.function, facts.name, legal, count)
+    )
 
 
 class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The metrics of a study and the objectives of its searches; stored in results beside the study.
+    """The metrics of a study and the objectives of its searches; stored in results beside the
+    study.
 
-    In a study that searches its scenario, a setting is feasible if the original vehicle has at least the safety degree
-    `safe_original` in the same encounter [m].
+    In a study that searches its scenario, a setting is feasible if the original vehicle has at
+    least the safety degree `safe_original` in the same encounter [m].
     """
 
     metrics: tuple[Measure, ...]
@@ -134,8 +145,8 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
     safe_original: float | None = None
 
     def violation(self, evaluations: Evaluations) -> FloatArray:
-        """By how much the original vehicle is not safe in each setting's encounter, shape (M,); 0 if it is, infinite if
-        it could not be simulated.
+        """By how much the original vehicle is not safe in each setting's encounter, shape (M,); 0
+        if it is, infinite if it could not be simulated.
         """
         if self.safe_original is None:
             return np.zeros(len(evaluations))
@@ -143,8 +154,8 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
         return np.where(np.isnan(shortfall), np.inf, np.maximum(shortfall, 0.0))
 
     def feasible_rows(self, frame: pd.DataFrame) -> BoolArray:
-        """In which rows the original vehicle is safe in the same encounter: all, unless the study searches its
-        scenario.
+        """In which rows the original vehicle is safe in the same encounter: all, unless the study
+        searches its scenario.
         """
         if self.safe_original is None or ORIGINAL_DEGREE not in frame:
             return np.ones(len(frame), dtype=bool)
@@ -152,10 +163,15 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     def values(self, evaluations: Evaluations) -> FloatArray:
         """Values of the objectives, smaller being better; shape (M, objectives)."""
-        return np.stack([objective.sign * evaluations.column(objective.name) for objective in self.objectives], axis=1)
+        return np.stack(
+            [objective.sign * evaluations.column(objective.name) for objective in self.objectives],
+            axis=1,
+        )
 
     def valid(self, evaluations: Evaluations) -> BoolArray:
-        """Whether the simulation succeeded, every objective is defined and the setting is feasible; shape (M,)."""
+        """Whether the simulation succeeded, every objective is defined and the setting is feasible;
+        shape (M,).
+        """
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
         return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
 

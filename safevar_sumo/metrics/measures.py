@@ -1,7 +1,8 @@
-"""The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), and a rating's points.
+"""The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), and a
+rating's points.
 
-Metrics of longitudinal comfort follow, which a study has only if it names them: jerk, weighted acceleration, harsh
-braking.
+Metrics of longitudinal comfort follow, which a study has only if it names them: jerk, weighted
+acceleration, harsh braking.
 """
 
 from __future__ import annotations
@@ -10,12 +11,20 @@ import numpy as np
 
 from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
 from safevar_sumo.metrics.conflicts import conflict
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, BoolArray, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import (
+    STANDSTILL,
+    TIME_DECIMALS,
+    BoolArray,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 
 def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Least separation during the encounter [m, > 0], or minus the closing speed of the collision [m/s, < 0].
+    """Least separation during the encounter [m, > 0], or minus the closing speed of the collision
+    [m/s, < 0].
 
     Shape (N,); NaN where there was neither an encounter nor a collision.
     """
@@ -30,7 +39,10 @@ SAFETY_DEGREE_METRIC = Measure(
     title="SD",
     unit="m, or -m/s",
     function=safety_degree,
-    description="Least separation during the encounter [m, > 0], or minus a collision's closing speed [m/s, < 0].",
+    description=(
+        "Least separation during the encounter [m, > 0], or minus a collision's closing speed [m/s,"
+        " < 0]."
+    ),
 )
 
 
@@ -46,22 +58,29 @@ def time_to_collision(runs: SimulationRuns) -> FloatArray:
 
 
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a collision."""
+    """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a
+    collision.
+    """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     return mask_collisions(
-        runs, np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS)
+        runs,
+        np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS),
     )
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a collision."""
+    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a
+    collision.
+    """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     deficit = np.where(np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0)
     return mask_collisions(runs, sum_in_order(deficit) * interval)
 
 
 def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
-    """TTC at every sample, infinite where it is not critical; and the time between two samples [s]."""
+    """TTC at every sample, infinite where it is not critical; and the time between two samples
+    [s].
+    """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     ttc = time_to_collision(runs)[::stride]
     return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
@@ -87,7 +106,9 @@ TIT = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=time_integrated,
-    description="TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2], with the TTC of TET.",
+    description=(
+        "TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2], with the TTC of TET."
+    ),
 )
 
 
@@ -143,19 +164,26 @@ DRAC = Measure(
 
 
 def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Time from the first one's leaving the place that both paths share to the second one's entering it [s] (Allen,
-    Shin and Cooper 1978); shape (N,), NaN unless the vehicle and a body that crosses pass without a stop.
+    """Time from the first one's leaving the place that both paths share to the second one's
+    entering it [s] (Allen, Shin and Cooper 1978); shape (N,), NaN unless the vehicle and a body
+    that crosses pass without a stop.
 
-    The run ends when the first one has left: the body the vehicle's path, or the vehicle's rear the body's. The second
-    one arrives at its speed then. PET of SUMO's SSM device takes lanes for bodies: it is shorter by the share of both
-    widths that lanes are wider.
+    The run ends when the first one has left: the body the vehicle's path, or the vehicle's rear the
+    body's. The second one arrives at its speed then. PET of SUMO's SSM device takes lanes for
+    bodies: it is shorter by the share of both widths that lanes are wider.
     """
     trace = runs.trace
     number = np.count_nonzero(trace.active, axis=0)
     at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
     speed, gap, lateral, lateral_speed, obstacle_width = (
         np.broadcast_to(column, trace.speed.shape)[at_end]
-        for column in (trace.speed, trace.gap, trace.lateral, trace.lateral_speed, trace.obstacle_width)
+        for column in (
+            trace.speed,
+            trace.gap,
+            trace.lateral,
+            trace.lateral_speed,
+            trace.obstacle_width,
+        )
     )
     apart = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     crossing = np.abs(lateral_speed)
@@ -163,14 +191,16 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     comes = (lateral * lateral_speed < 0) & (gap <= 0)
     way = np.where(leaves, gap, apart)
     rate = np.where(leaves, speed, crossing)
-    is_defined = (runs.outcome == Outcome.PASSED) & (apart >= 0) & (leaves | comes) & (rate > STANDSTILL)
+    is_defined = (
+        (runs.outcome == Outcome.PASSED) & (apart >= 0) & (leaves | comes) & (rate > STANDSTILL)
+    )
     return np.asarray(np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined))
 
 
 def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Time from the first sample at which nothing hides the body ahead to the first brake command from then on [s], as
-    of a driver (Olson and Sivak 1986: perception-response time); shape (N,), NaN for a vehicle that sees nobody, or
-    does not brake.
+    """Time from the first sample at which nothing hides the body ahead to the first brake command
+    from then on [s], as of a driver (Olson and Sivak 1986: perception-response time); shape (N,),
+    NaN for a vehicle that sees nobody, or does not brake.
     """
     trace = runs.trace
     visible = trace.active & trace.visible
@@ -187,7 +217,10 @@ PET = Measure(
     unit="s",
     over_collisions=False,
     function=post_encroachment_time,
-    description="Post-encroachment time of a vehicle that passes who crosses; without a collision or a stop.",
+    description=(
+        "Post-encroachment time of a vehicle that passes who crosses; without a collision or a"
+        " stop."
+    ),
 )
 REACTION_TIME = Measure(
     name="reaction_time",
@@ -200,7 +233,8 @@ REACTION_TIME = Measure(
 
 
 def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Mean deceleration over the samples in which the brake is commanded and the vehicle moves [m/s^2].
+    """Mean deceleration over the samples in which the brake is commanded and the vehicle moves
+    [m/s^2].
 
     Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
     """
@@ -213,7 +247,9 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
     undefined = np.full_like(deceleration_sum, np.nan)
-    return np.asarray(np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0))
+    return np.asarray(
+        np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0)
+    )
 
 
 AVE_DECE = Measure(
@@ -221,7 +257,10 @@ AVE_DECE = Measure(
     title="aveDece",
     unit="m/s^2",
     function=average_deceleration,
-    description="Mean loss of speed per time over the samples in which the brake is commanded and the vehicle moves.",
+    description=(
+        "Mean loss of speed per time over the samples in which the brake is commanded and the"
+        " vehicle moves."
+    ),
 )
 
 
@@ -230,7 +269,8 @@ PEDAL_ROUNDING = 1e-6
 
 
 def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that does not brake or stop.
+    """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that
+    does not brake or stop.
 
     A sample's pedal acts in the step before it.
     """
@@ -250,12 +290,17 @@ STOPPING_DISTANCE = Measure(
     unit="m",
     more_is_unsafe=True,
     function=stopping_distance,
-    description="Distance from the first brake force to standstill; every study of the scenario stop has it.",
+    description=(
+        "Distance from the first brake force to standstill; every study of the scenario stop"
+        " has it."
+    ),
 )
 
 
 def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """NaN, shape (N,): a single cell has no points; the rater computes them from all cells of the matrix."""
+    """NaN, shape (N,): a single cell has no points; the rater computes them from all cells of the
+    matrix.
+    """
     return np.full(len(runs.outcome), np.nan)
 
 
@@ -264,26 +309,36 @@ RATING_POINTS = Measure(
     title="points kept",
     unit="points",
     function=_undefined_points,
-    description="Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are simulated.",
+    description=(
+        "Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are"
+        " simulated."
+    ),
 )
 
 
 JERK_TIME = 1.0
-"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5 m/s^3 above 20 m/s;
-cited from memory, not read.
+"""Time over which jerk is averaged [s], as in ISO 15622 (adaptive cruise control), which allows 2.5
+m/s^3 above 20 m/s; cited from memory, not read.
 """
 BRAKING_TIME = 0.5
-"""Time over which a deceleration is averaged [s], as for accelerations in UN R79; cited from memory, not read."""
+"""Time over which a deceleration is averaged [s], as for accelerations in UN R79; cited from
+memory, not read.
+"""
 HIGH_PASS, TRANSITION, TRANSITION_QUALITY = 0.4, 2.0, 0.63
 """W_d of ISO 2631-1, annex A: f_1 and f_3 = f_4 [Hz], Q_4 [-]; the high pass is Butterworth's."""
 
 
 def _filter(
-    samples: FloatArray, numerator: tuple[float, float, float], denominator: tuple[float, float, float], step: float
+    samples: FloatArray,
+    numerator: tuple[float, float, float],
+    denominator: tuple[float, float, float],
+    step: float,
 ) -> FloatArray:
-    """Samples after a second-order filter along the first axis, from rest, sample by sample: no result depends on N.
+    """Samples after a second-order filter along the first axis, from rest, sample by sample: no
+    result depends on N.
 
-    The filter is a transfer function in s, with coefficients from the highest power; Tustin's rule makes it discrete.
+    The filter is a transfer function in s, with coefficients from the highest power; Tustin's rule
+    makes it discrete.
     """
     k = 2 / step
     (b0, b1, b2), (a0, a1, a2) = (
@@ -302,8 +357,8 @@ def _filter(
 def weight_acceleration(acceleration: FloatArray, step: float) -> FloatArray:
     """Acceleration along the vehicle, weighted with W_d of ISO 2631-1 [m/s^2], shape (T, N).
 
-    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies above half the sampling
-    rate.
+    The low pass at 100 Hz is omitted, since the samples of a simulation contain no frequencies
+    above half the sampling rate.
     """
     high_pass_rate = 2 * np.pi * HIGH_PASS
     transition = 2 * np.pi * TRANSITION
@@ -318,15 +373,21 @@ def max_jerk(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     accelerations, is_counted = _accelerations(runs)
     steps = _step_count(JERK_TIME, runs.trace.step, largest_count=len(accelerations) - 1)
     jerk = np.abs(accelerations[steps:] - accelerations[:-steps]) / (steps * runs.trace.step)
-    return mask_collisions(runs, np.max(np.where(is_counted[steps:], jerk, 0.0), axis=0, initial=0.0))
+    return mask_collisions(
+        runs, np.max(np.where(is_counted[steps:], jerk, 0.0), axis=0, initial=0.0)
+    )
 
 
 def rms_acceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a collision."""
+    """Root mean square of the weighted acceleration over the run [m/s^2]; shape (N,), NaN on a
+    collision.
+    """
     accelerations, is_counted = _accelerations(runs)
     weighted = weight_acceleration(np.where(is_counted, accelerations, 0.0), runs.trace.step)
     squares = np.where(is_counted, weighted, 0.0) ** 2
-    return mask_collisions(runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1)))
+    return mask_collisions(
+        runs, np.sqrt(sum_in_order(squares) / np.maximum(np.count_nonzero(is_counted, axis=0), 1))
+    )
 
 
 def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -335,11 +396,15 @@ def brake_harshness(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     active = runs.trace.active
     steps = _step_count(BRAKING_TIME, runs.trace.step, largest_count=len(speed) - 1)
     decelerations = (speed[:-steps] - speed[steps:]) / (steps * runs.trace.step)
-    return mask_collisions(runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0))
+    return mask_collisions(
+        runs, np.max(np.where(active[steps:], decelerations, 0.0), axis=0, initial=0.0)
+    )
 
 
 def _accelerations(runs: SimulationRuns) -> tuple[FloatArray, BoolArray]:
-    """Acceleration between two of the T samples [m/s^2], and whether both samples count; shape (T - 1, N) each."""
+    """Acceleration between two of the T samples [m/s^2], and whether both samples count; shape (T -
+    1, N) each.
+    """
     return np.diff(runs.trace.speed, axis=0) / runs.trace.step, runs.trace.active[1:]
 
 
@@ -355,7 +420,9 @@ MAX_JERK = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=max_jerk,
-    description="Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision.",
+    description=(
+        "Largest magnitude of the jerk, averaged over a second (ISO 15622); without a collision."
+    ),
 )
 RMS_ACCELERATION = Measure(
     name="rms_acceleration",
@@ -365,7 +432,8 @@ RMS_ACCELERATION = Measure(
     over_collisions=False,
     function=rms_acceleration,
     description=(
-        "Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1; without a collision."
+        "Root mean square of the acceleration along the vehicle, weighted with W_d of ISO 2631-1;"
+        " without a collision."
     ),
 )
 BRAKE_HARSHNESS = Measure(

@@ -1,4 +1,6 @@
-"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit, lost points of a rating."""
+"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit, lost
+points of a rating.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CRITERIA = (
-    "collision, points=X with X points of a rating, below=X with a safety degree X [m, or minus a collision's "
-    'closing speed in m/s], or a metric with <, <=, > or >= and a number, such as "drac > 6"'
+    "collision, points=X with X points of a rating, below=X with a safety degree X [m, or minus a"
+    " collision's closing speed in m/s], or a metric with <, <=, > or >= and a number, such as"
+    ' "drac > 6"'
 )
 COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
     "<": operator.lt,
@@ -34,14 +37,16 @@ COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
 }
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
-"""The default limit if nothing collides: this share of the original's safety degree, to this many significant digits.
+"""The default limit if nothing collides: this share of the original's safety degree, to this many
+significant digits.
 """
 DEFAULT_MARGIN = 0.3
 """Distance to keep in a study that states no error of its model [m]."""
 LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
 POINT_LOSS, POINT_DECIMALS = 1.0, 6
-"""The default limit in a rated study: the original's points minus this loss, to this many decimals."""
+"""The default limit in a rated study: the original's points minus this loss, to this many decimals.
+"""
 
 
 class Bound(NamedTuple):
@@ -61,9 +66,10 @@ class Bound(NamedTuple):
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with `below`, a safety degree
-    below this limit [m, or -m/s]; with `points`, at most that many points of a rating; with a `bound`, a metric of the
-    study beyond a limit, or a collision (points of a rating are of no run: these alone).
+    """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
+    `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most that many points
+    of a rating; with a `bound`, a metric of the study beyond a limit, or a collision (points of a
+    rating are of no run: these alone).
 
     `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
     """
@@ -91,17 +97,21 @@ class Unsafe:
     @property
     def is_of_points(self) -> bool:
         """Whether points of a rating decide, by `points` or by a bound."""
-        return self.points is not None or (self.bound is not None and self.bound.measure == RATING_POINTS.name)
+        return self.points is not None or (
+            self.bound is not None and self.bound.measure == RATING_POINTS.name
+        )
 
     @property
     def worst(self) -> Callable[..., float]:
-        """Which of several values is the worst: `min`, or `max` where a bound forbids large ones."""
+        """Which of several values is the worst: `min`, or `max` where a bound forbids large
+        ones.
+        """
         return max if self.bound is not None and self.bound.worst_is_largest else min
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision, or stops less than 0.30 m short`, `safety degree below 1.4 m
-        (half of the original's, a screening limit)`, `drac > 6, or a collision`.
+        """The criterion in words, rounded: `collision, or stops less than 0.30 m short`, `safety
+        degree below 1.4 m (half of the original's, a screening limit)`, `drac > 6, or a collision`.
         """
         if self.points is not None:
             return f"at most {self.points:g} points"
@@ -110,7 +120,9 @@ class Unsafe:
         if self.below is None:
             kept = self._keep_in_words
             where = ", from bumper to bumper" if self.contact else ""
-            return f"collision, or stops less than {kept} m short{where}" if self.keep else "collision"
+            return (
+                f"collision, or stops less than {kept} m short{where}" if self.keep else "collision"
+            )
         share = " (half of the original's, a screening limit)" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
@@ -120,7 +132,9 @@ class Unsafe:
 
     @property
     def smaller_demand(self) -> str:
-        """What to do where the original does not meet the criterion; "" if a collision alone is unsafe."""
+        """What to do where the original does not meet the criterion; "" if a collision alone is
+        unsafe.
+        """
         if self.is_collision and not self.keep:
             return ""
         return f"Demand less, with {'--margin' if self.is_collision else '--unsafe'}."
@@ -135,11 +149,15 @@ class Unsafe:
         return "collides" if self.below is None else f"SD is below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
-        """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by every bound."""
+        """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
+        every bound.
+        """
         return np.asarray(self._holds(evaluations.outcome, evaluations.column))
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
-        """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are unsafe."""
+        """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
+        unsafe.
+        """
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
@@ -152,43 +170,64 @@ class Unsafe:
             name, comparison, limit = self.bound
             is_beyond = COMPARISONS[comparison](column(name), limit)
             return is_beyond if self.is_of_points else collides | is_beyond
-        return collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
+        return (
+            collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
+        )
 
     def left(self, evaluations: Evaluations) -> FloatArray:
-        """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are unsafe; infinite
-        where the measure is undefined; on a collision by a bound, minus the speed of the collision.
+        """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
+        unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
+        of the collision.
         """
         if self.bound is None:
-            left = evaluations.f_safe - (self.contact + self.keep if self.below is None else self.below)
+            left = evaluations.f_safe - (
+                self.contact + self.keep if self.below is None else self.below
+            )
         else:
             difference = evaluations.column(self.bound.measure) - self.bound.limit
             left = -difference if self.bound.worst_is_largest else difference
-            left = left if self.is_of_points else np.where(evaluations.collided, evaluations.f_safe, left)
+            left = (
+                left
+                if self.is_of_points
+                else np.where(evaluations.collided, evaluations.f_safe, left)
+            )
         left = np.where(np.isnan(left), np.inf, left)
         return np.where(self.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
 
     def value(self, left: float) -> float:
-        """What is `left` away from the limit: a distance between bumpers [m], or the value that is limited."""
+        """What is `left` away from the limit: a distance between bumpers [m], or the value that is
+        limited.
+        """
         if self.bound is not None:
-            return self.bound.limit - left if self.bound.worst_is_largest else self.bound.limit + left
+            return (
+                self.bound.limit - left if self.bound.worst_is_largest else self.bound.limit + left
+            )
         return left + (self.keep if self.below is None else self.below)
 
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m`, `has drac 5.9`."""
-        return f"keeps {value:.2f} m" if self.bound is None else f"has {self.bound.measure} {value:.3g}"
+        return (
+            f"keeps {value:.2f} m"
+            if self.bound is None
+            else f"has {self.bound.measure} {value:.3g}"
+        )
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
-        """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at 3.21 m/s`, `stops 0.04
-        m short, less than 0.30 m`.
+        """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
+        3.21 m/s`, `stops 0.04 m short, less than 0.30 m`.
         """
         degree = float(vehicle.f_safe[0])
         if self.points is not None:
-            return f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
+            return (
+                f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
+            )
         if self.bound is not None:
             measure, comparison, limit = self.bound
             value = float(vehicle.column(measure)[0])
             if COMPARISONS[comparison](value, limit):
-                return f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
+                return (
+                    f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
+                )
         if self.below is not None and (degree >= 0 or self.below < 0):
             unit = "m" if degree >= 0 else "m/s"
             text = _on_its_side(degree, self.below, "g", 3)
@@ -201,7 +240,8 @@ class Unsafe:
 
     @classmethod
     def parse(cls, criterion: Criterion) -> Unsafe:
-        """The criterion that `--unsafe` or an argument `unsafe` states: a text, or a number X for `below=X`.
+        """The criterion that `--unsafe` or an argument `unsafe` states: a text, or a number X for
+        `below=X`.
 
         Raises
         ------
@@ -237,9 +277,10 @@ class Unsafe:
     def default(cls, original: Tables, outcomes: npt.NDArray[np.str_] | pd.Series[str]) -> Unsafe:
         """The criterion if none is stated.
 
-        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points. In other studies the
-        criterion is a collision if any vehicle collides or the original has no safety degree to halve; otherwise, a
-        safety degree below half of the original's safety degree.
+        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points.
+        In other studies the criterion is a collision if any vehicle collides or the original has no
+        safety degree to halve; otherwise, a safety degree below half of the original's safety
+        degree.
 
         Parameters
         ----------
@@ -266,16 +307,21 @@ class Unsafe:
             If no vehicle can be unsafe by this criterion.
         """
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
-        unsafe = cls.default({name: float(values[0]) for name, values in original.metrics.items()}, outcomes)
+        unsafe = cls.default(
+            {name: float(values[0]) for name, values in original.metrics.items()}, outcomes
+        )
         if unsafe.points is not None and unsafe.points < 0:
             raise InputError(
                 "unsafe",
-                f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to lose",
+                f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to"
+                " lose",
                 CRITERIA,
             )
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError(
-                "unsafe", "nothing collides, and the original vehicle has no safety degree to halve", CRITERIA
+                "unsafe",
+                "nothing collides, and the original vehicle has no safety degree to halve",
+                CRITERIA,
             )
         return unsafe
 
@@ -288,11 +334,13 @@ def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:
 
 
 def margin_of(study: Study, margin: float | None) -> float:
-    """The distance to keep [m]: the stated one, else the study's error of its model, else `DEFAULT_MARGIN`."""
+    """The distance to keep [m]: the stated one, else the study's error of its model, else
+    `DEFAULT_MARGIN`.
+    """
     return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if margin is None else margin
 
 
 Criterion = Unsafe | float | str
-"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision", "below=X", "points=X"
-or a metric beyond a limit such as "drac > 6".
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision",
+"below=X", "points=X" or a metric beyond a limit such as "drac > 6".
 """

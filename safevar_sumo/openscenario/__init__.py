@@ -1,4 +1,6 @@
-"""OpenSCENARIO XML 1.0 to 1.3: a file becomes the motion of all its actors, with an Ego that holds its speed."""
+"""OpenSCENARIO XML 1.0 to 1.3: a file becomes the motion of all its actors, with an Ego that holds
+its speed.
+"""
 
 from safevar_sumo.openscenario.actors import STEP as STEP
 from safevar_sumo.openscenario.document import read as read
@@ -9,4 +11,9 @@ from safevar_sumo.openscenario.logical import (
     open_file as open_file,
     originals as originals,
 )
-from safevar_sumo.openscenario.scene import EVERY as EVERY, Moved as Moved, Played as Played, play as play
+from safevar_sumo.openscenario.scene import (
+    EVERY as EVERY,
+    Moved as Moved,
+    Played as Played,
+    play as play,
+)

@@ -12,8 +12,25 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
-from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported, whole
-from safevar_sumo.openscenario.places import AHEAD, Place, Way, line_of, neighbour, of_reference, way_of, way_through
+from safevar_sumo.openscenario.document import (
+    Element,
+    attribute,
+    number,
+    part,
+    truth,
+    unsupported,
+    whole,
+)
+from safevar_sumo.openscenario.places import (
+    AHEAD,
+    Place,
+    Way,
+    line_of,
+    neighbour,
+    of_reference,
+    way_of,
+    way_through,
+)
 
 if TYPE_CHECKING:
     from safevar_sumo.openscenario.storyboard import Player
@@ -39,8 +56,8 @@ IGNORED = (
 
 
 class Transition(NamedTuple):
-    """How long a change takes [s], or with `over_distance` how far the actor drives meanwhile [m]; and
-    its share, 0 to 1, after so much of either.
+    """How long a change takes [s], or with `over_distance` how far the actor drives meanwhile [m];
+    and its share, 0 to 1, after so much of either.
     """
 
     duration: float
@@ -53,7 +70,9 @@ SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
     "sinusoidal": (math.pi / 2, lambda x: (1 - np.cos(math.pi * x)) / 2),
     "cubic": (1.5, lambda x: x * x * (3 - 2 * x)),
 }
-"""Shapes of a change by their names (class DynamicsShape): largest slope, and the share done at a share of the time."""
+"""Shapes of a change by their names (class DynamicsShape): largest slope, and the share done at a
+share of the time.
+"""
 
 
 def transition_of(dynamics: Element, change: float, speed: float | None = None) -> Transition:
@@ -72,7 +91,9 @@ def transition_of(dynamics: Element, change: float, speed: float | None = None) 
     elif dimension == "distance" and speed is not None:
         duration = duration / speed if speed else math.inf
     over_distance = dimension == "distance" and speed is None
-    return Transition(duration, lambda since: share(np.minimum(since / duration, 1.0)), over_distance)
+    return Transition(
+        duration, lambda since: share(np.minimum(since / duration, 1.0)), over_distance
+    )
 
 
 # Longitudinal
@@ -86,7 +107,9 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     if target.tag == "RelativeTargetSpeed":
         other = player.other(target)
         if truth(target, "continuous"):
-            raise unsupported("SpeedAction: RelativeTargetSpeed with continuous = true is not supported")
+            raise unsupported(
+                "SpeedAction: RelativeTargetSpeed with continuous = true is not supported"
+            )
         value = _relative_speed(target, other)
         player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
     if value < 0:
@@ -100,14 +123,20 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     if not transition.duration:
         actor.speed_now = value
     share = transition.share
-    running = actor.begin("along", transition.duration, player.now, lambda time: start + (value - start) * share(time))
+    running = actor.begin(
+        "along", transition.duration, player.now, lambda time: start + (value - start) * share(time)
+    )
     return [running]
 
 
 def _relative_speed(target: Element, other: Actor) -> float:
     """A speed relative to another actor's [m/s] (enumeration SpeedTargetValueType)."""
     value = number(target, "value")
-    return other.speed_now * value if target.get("speedTargetValueType") == "factor" else other.speed_now + value
+    return (
+        other.speed_now * value
+        if target.get("speedTargetValueType") == "factor"
+        else other.speed_now + value
+    )
 
 
 def longitudinal_distance_action(player: Player, action: Element, actor: Actor) -> list[Running]:
@@ -121,12 +150,18 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
     if math.isnan(gap):
         gap = number(action, "timeGap") * follower.speed_now
     if truth(action, "freespace"):
-        gap += other.shape.front - actor.shape.rear if leads else actor.shape.front - other.shape.rear
+        gap += (
+            other.shape.front - actor.shape.rear if leads else actor.shape.front - other.shape.rear
+        )
     signed = gap if leads else -gap
     player.depends(other, player.now, f"{actor.name}'s distance to {other.name}")
     mine = actor.here
     its = other.here
-    if isinstance(mine.path, Way) and isinstance(its.path, Way) and mine.path.chain == its.path.chain:
+    if (
+        isinstance(mine.path, Way)
+        and isinstance(its.path, Way)
+        and mine.path.chain == its.path.chain
+    ):
         actor.at = mine._replace(distance=its.distance + signed)
     else:
         actor.at = Place.free(its.pose.moved(signed))
@@ -140,15 +175,19 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
 
 
 def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """SynchronizeAction: the actor and its master, who holds its speed, reach their positions at the same time.
+    """SynchronizeAction: the actor and its master, who holds its speed, reach their positions at
+    the same time.
 
-    Up to its steady state the actor changes its speed evenly twice, each time for half of the time; one that stands
-    waits, and then accelerates evenly. Then its speed is the final one.
+    Up to its steady state the actor changes its speed evenly twice, each time for half of the time;
+    one that stands waits, and then accelerates evenly. Then its speed is the final one.
     """
     master = player.actor(attribute(action, "masterEntityRef"))
     time = math.inf
     if master.speed_now:
-        time = master.here.way_to(player.place(part(action, "TargetPositionMaster/*"))) / master.speed_now
+        time = (
+            master.here.way_to(player.place(part(action, "TargetPositionMaster/*")))
+            / master.speed_now
+        )
     if not 0 < time < math.inf:
         raise unsupported(f"SynchronizeAction: {master.name} does not move towards its position")
     way = actor.here.way_to(player.place(part(action, "TargetPosition/*")))
@@ -172,11 +211,15 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
     if rest < -1e-6 or until < -1e-6:
         where = f"{way:.1f} m and {time:.1f} s before its position"
         raise unsupported(f"SynchronizeAction: {actor.name} is {where}, within its steady state")
-    player.depends(master, player.now + until, f"{actor.name}'s SynchronizeAction with {master.name}")
+    player.depends(
+        master, player.now + until, f"{actor.name}'s SynchronizeAction with {master.name}"
+    )
     return [actor.begin("along", time, player.now, _approach(player, actor, until, rest, final))]
 
 
-def _approach(player: Player, actor: Actor, until: float, way: float, final: float) -> Callable[[Array], Array]:
+def _approach(
+    player: Player, actor: Actor, until: float, way: float, final: float
+) -> Callable[[Array], Array]:
     """Speeds of a way [m] in a time [s] that end at a final speed [m/s]."""
     start = actor.speed_now
     if way <= 1e-6:
@@ -188,7 +231,9 @@ def _approach(player: Player, actor: Actor, until: float, way: float, final: flo
     if middle < 0:
         raise unsupported(f"SynchronizeAction: {actor.name} would have to drive backwards")
     if not start:
-        player.remark(f"{actor.name} begins to move at once: it has only {until:.2f} s for {way:.2f} m")
+        player.remark(
+            f"{actor.name} begins to move at once: it has only {until:.2f} s for {way:.2f} m"
+        )
     return lambda time: np.interp(time, [0.0, until / 2, until], [start, middle, final])
 
 
@@ -239,7 +284,9 @@ def _way_of(action: Element, actor: Actor) -> Way:
 
 
 def _sign(way: Way, actor: Actor) -> int:
-    """1 if the actor drives along the road's reference line, otherwise -1: offsets count along t."""
+    """1 if the actor drives along the road's reference line, otherwise -1: offsets count along
+    t.
+    """
     return 1 if way.road_at(actor.here.distance).is_forward else -1
 
 
@@ -250,7 +297,11 @@ def _sideways(player: Player, actor: Actor, goal: float, transition: Transition)
         actor.at = actor.here._replace(left=goal)
     since = float(actor.travelled[player.sample]) if over_distance else player.now
     return actor.begin(
-        "sideways", duration, since, lambda by: start + (goal - start) * share(by), over_distance=over_distance
+        "sideways",
+        duration,
+        since,
+        lambda by: start + (goal - start) * share(by),
+        over_distance=over_distance,
     )
 
 
@@ -272,7 +323,9 @@ def assign_route_action(player: Player, action: Element, actor: Actor) -> list[R
 
 def acquire_position_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """AcquirePositionAction: the actor goes on along the shortest way to a position on a road."""
-    return _go_on(actor, way_through([actor.here, player.place(part(action, "Position/*"))], player.network))
+    return _go_on(
+        actor, way_through([actor.here, player.place(part(action, "Position/*"))], player.network)
+    )
 
 
 def _go_on(actor: Actor, way: Way) -> list[Running]:
@@ -288,7 +341,9 @@ def _go_on(actor: Actor, way: Way) -> list[Running]:
 
 
 def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in between."""
+    """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in
+    between.
+    """
     start = None if actor.at is None else actor.at.pose
     line = line_of(_trajectory(action), player.network, player.place_of, start)
     actor.at = Place(line, number(action, "initialDistanceOffset", 0.0), 0.0)
@@ -302,14 +357,20 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
     begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
     times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
     if (np.diff(times) <= 0).any():
-        raise unsupported("FollowTrajectoryAction with Timing: the times of the vertices do not grow")
+        raise unsupported(
+            "FollowTrajectoryAction with Timing: the times of the vertices do not grow"
+        )
     now = player.now
     stations = np.asarray(line.stations)
     speeds = np.diff(stations) / np.diff(times)
     # Who changes its speed evenly has the mean of two neighbours at the vertex in between.
-    at_vertices = np.array([speeds[0] if times[0] <= now else 0.0, *(speeds[1:] + speeds[:-1]) / 2, speeds[-1]])
+    at_vertices = np.array(
+        [speeds[0] if times[0] <= now else 0.0, *(speeds[1:] + speeds[:-1]) / 2, speeds[-1]]
+    )
     actor.speed_now = float(np.interp(now, times, at_vertices))
-    running = actor.begin("along", float(times[-1]) - now, now, lambda time: np.interp(time + now, times, at_vertices))
+    running = actor.begin(
+        "along", float(times[-1]) - now, now, lambda time: np.interp(time + now, times, at_vertices)
+    )
 
     def station(time: Array) -> Array:
         beyond = np.maximum(time + now - times[-1], 0.0)
@@ -320,7 +381,9 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
 
 
 def _trajectory(action: Element) -> Element:
-    """The trajectory of a FollowTrajectoryAction; in version 1.0 it had no TrajectoryRef around it."""
+    """The trajectory of a FollowTrajectoryAction; in version 1.0 it had no TrajectoryRef around
+    it.
+    """
     found = action.find("TrajectoryRef/Trajectory")
     return part(action, "Trajectory") if found is None else found
 
@@ -345,7 +408,8 @@ INIT_ORDER = (
     ("SpeedAction",),
     ("AssignRouteAction", "AcquirePositionAction"),
 )
-"""The order of actions in Init, whose list has none: places, speeds, routes, and then all others."""
+"""The order of actions in Init, whose list has none: places, speeds, routes, and then all others.
+"""
 
 
 def leaf_of(action: Element) -> Element:
@@ -380,5 +444,7 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         player.ego_turns([piece.start.facing for piece in line.pieces])
         return []
     if player.sample and player.ego in actors:
-        raise unsupported(f"{leaf.tag} of {player.ego.name} after the start: its driving system drives")
+        raise unsupported(
+            f"{leaf.tag} of {player.ego.name} after the start: its driving system drives"
+        )
     return [running for actor in actors for running in PRIVATE[leaf.tag](player, leaf, actor)]

@@ -22,7 +22,9 @@ Array = Any
 
 
 class Shape(NamedTuple):
-    """A body: its kind, length and width [m], and how far its middle is ahead and to the left of its origin [m]."""
+    """A body: its kind, length and width [m], and how far its middle is ahead and to the left of
+    its origin [m].
+    """
 
     kind: str
     length: float
@@ -76,8 +78,8 @@ class Following(NamedTuple):
 class Actor:
     """An entity that moves: where it is now, its motions, and arrays of all samples.
 
-    `place`, `facing` and `speed` are those of its origin, in the plane; `travelled` is its way since the start [m],
-    `standing` for how long it has stood [s].
+    `place`, `facing` and `speed` are those of its origin, in the plane; `travelled` is its way
+    since the start [m], `standing` for how long it has stood [s].
     """
 
     name: str
@@ -94,7 +96,9 @@ class Actor:
 
     def __post_init__(self) -> None:
         self.place, self.facing = (np.zeros(self.n_samples, dtype=complex) for _ in range(2))
-        self.speed, self.travelled, self.standing, self.distance, self.left = np.zeros((5, self.n_samples))
+        self.speed, self.travelled, self.standing, self.distance, self.left = np.zeros(
+            (5, self.n_samples)
+        )
 
     @property
     def here(self) -> Place:
@@ -149,7 +153,9 @@ class Actor:
         self.left[sample] = self.here.left
 
     def move(self, sample: int, last: int, times: Array) -> None:
-        """Move from a sample to the `last`: the speed is that of the body, along its own direction."""
+        """Move from a sample to the `last`: the speed is that of the body, along its own
+        direction.
+        """
         path = self.here.path
         now = self.here
         n = last - sample
@@ -163,7 +169,9 @@ class Actor:
         before = np.concatenate([[self.speed_now], speed[:-1]])
         ahead = (before + speed) / 2 * STEP
         if self.stations is not None:
-            ahead = np.diff(self.stations.value(times[later] - self.stations.since), prepend=now.distance)
+            ahead = np.diff(
+                self.stations.value(times[later] - self.stations.since), prepend=now.distance
+            )
         self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
         forward = ahead
         left = np.full(n, now.left)
@@ -175,14 +183,18 @@ class Actor:
             if motion.until is not None:
                 # It ends at the first sample at which the actor has travelled so far.
                 index = int(np.searchsorted(self.travelled[sample : last + 1], motion.until - 1e-9))
-                self.running["sideways"].end = float(np.append(times[sample : last + 1], np.inf)[index])
+                self.running["sideways"].end = float(
+                    np.append(times[sample : last + 1], np.inf)[index]
+                )
             aside = np.diff(left, prepend=now.left)
             sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
             cosine = np.sqrt(1 - np.square(sine))
             forward = ahead * cosine
             turn = np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
         distance = now.distance + np.cumsum(forward)
-        if isinstance(path, Way) and not path.is_straight:  # on a way that bends, the inner side is shorter
+        if (
+            isinstance(path, Way) and not path.is_straight
+        ):  # on a way that bends, the inner side is shorter
             for _ in range(2):
                 middle = distance - forward / 2
                 distance = now.distance + np.cumsum(forward / (1 - path.curvature(middle) * left))
@@ -196,20 +208,31 @@ class Actor:
         self.left[later] = left
         moves = speed > 1e-3
         since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
-        self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (since == 0)
+        self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (
+            since == 0
+        )
 
     def _behind(self, following: Following, later: slice) -> Array:
         """Distances along the path of who keeps its distance to another actor."""
         other, by = following
         path = self.here.path
-        if not (isinstance(path, Way) and isinstance(other.here.path, Way) and path.chain == other.here.path.chain):
-            raise unsupported(f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same roads")
+        if not (
+            isinstance(path, Way)
+            and isinstance(other.here.path, Way)
+            and path.chain == other.here.path.chain
+        ):
+            raise unsupported(
+                f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same"
+                " roads"
+            )
         return other.distance[later] + by
 
     def arrive(self, sample: int) -> None:
         """Be where it has been at a sample."""
         here = self.here
-        self.at = here._replace(distance=float(self.distance[sample]), left=float(self.left[sample]))
+        self.at = here._replace(
+            distance=float(self.distance[sample]), left=float(self.left[sample])
+        )
         self.speed_now = float(self.speed[sample])
 
     def pose(self, sample: int) -> Pose:
@@ -221,17 +244,23 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
     """The entities of a file (class ScenarioObject)."""
     for entity in root.findall("Entities/ScenarioObject"):
         name = attribute(entity, "name")
-        body = next((each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
+        body = next(
+            (each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None
+        )
         if body is None:
             raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
-        if any(each.tag != "TrailerRef" or each.get("entityRef") for each in body.findall("Trailer/*")):
+        if any(
+            each.tag != "TrailerRef" or each.get("entityRef") for each in body.findall("Trailer/*")
+        ):
             raise unsupported(f"the Trailer of {name} is not supported")
         middle = part(body, "BoundingBox/Center")
         size = part(body, "BoundingBox/Dimensions")
         length = number(size, "length")
         width = number(size, "width")
         if not (0 < length <= 100 and 0 < width <= 100):
-            raise unsupported(f"{name} is {length:g} m long and {width:g} m wide", "sizes above 0, up to 100 m")
+            raise unsupported(
+                f"{name} is {length:g} m long and {width:g} m wide", "sizes above 0, up to 100 m"
+            )
         shape = Shape(_kind(body), length, width, number(middle, "x"), number(middle, "y", 0.0))
         yield Actor(name, shape, n_samples)
 
@@ -241,7 +270,9 @@ def _kind(body: Element) -> str:
     if body.tag == "Pedestrian":
         height = number(part(body, "BoundingBox/Dimensions"), "height", 2.0)
         return "child" if height < CHILD else "adult"
-    return {"bicycle": "cyclist", "motorbike": "motorcyclist"}.get(body.get("vehicleCategory", ""), "car")
+    return {"bicycle": "cyclist", "motorbike": "motorcyclist"}.get(
+        body.get("vehicleCategory", ""), "car"
+    )
 
 
 CHILD = 1.4

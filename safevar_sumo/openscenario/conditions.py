@@ -1,4 +1,5 @@
-"""Conditions of triggers: each is a function with the standard's name that tells at which samples of a window it holds.
+"""Conditions of triggers: each is a function with the standard's name that tells at which samples
+of a window it holds.
 
 The names are those of the classes in the class reference of ASAM OpenSCENARIO XML 1.3.
 """
@@ -46,7 +47,9 @@ def holds(player: Player, trigger: Element | None, window: slice) -> Array:
 
 
 def _condition(player: Player, condition: Element, window: slice) -> Array:
-    """Class Condition: with its edge, after its delay; it is unknown before it is asked for the first time."""
+    """Class Condition: with its edge, after its delay; it is unknown before it is asked for the
+    first time.
+    """
     if id(condition) not in player.seen:
         player.seen[id(condition)] = window.start, np.zeros(len(player.times) + 1, bool)
     first, seen = player.seen[id(condition)]
@@ -73,7 +76,10 @@ def _value(player: Player, condition: Element, window: slice) -> Array:
         raise unsupported(f"{inner.tag} with direction = {inner.get('direction')} is not supported")
     triggering = part(kind, "TriggeringEntities")
     actors = [player.other(each) for each in triggering.findall("EntityRef")]
-    values = [BY_ENTITY[inner.tag](player, inner, actor, window) & (actor.deleted > player.now) for actor in actors]
+    values = [
+        BY_ENTITY[inner.tag](player, inner, actor, window) & (actor.deleted > player.now)
+        for actor in actors
+    ]
     rule = triggering.get("triggeringEntitiesRule")
     if rule == "all":
         return np.logical_and.reduce(values)
@@ -104,7 +110,11 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
     times = player.times[window]
     began, ended = (
         min(
-            (time for (of, path), time in states.items() if of == kind and f"::{path}".endswith(f"::{name}")),
+            (
+                time
+                for (of, path), time in states.items()
+                if of == kind and f"::{path}".endswith(f"::{name}")
+            ),
             default=np.inf,
         )
         for states in (player.begun, player.ended)
@@ -137,18 +147,24 @@ def parameter_condition(player: Player, condition: Element, window: slice) -> Ar
 # By entity
 
 
-def relative_distance_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def relative_distance_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """RelativeDistanceCondition [m]."""
     return compared(condition, distance(condition, actor, player.other(condition), window))
 
 
-def time_headway_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def time_headway_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """TimeHeadwayCondition: the distance over the triggering entity's speed [s]."""
     gap = distance(condition, actor, player.other(condition), window)
     return compared(condition, _time(gap, actor.speed[window]))
 
 
-def time_to_collision_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def time_to_collision_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """TimeToCollisionCondition: the distance over the speed at which it shrinks [s]."""
     target = condition.find("TimeToCollisionConditionTarget/EntityRef")
     if target is None:
@@ -163,12 +179,16 @@ def _time(way: Array, speed: Array) -> Array:
     return np.where(speed > 0, way / np.maximum(speed, 1e-9), np.inf)
 
 
-def traveled_distance_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def traveled_distance_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """TraveledDistanceCondition [m]."""
     return actor.travelled[window] >= number(condition, "value") - 1e-9
 
 
-def reach_position_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def reach_position_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """ReachPositionCondition: within the tolerance of a position [m]."""
     goal = player.place(part(condition, "Position/*")).pose.place
     return np.abs(actor.place[window] - goal) <= number(condition, "tolerance")
@@ -178,7 +198,9 @@ def distance_condition(player: Player, condition: Element, actor: Actor, window:
     """DistanceCondition: from a position [m]; the bodies' ends do not count."""
     if truth(condition, "freespace"):
         raise unsupported("DistanceCondition with freespace = true is not supported")
-    gap = (player.place(part(condition, "Position/*")).pose.place - actor.place[window]) / actor.facing[window]
+    gap = (
+        player.place(part(condition, "Position/*")).pose.place - actor.place[window]
+    ) / actor.facing[window]
     return compared(condition, _part(condition.get("relativeDistanceType", ""), gap))
 
 
@@ -187,7 +209,9 @@ def speed_condition(player: Player, condition: Element, actor: Actor, window: sl
     return compared(condition, actor.speed[window])
 
 
-def relative_speed_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def relative_speed_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """RelativeSpeedCondition [m/s]."""
     return compared(condition, actor.speed[window] - _along(actor, player.other(condition), window))
 
@@ -197,7 +221,9 @@ def stand_still_condition(player: Player, condition: Element, actor: Actor, wind
     return actor.standing[window] >= number(condition, "duration") - 1e-9
 
 
-def acceleration_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
+def acceleration_condition(
+    player: Player, condition: Element, actor: Actor, window: slice
+) -> Array:
     """AccelerationCondition [m/s^2]: in the last step."""
     before = np.arange(window.start, window.stop) - 1
     change = actor.speed[window] - actor.speed[np.maximum(before, 0)]
@@ -251,7 +277,11 @@ def bodies_apart(actor: Actor, other: Actor, window: slice) -> tuple[Array, Arra
     facing = actor.facing[window]
     turn = other.facing[window] / facing
     apart: Array = (other.place[window] - actor.place[window]) / facing
-    apart = apart + turn * complex(other.shape.ahead, other.shape.left) - complex(actor.shape.ahead, actor.shape.left)
+    apart = (
+        apart
+        + turn * complex(other.shape.ahead, other.shape.left)
+        - complex(actor.shape.ahead, actor.shape.left)
+    )
     size, own = (complex(one.shape.length, one.shape.width) for one in (other, actor))
     # A body that is turned reaches as far ahead as the box around it.
     across = complex(size.imag, size.real)
@@ -262,10 +292,17 @@ def _is_along_road(condition: Element, kind: str, actor: Actor) -> bool:
     """Whether a distance is one along a road that bends."""
     system = condition.get("coordinateSystem", "entity")
     path = actor.here.path
-    return kind == "longitudinal" and system in ("road", "lane") and isinstance(path, Way) and not path.is_straight
+    return (
+        kind == "longitudinal"
+        and system in ("road", "lane")
+        and isinstance(path, Way)
+        and not path.is_straight
+    )
 
 
-def _along_road(condition: Element, actor: Actor, other: Actor, window: slice, is_free: bool) -> Array:
+def _along_road(
+    condition: Element, actor: Actor, other: Actor, window: slice, is_free: bool
+) -> Array:
     own = actor.here.path
     its = other.here.path
     if not (isinstance(own, Way) and isinstance(its, Way) and own.chain == its.chain):

@@ -38,7 +38,9 @@ def root_of(file: str) -> Element:
     try:
         stamp = os.stat(file)
     except OSError as error:
-        raise unsupported(f"{file!r} cannot be read: {error.strerror}", "the path of a file") from None
+        raise unsupported(
+            f"{file!r} cannot be read: {error.strerror}", "the path of a file"
+        ) from None
     return _parsed(file, stamp.st_mtime_ns, stamp.st_size)
 
 
@@ -53,7 +55,9 @@ def _parsed(file: str, modified: int, size: int) -> Element:
         problem = f"{file!r} has a document type or entities ({type(error).__name__})"
         raise unsupported(problem, "XML without them") from None
     except (ParseError, ValueError, LookupError, OSError) as error:
-        raise unsupported(f"{file!r} is no XML: {error}", "a file of OpenSCENARIO or OpenDRIVE") from None
+        raise unsupported(
+            f"{file!r} is no XML: {error}", "a file of OpenSCENARIO or OpenDRIVE"
+        ) from None
 
 
 def attribute(element: Element, name: str) -> str:
@@ -116,7 +120,9 @@ def part(element: Element, path: str) -> Element:
 
 
 class Parameter(NamedTuple):
-    """A declared parameter, its value as written, and its constraints: groups of a rule and a limit each."""
+    """A declared parameter, its value as written, and its constraints: groups of a rule and a limit
+    each.
+    """
 
     name: str
     text: str
@@ -150,7 +156,9 @@ def check_unique(names: Sequence[str], kind: str) -> None:
 
 
 def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> dict[str, str]:
-    """Values by name: those given, otherwise those declared, which may use names that were declared before."""
+    """Values by name: those given, otherwise those declared, which may use names that were declared
+    before.
+    """
     names = [parameter.name for parameter in parameters]
     for name in given:
         if name not in names:
@@ -164,13 +172,15 @@ def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> 
 def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
     """The values that violate a constraint, as `name = value`.
 
-    By the standard (class ParameterDeclaration) one group must hold whole; the files of UN R157 write limits that must
-    all hold as groups of their own. So several groups are joined by "or" if they are all `equalTo`, else by "and".
+    By the standard (class ParameterDeclaration) one group must hold whole; the files of UN R157
+    write limits that must all hold as groups of their own. So several groups are joined by "or" if
+    they are all `equalTo`, else by "and".
     """
     problems = []
     for name, _, groups in parameters:
         results = [
-            all(compare(rule, values[name], literal(limit, values)) for rule, limit in group) for group in groups
+            all(compare(rule, values[name], literal(limit, values)) for rule, limit in group)
+            for group in groups
         ]
         has_choices = all(rule == "equalTo" for group in groups for rule, _ in group)
         if results and not (any(results) if has_choices else all(results)):
@@ -179,8 +189,8 @@ def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
 
 
 class Document(NamedTuple):
-    """A concrete file with every value a literal: its root, its parameters and their values, and the paths of the
-    catalogs and the road that it names.
+    """A concrete file with every value a literal: its root, its parameters and their values, and
+    the paths of the catalogs and the road that it names.
     """
 
     root: Element
@@ -201,9 +211,13 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     root = copy.deepcopy(root_of(file))
     header = root.find("FileHeader")
     if root.tag != "OpenSCENARIO" or header is None or header.get("revMajor") != "1":
-        raise unsupported(f"{file!r} is no OpenSCENARIO XML 1.x", "a file with FileHeader revMajor = 1")
+        raise unsupported(
+            f"{file!r} is no OpenSCENARIO XML 1.x", "a file with FileHeader revMajor = 1"
+        )
     if root.find("Storyboard") is None:
-        raise unsupported(f"{file!r} has no Storyboard", "a scenario, or a file of parameter values")
+        raise unsupported(
+            f"{file!r} has no Storyboard", "a scenario, or a file of parameter values"
+        )
     parameters = declared(root)
     values = values_of(parameters, given, {})
     folder = os.path.dirname(file)
@@ -214,7 +228,9 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     _resolve(root, values, tuple(folders), catalogs)
     # An orientation without a type is absolute up to version 1.2, and relative from 1.3 on.
     for orientation in root.iter("Orientation"):
-        orientation.attrib.setdefault("type", "relative" if number(header, "revMinor", 0.0) >= 3 else "absolute")
+        orientation.attrib.setdefault(
+            "type", "relative" if number(header, "revMinor", 0.0) >= 3 else "absolute"
+        )
     check_unique([attribute(one, "name") for one in root.findall("Entities/*")], "entities")
     _name_members(root)
     logic = root.find("RoadNetwork/LogicFile")
@@ -223,21 +239,27 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     road = beside(folder, attribute(logic, "filepath"))
     if not os.path.isfile(road):
         raise unsupported(
-            f"the road {road!r} is not there", "the path of an OpenDRIVE file, from the file that names it"
+            f"the road {road!r} is not there",
+            "the path of an OpenDRIVE file, from the file that names it",
         )
     return Document(root, parameters, values, list(dict.fromkeys(catalogs)), road)
 
 
 def _name_members(root: Element) -> None:
-    """Replace selections of entities (class EntitySelection) by their members, where they act or are watched."""
+    """Replace selections of entities (class EntitySelection) by their members, where they act or
+    are watched.
+    """
     members = {
-        attribute(one, "name"): one.findall("Members/EntityRef") for one in root.findall("Entities/EntitySelection")
+        attribute(one, "name"): one.findall("Members/EntityRef")
+        for one in root.findall("Entities/EntitySelection")
     }
     if root.find("Entities/EntitySelection/Members/ByType") is not None:
         raise unsupported("EntitySelection with ByType is not supported")
     for parent in root.iter() if members else ():
         if parent.tag in ("Actors", "TriggeringEntities"):
-            parent[:] = [one for each in parent for one in members.get(each.get("entityRef", ""), [each])]
+            parent[:] = [
+                one for each in parent for one in members.get(each.get("entityRef", ""), [each])
+            ]
 
 
 def beside(folder: str, path: str) -> str:
@@ -245,8 +267,12 @@ def beside(folder: str, path: str) -> str:
     return os.path.normpath(os.path.join(folder, path.replace("\\", "/")))
 
 
-def _resolve(element: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]) -> None:
-    """Replace values and references to catalogs below an element; `catalogs` collects the files that are read."""
+def _resolve(
+    element: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]
+) -> None:
+    """Replace values and references to catalogs below an element; `catalogs` collects the files
+    that are read.
+    """
     for key, text in element.attrib.items():
         if "$" in text:
             element.set(key, literal(text, values))
@@ -261,7 +287,9 @@ def _resolve(element: Element, values: Values, folders: tuple[str, ...], catalog
             _resolve(child, values_of(own, {}, values) if own else values, folders, catalogs)
 
 
-def _referenced(child: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]) -> Element:
+def _referenced(
+    child: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]
+) -> Element:
     """The entry of a catalog that a reference names, with the values that it assigns."""
     catalog, name = (literal(attribute(child, key), values) for key in ("catalogName", "entryName"))
     file, found = _entry(catalog, name, folders)
@@ -282,7 +310,9 @@ def _files(folders: Sequence[str]) -> list[str]:
         path
         for folder in folders
         for path in (
-            [os.path.join(folder, name) for name in sorted(os.listdir(folder))] if os.path.isdir(folder) else [folder]
+            [os.path.join(folder, name) for name in sorted(os.listdir(folder))]
+            if os.path.isdir(folder)
+            else [folder]
         )
     ]
     return [path for path in paths if path.endswith(".xosc") and os.path.isfile(path)]
@@ -297,4 +327,7 @@ def _entry(catalog: str, entry: str, folders: tuple[str, ...]) -> tuple[str, Ele
             if entry not in entries:
                 raise unsupported(f"the catalog {catalog} has no {entry}", one_of(entries))
             return file, entries[entry]
-    raise unsupported(f"there is no catalog {catalog} in {', '.join(folders) or 'CatalogLocations'}", "a file with it")
+    raise unsupported(
+        f"there is no catalog {catalog} in {', '.join(folders) or 'CatalogLocations'}",
+        "a file with it",
+    )

@@ -1,4 +1,6 @@
-"""Values: literals, `$parameters`, `${expressions}`, and rules that compare them (classes Expression, Rule)."""
+"""Values: literals, `$parameters`, `${expressions}`, and rules that compare them (classes
+Expression, Rule).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Files of parameter values (class ParameterValueDistribution): which combinations of values a logical file has."""
+"""Files of parameter values (class ParameterValueDistribution): which combinations of values a
+logical file has.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ MOST_STEPS = 100_000
 
 
 class Choice(NamedTuple):
-    """Values that parameters take together, one set of them at a time; `ends` are those of a range."""
+    """Values that parameters take together, one set of them at a time; `ends` are those of a
+    range.
+    """
 
     names: tuple[str, ...]
     sets: tuple[tuple[str, ...], ...]
@@ -42,7 +46,9 @@ class Choice(NamedTuple):
 
 
 class Source(NamedTuple):
-    """What a file offers: the concrete file, its parameters with their values, and the choices of a logical one."""
+    """What a file offers: the concrete file, its parameters with their values, and the choices of a
+    logical one.
+    """
 
     concrete: str
     values: dict[str, str]
@@ -56,7 +62,9 @@ class Source(NamedTuple):
             values = dict[str, str]()
             for choice, own in zip(self.choices, sets, strict=True):
                 values |= zip(choice.names, own, strict=True)
-            if has_constraints and violated(declarations, values_of(declarations, {**given, **values}, {})):
+            if has_constraints and violated(
+                declarations, values_of(declarations, {**given, **values}, {})
+            ):
                 continue
             yield values
 
@@ -67,7 +75,9 @@ class Source(NamedTuple):
             kept = [place for place, name in enumerate(choice.names) if name not in names]
             sets = tuple(dict.fromkeys(tuple(own[place] for place in kept) for own in choice.sets))
             if kept:
-                choices.append(choice._replace(names=tuple(choice.names[place] for place in kept), sets=sets))
+                choices.append(
+                    choice._replace(names=tuple(choice.names[place] for place in kept), sets=sets)
+                )
         return self._replace(choices=choices)
 
     def range_of(self, name: str) -> tuple[float, float] | None:
@@ -89,12 +99,20 @@ def open_file(file: str) -> Source:
     distribution = root.find("ParameterValueDistribution")
     if distribution is not None:
         if distribution.find("Deterministic") is None:
-            raise unsupported("Stochastic distributions are not supported", "Deterministic ones, such as a range")
+            raise unsupported(
+                "Stochastic distributions are not supported", "Deterministic ones, such as a range"
+            )
         choices = [_choice(each) for each in part(distribution, "Deterministic")]
-        check_unique([name for choice in choices for name in choice.names], "parameters with values")
-        concrete = beside(os.path.dirname(file), attribute(part(distribution, "ScenarioFile"), "filepath"))
+        check_unique(
+            [name for choice in choices for name in choice.names], "parameters with values"
+        )
+        concrete = beside(
+            os.path.dirname(file), attribute(part(distribution, "ScenarioFile"), "filepath")
+        )
     declarations = declared(root_of(concrete))
-    given = {name: choice.sets[0][place] for choice in choices for place, name in enumerate(choice.names)}
+    given = {
+        name: choice.sets[0][place] for choice in choices for place, name in enumerate(choice.names)
+    }
     values_of(declarations, given, {})  # refuses names that the file does not declare
     return Source(concrete, values_of(declarations, {}, {}), choices)
 
@@ -104,7 +122,9 @@ def _choice(each: Element) -> Choice:
     content = part(each, "*")
     match content.tag:
         case "DistributionSet":
-            return _filled(Choice((_name(each),), tuple((attribute(one, "value"),) for one in content)))
+            return _filled(
+                Choice((_name(each),), tuple((attribute(one, "value"),) for one in content))
+            )
         case "DistributionRange":
             limits = part(content, "Range")
             step = number(content, "stepWidth")
@@ -144,7 +164,9 @@ def originals(source: Source) -> dict[str, float]:
 
 
 class Bound(NamedTuple):
-    """A linear constraint: the sum of `weights` times values is `at_least` or `at_most` (the `kind`) a limit."""
+    """A linear constraint: the sum of `weights` times values is `at_least` or `at_most` (the
+    `kind`) a limit.
+    """
 
     weights: list[float]
     kind: str
@@ -153,15 +175,23 @@ class Bound(NamedTuple):
 
 
 INSIDE = 1e-6
-"""Part of a constraint's range that a search keeps from its limit, which may be excluded itself [-]."""
-KINDS = {"greaterThan": "at_least", "greaterOrEqual": "at_least", "lessThan": "at_most", "lessOrEqual": "at_most"}
+"""Part of a constraint's range that a search keeps from its limit, which may be excluded itself
+[-].
+"""
+KINDS = {
+    "greaterThan": "at_least",
+    "greaterOrEqual": "at_least",
+    "lessThan": "at_most",
+    "lessOrEqual": "at_most",
+}
 """Bounds by rules: a search does not tell the two apart."""
 
 
 def constraints_of(
     file: str, given: Mapping[str, str], names: Sequence[str], low: FloatArray, high: FloatArray
 ) -> list[Bound]:
-    """The constraints of a file on the parameters `names` between `low` and `high`, at `given` values of others.
+    """The constraints of a file on the parameters `names` between `low` and `high`, at `given`
+    values of others.
 
     Raises
     ------
@@ -183,7 +213,10 @@ def constraints_of(
             if rule not in KINDS:
                 continue
             base = difference(name, limit, middle)
-            slopes = np.array([difference(name, limit, middle + step) - base for step in np.diag(half)]) / half
+            slopes = (
+                np.array([difference(name, limit, middle + step) - base for step in np.diag(half)])
+                / half
+            )
             sign = 1 if KINDS[rule] == "at_least" else -1
             reach = np.abs(slopes * half).sum()
             is_given = reach < 1e-12
@@ -192,10 +225,13 @@ def constraints_of(
             if is_given or holds_everywhere:
                 continue
             elsewhere = [low, high, middle - half / 3]
-            errors = [difference(name, limit, at) - base - slopes @ (at - middle) for at in elsewhere]
+            errors = [
+                difference(name, limit, at) - base - slopes @ (at - middle) for at in elsewhere
+            ]
             if np.abs(errors).max() > 1e-6 * reach:
                 raise unsupported(
-                    f"the constraint of {name} is not linear in {', '.join(names)}", "other parameters to search"
+                    f"the constraint of {name} is not linear in {', '.join(names)}",
+                    "other parameters to search",
                 )
             bound = float(slopes @ middle - base + sign * INSIDE * reach)
             bounds.append(Bound(slopes.tolist(), KINDS[rule], bound, f"{name} {rule} {limit}"))

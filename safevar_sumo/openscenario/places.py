@@ -1,4 +1,6 @@
-"""Positions, routes and trajectories: each is a distance along a line in the plane, and an offset to its left."""
+"""Positions, routes and trajectories: each is a distance along a line in the plane, and an offset
+to its left.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ AHEAD = -1e-9
 
 
 class Crossing(NamedTuple):
-    """A place on a road: the road, whether it is driven along its reference line, and s and t there [m]."""
+    """A place on a road: the road, whether it is driven along its reference line, and s and t there
+    [m].
+    """
 
     road: Road
     is_forward: bool
@@ -47,7 +51,9 @@ class Way(Line):
 
     @classmethod
     def onward(cls, network: Network, name: str, is_forward: bool) -> Way:
-        """The way along a road and straight on along those that follow, as far as there is one such road."""
+        """The way along a road and straight on along those that follow, as far as there is one such
+        road.
+        """
         way = cls.of(network, ((name, is_forward),))
         following = [(name, is_forward)]
         while len(following) == 1 and way.is_straight and len(way.chain) <= MAX_DETOUR:
@@ -70,10 +76,14 @@ class Way(Line):
                 break
             distance -= road.length
         sign = 1 if is_forward else -1
-        return Crossing(road, is_forward, distance if is_forward else road.length - distance, sign * left)
+        return Crossing(
+            road, is_forward, distance if is_forward else road.length - distance, sign * left
+        )
 
     def distance_to(self, name: str, s: float) -> float | None:
-        """The distance at which the way has s on a road, None if it does not lead along that road."""
+        """The distance at which the way has s on a road, None if it does not lead along that
+        road.
+        """
         assert self.network is not None
         before = 0.0
         for road, is_forward in self.chain:
@@ -95,7 +105,9 @@ class Way(Line):
 
 
 class Place(NamedTuple):
-    """A distance along a line and an offset to its left [m]; `turn` is the direction of a body relative to it."""
+    """A distance along a line and an offset to its left [m]; `turn` is the direction of a body
+    relative to it.
+    """
 
     path: Line
     distance: float
@@ -133,20 +145,28 @@ Entity = Callable[[str], Place]
 
 
 def oriented(orientation: Element | None, base: complex) -> complex:
-    """The direction of an Orientation: absolute, or relative to `base`; without one it is `base`."""
+    """The direction of an Orientation: absolute, or relative to `base`; without one it is
+    `base`.
+    """
     if orientation is None:
         return base
     turn = unit(number(orientation, "h", 0.0))
     return base * turn if orientation.get("type") == "relative" else turn
 
 
-def on_road(road: Road, network: Network, s: float, t: float, facing: Element | None, *, against: bool) -> Place:
-    """A place on a road, which faces along the reference line, `against` it, or as an orientation says.
+def on_road(
+    road: Road, network: Network, s: float, t: float, facing: Element | None, *, against: bool
+) -> Place:
+    """A place on a road, which faces along the reference line, `against` it, or as an orientation
+    says.
 
-    A relative orientation counts from the direction without one: in a lane from its driving direction.
+    A relative orientation counts from the direction without one: in a lane from its driving
+    direction.
     """
     if not -1e-9 <= s <= road.length + 1e-9:
-        raise unsupported(f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long")
+        raise unsupported(
+            f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long"
+        )
     along = road.line.pose(s).facing
     turn = oriented(facing, -along if against else along) / along
     is_forward = turn.real >= AHEAD
@@ -155,7 +175,9 @@ def on_road(road: Road, network: Network, s: float, t: float, facing: Element | 
 
 
 def place_of(position: Element, network: Network, entity: Entity) -> Place:
-    """The place that the child of a Position names (class Position); `entity` returns that of an entity."""
+    """The place that the child of a Position names (class Position); `entity` returns that of an
+    entity.
+    """
     if position.tag not in POSITIONS:
         raise unsupported(f"{position.tag} is not supported")
     return POSITIONS[position.tag](position, network, entity)
@@ -163,11 +185,15 @@ def place_of(position: Element, network: Network, entity: Entity) -> Place:
 
 def world_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class WorldPosition."""
-    return Place.free(Pose.at(number(position, "x"), number(position, "y"), number(position, "h", 0.0)))
+    return Place.free(
+        Pose.at(number(position, "x"), number(position, "y"), number(position, "h", 0.0))
+    )
 
 
 def lane_position(position: Element, network: Network, entity: Entity) -> Place:
-    """Class LanePosition: the offset counts along t, of lanes to the left of the reference line, too."""
+    """Class LanePosition: the offset counts along t, of lanes to the left of the reference line,
+    too.
+    """
     road = network.road(attribute(position, "roadId"))
     lane = whole(position, "laneId")
     s = number(position, "s")
@@ -232,7 +258,9 @@ def _beside(position: Element, entity: Entity, axis: complex) -> Place:
 def trajectory_position(position: Element, network: Network, entity: Entity) -> Place:
     """Class TrajectoryPosition."""
     line = line_of(part(position, "TrajectoryRef/Trajectory"), network, entity)
-    return _turned(Place(line, number(position, "s"), number(position, "t", 0.0)), position.find("Orientation"))
+    return _turned(
+        Place(line, number(position, "s"), number(position, "t", 0.0)), position.find("Orientation")
+    )
 
 
 def route_position(position: Element, network: Network, entity: Entity) -> Place:
@@ -245,7 +273,9 @@ def route_position(position: Element, network: Network, entity: Entity) -> Place
         case "FromRoadCoordinates":
             left = sign * number(where, "t")
         case "FromLaneCoordinates":
-            left = way.lane_left(whole(where, "laneId"), distance) + sign * number(where, "laneOffset", 0.0)
+            left = way.lane_left(whole(where, "laneId"), distance) + sign * number(
+                where, "laneOffset", 0.0
+            )
         case _:
             raise unsupported(f"{where.tag} is not supported")
     return _turned(Place(way, distance, left), position.find("Orientation"))
@@ -286,7 +316,11 @@ def _nobody(name: str) -> Place:
 def way_of(route: Element, network: Network) -> Way:
     """The roads of a route (class Route): the shortest chain from waypoint to waypoint."""
     return way_through(
-        [place_of(part(point, "Position/*"), network, _nobody) for point in route.findall("Waypoint")], network
+        [
+            place_of(part(point, "Position/*"), network, _nobody)
+            for point in route.findall("Waypoint")
+        ],
+        network,
     )
 
 
@@ -316,7 +350,9 @@ Chain = tuple[tuple[str, bool], ...]
 
 
 def _extended(network: Network, options: Sequence[Chain], end: str) -> Chain:
-    """The first of some chains of roads that leads to the road with the id `end`, extended by the fewest roads."""
+    """The first of some chains of roads that leads to the road with the id `end`, extended by the
+    fewest roads.
+    """
     queue = [*options]
     most = len(options[0]) + MAX_DETOUR
     while queue:
@@ -328,7 +364,9 @@ def _extended(network: Network, options: Sequence[Chain], end: str) -> Chain:
     raise unsupported(f"no route leads from road {options[0][-1][0]} to road {end}")
 
 
-def line_of(trajectory: Element, network: Network, entity: Entity, start: Pose | None = None) -> Line:
+def line_of(
+    trajectory: Element, network: Network, entity: Entity, start: Pose | None = None
+) -> Line:
     """The line of a Trajectory (class Shape); `start` is where its actor is."""
     shape = part(trajectory, "Shape/*")
     match shape.tag:
@@ -342,7 +380,10 @@ def line_of(trajectory: Element, network: Network, entity: Entity, start: Pose |
             first = number(shape, "curvature")
             slope = number(shape, "curvaturePrime", number(shape, "curvatureDot", 0.0))
             return Line([Piece(pose, length, first, first + slope * length)])
-    raise unsupported(f"the trajectory's {shape.tag} is not supported; supported: Polyline, Clothoid, ClothoidSpline")
+    raise unsupported(
+        f"the trajectory's {shape.tag} is not supported; supported: Polyline, Clothoid,"
+        " ClothoidSpline"
+    )
 
 
 def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
@@ -367,7 +408,9 @@ def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
 
 
 def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | None) -> list[Piece]:
-    """Class ClothoidSpline: one segment after another, from where its actor is unless a start is given."""
+    """Class ClothoidSpline: one segment after another, from where its actor is unless a start is
+    given.
+    """
     pieces = []
     pose = start
     for segment in shape.findall("ClothoidSplineSegment"):
@@ -375,7 +418,9 @@ def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | N
         if begin is not None:
             pose = place_of(part(begin, "*"), network, entity).pose
         if pose is None:
-            raise unsupported("a ClothoidSpline without a start in the plane, which no actor follows")
+            raise unsupported(
+                "a ClothoidSpline without a start in the plane, which no actor follows"
+            )
         curvatures = (number(segment, name) for name in ("curvatureStart", "curvatureEnd"))
         piece = Piece(pose, number(segment, "length"), *curvatures)
         pieces.append(piece)

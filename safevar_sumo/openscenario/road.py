@@ -1,4 +1,6 @@
-"""OpenDRIVE: lines in the plane, and roads with lanes along them. A place in the plane is a complex number: x + iy."""
+"""OpenDRIVE: lines in the plane, and roads with lanes along them. A place in the plane is a complex
+number: x + iy.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.openscenario.document import Element, attribute, number, part, root_of, unsupported
+from safevar_sumo.openscenario.document import (
+    Element,
+    attribute,
+    number,
+    part,
+    root_of,
+    unsupported,
+)
 
 LEAST_TURN = 1e-9
 """Turn of a curve by its change of curvature below which it is an arc, or a line [rad]."""
@@ -46,11 +55,17 @@ class Pose(NamedTuple):
 def unit(heading: float) -> complex:
     """The direction of a heading [rad]; exact for the four along the axes."""
     quarter = heading / (math.pi / 2)
-    return (1, 1j, -1, -1j)[round(quarter) % 4] if abs(quarter - round(quarter)) < 1e-12 else cmath.exp(1j * heading)
+    return (
+        (1, 1j, -1, -1j)[round(quarter) % 4]
+        if abs(quarter - round(quarter)) < 1e-12
+        else cmath.exp(1j * heading)
+    )
 
 
 class Piece(NamedTuple):
-    """A piece of a line: its first pose, its length, and its curvatures at both ends, linear in between [1/m]."""
+    """A piece of a line: its first pose, its length, and its curvatures at both ends, linear in
+    between [1/m].
+    """
 
     start: Pose
     length: float
@@ -70,7 +85,10 @@ class Piece(NamedTuple):
             if abs(first) * self.length < LEAST_TURN:
                 return self.start.moved(distance)
             turn = np.exp(1j * first * distance)
-            return Pose(self.start.place + self.start.facing * (turn - 1) / (1j * first), self.start.facing * turn)
+            return Pose(
+                self.start.place + self.start.facing * (turn - 1) / (1j * first),
+                self.start.facing * turn,
+            )
         # Fresnel's integrals count from where the curvature is 0.
         scale = math.sqrt(abs(slope) / math.pi)
         sign = math.copysign(1.0, slope)
@@ -96,8 +114,8 @@ def _fresnel(value: Number, sign: float) -> Number:
 class Line:
     """A line of pieces, straight on beyond both ends.
 
-    A trajectory has vertices at these `stations` [m], with `times` [s] and directions that a body faces, `facings`, if
-    the file states them.
+    A trajectory has vertices at these `stations` [m], with `times` [s] and directions that a body
+    faces, `facings`, if the file states them.
     """
 
     pieces: Sequence[Piece]
@@ -120,7 +138,9 @@ class Line:
         """Whether it turns nowhere."""
         facing = self.pieces[0].start.facing
         return all(
-            abs(cmath.phase(piece.start.facing / facing)) < STRAIGHT and not piece.first and not piece.last
+            abs(cmath.phase(piece.start.facing / facing)) < STRAIGHT
+            and not piece.first
+            and not piece.last
             for piece in self.pieces
         )
 
@@ -145,12 +165,16 @@ class Line:
     def curvature(self, distance: Number) -> Number:
         """The curvatures at distances [1/m]."""
         inside = np.clip(distance, 0.0, self.length)
-        firsts, slopes = (np.array([getattr(piece, name) for piece in self.pieces]) for name in ("first", "slope"))
+        firsts, slopes = (
+            np.array([getattr(piece, name) for piece in self.pieces]) for name in ("first", "slope")
+        )
         k = self._piece_at(inside)
         return firsts[k] + slopes[k] * (inside - self.starts[k])
 
     def _piece_at(self, distance: Number) -> Number:
-        return np.clip(np.searchsorted(self.starts, distance, side="right") - 1, 0, len(self.pieces) - 1)
+        return np.clip(
+            np.searchsorted(self.starts, distance, side="right") - 1, 0, len(self.pieces) - 1
+        )
 
 
 Cubics = list[tuple[float, tuple[float, ...]]]
@@ -159,8 +183,8 @@ Cubics = list[tuple[float, tuple[float, ...]]]
 
 @dataclass(frozen=True)
 class Road:
-    """A road: its reference line, sections with widths by lane, offsets of lane 0, and the elements at its ends; a
-    `flaw` says why nobody can be on it.
+    """A road: its reference line, sections with widths by lane, offsets of lane 0, and the elements
+    at its ends; a `flaw` says why nobody can be on it.
     """
 
     id: str
@@ -197,7 +221,9 @@ class Road:
         return min(self._section(s)[1], key=lambda lane: abs(self.lane_t(lane, s) - t))
 
     def _section(self, s: float) -> tuple[float, dict[int, Cubics]]:
-        return next((one for one in reversed(self.sections) if one[0] <= s + 1e-9), self.sections[0])
+        return next(
+            (one for one in reversed(self.sections) if one[0] <= s + 1e-9), self.sections[0]
+        )
 
 
 def _cubic(pieces: Cubics, s: float) -> float:
@@ -208,7 +234,9 @@ def _cubic(pieces: Cubics, s: float) -> float:
 
 @dataclass(frozen=True)
 class Network:
-    """The roads of a file, and connections of its junctions: incoming road, connecting road, its contact point."""
+    """The roads of a file, and connections of its junctions: incoming road, connecting road, its
+    contact point.
+    """
 
     name: str
     roads: dict[str, Road]
@@ -228,7 +256,11 @@ class Network:
         kind, other, contact = link
         if kind == "road":
             return [(other, contact == "start")]
-        return [(to, at == "start") for incoming, to, at in self.junctions.get(other, []) if incoming == road]
+        return [
+            (to, at == "start")
+            for incoming, to, at in self.junctions.get(other, [])
+            if incoming == road
+        ]
 
 
 def read_network(file: str) -> Network:
@@ -244,7 +276,11 @@ def _network(file: str, modified: int) -> Network:
     roads = {attribute(element, "id"): _road(element) for element in root.findall("road")}
     junctions = {
         attribute(junction, "id"): [
-            (attribute(one, "incomingRoad"), attribute(one, "connectingRoad"), attribute(one, "contactPoint"))
+            (
+                attribute(one, "incomingRoad"),
+                attribute(one, "connectingRoad"),
+                attribute(one, "contactPoint"),
+            )
             for one in junction.findall("connection")
             if "connectingRoad" in one.attrib
         ]
@@ -257,7 +293,11 @@ def _road(element: Element) -> Road:
     """A road of OpenDRIVE."""
     name = attribute(element, "id")
     links = {
-        link.tag: (attribute(link, "elementType"), attribute(link, "elementId"), link.get("contactPoint", ""))
+        link.tag: (
+            attribute(link, "elementType"),
+            attribute(link, "elementId"),
+            link.get("contactPoint", ""),
+        )
         for link in element.findall("link/*")
         if link.tag in ("predecessor", "successor")
     }
@@ -285,7 +325,10 @@ def _road(element: Element) -> Road:
 
 
 def _cubics(element: Element, tag: str, start: str) -> Cubics:
-    found = [(number(one, start), tuple(number(one, key) for key in "abcd")) for one in element.findall(tag)]
+    found = [
+        (number(one, start), tuple(number(one, key) for key in "abcd"))
+        for one in element.findall(tag)
+    ]
     return found or [(0.0, (0.0,) * 4)]
 
 

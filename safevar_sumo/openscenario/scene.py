@@ -17,8 +17,9 @@ from safevar_sumo.openscenario.storyboard import Player
 
 
 class Moved(NamedTuple):
-    """How an entity moves: its shape, the places of its middle, directions and speeds at samples (with `every` above 1
-    up to the last change, after which it goes on evenly), and the time at which it is deleted [s].
+    """How an entity moves: its shape, the places of its middle, directions and speeds at samples
+    (with `every` above 1 up to the last change, after which it goes on evenly), and the time at
+    which it is deleted [s].
     """
 
     name: str
@@ -30,9 +31,10 @@ class Moved(NamedTuple):
 
 
 class Played(NamedTuple):
-    """A scene: Ego's shape, the pose of the middle of its front at the start, and its speed [m/s]; the others; the
-    length [s]; the time until which a motion depends on Ego, and what depends on it; remarks; the files that were read;
-    the file's parameters that are numbers; and why nothing happens to Ego, "" if something does.
+    """A scene: Ego's shape, the pose of the middle of its front at the start, and its speed [m/s];
+    the others; the length [s]; the time until which a motion depends on Ego, and what depends on
+    it; remarks; the files that were read; the file's parameters that are numbers; and why nothing
+    happens to Ego, "" if something does.
     """
 
     ego: Shape
@@ -49,7 +51,8 @@ class Played(NamedTuple):
 
 
 def play(file: str, values: Mapping[str, str], ego: str = "Ego", every: int = 1) -> Played:
-    """Play a concrete file with some of its parameters set, or take the scene that was played from the same files.
+    """Play a concrete file with some of its parameters set, or take the scene that was played from
+    the same files.
 
     What moves has `every` such sample, the first one included.
 
@@ -74,18 +77,21 @@ EVERY = 5
 """Samples of a scene that are kept if those of a study are among them: every fifth."""
 _SCENES: dict[tuple[object, ...], tuple[Played, list[tuple[int, int]]]] = {}
 KEPT_SCENES = 8000
-"""Number of played scenes that a process keeps: all fits of a model meet the same encounters, 7,004."""
+"""Number of played scenes that a process keeps: all fits of a model meet the same encounters,
+7,004.
+"""
 KEPT_SAMPLES = 9_600_000
 """Number of samples of one body in all of these scenes; each takes 40 bytes."""
 HALF_LANE = 1.75
 """Whoever is within this distance of Ego's path is in its lane: half of a lane of 3.5 m [m]."""
 NEAR = 4.0
-"""Ego follows a body that is ahead in its lane within this time of driving for this time; a body that
-left the lane at most so long before Ego arrives is met, too [s]. At a time to collision of 4 s Euro
-NCAP's tests begin.
+"""Ego follows a body that is ahead in its lane within this time of driving for this time; a body
+that left the lane at most so long before Ego arrives is met, too [s]. At a time to collision of 4 s
+Euro NCAP's tests begin.
 """
 EVEN = 1e-11
-"""Difference of a step from that at an even speed up to which it is one [m]: what rounding leaves."""
+"""Difference of a step from that at an even speed up to which it is one [m]: what rounding leaves.
+"""
 
 
 def _stamps(files: Sequence[str]) -> list[tuple[int, int]]:
@@ -97,7 +103,9 @@ def _stamps(files: Sequence[str]) -> list[tuple[int, int]]:
 def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     document = read(file, values)
     if problems := violated(document.parameters, document.values):
-        raise unsupported(f"the file's constraints exclude {', '.join(problems)}", "values that they allow")
+        raise unsupported(
+            f"the file's constraints exclude {', '.join(problems)}", "values that they allow"
+        )
     player = Player(document, ego)
     player.play()
     own = player.ego
@@ -120,7 +128,9 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     speed = float(own.speed[0])
     remarks = [*player.remarks]
     reason = _why_uneventful(player)
-    return Played(own.shape, start, speed, others, player.now, until, what, remarks, files, numbers, reason)
+    return Played(
+        own.shape, start, speed, others, player.now, until, what, remarks, files, numbers, reason
+    )
 
 
 def _why_uneventful(player: Player) -> str:
@@ -135,7 +145,9 @@ def _why_uneventful(player: Player) -> str:
     for actor in player.actors.values():
         if actor is own:
             continue
-        apart, reach = bodies_apart(own, actor, slice(0, round(min(player.now, actor.deleted) / STEP) + 1))
+        apart, reach = bodies_apart(
+            own, actor, slice(0, round(min(player.now, actor.deleted) / STEP) + 1)
+        )
         is_in_lane = np.abs(apart.imag) < np.maximum(reach.imag, HALF_LANE)
         gap = np.abs(apart.real) - reach.real
         is_close = is_in_lane & (apart.real > 0) & (gap < NEAR * own.speed_now)
@@ -145,12 +157,20 @@ def _why_uneventful(player: Player) -> str:
         meets |= bool((gap[: last + long] <= 0).any() or is_close.sum() >= long)
     moving = [event for one in player.acts for event in one.events if event.moves]
     if moving and not has_company and not any(event.running for event in moving):
-        return f"no event begins that moves somebody, and nobody is in {own.name}'s lane or crosses it"
-    return "" if meets else f"the scene ends at {player.now:.1f} s, before {own.name} has come near anybody"
+        return (
+            f"no event begins that moves somebody, and nobody is in {own.name}'s lane or crosses it"
+        )
+    return (
+        ""
+        if meets
+        else f"the scene ends at {player.now:.1f} s, before {own.name} has come near anybody"
+    )
 
 
 def _moved(actor: Actor, samples: slice) -> Moved:
-    place = actor.place[samples] + actor.facing[samples] * complex(actor.shape.ahead, actor.shape.left)
+    place = actor.place[samples] + actor.facing[samples] * complex(
+        actor.shape.ahead, actor.shape.left
+    )
     facing = actor.facing[samples]
     speed = actor.speed[samples]
     kept = slice(None)
@@ -159,7 +179,14 @@ def _moved(actor: Actor, samples: slice) -> Moved:
         changes = np.flatnonzero((np.diff(speed) != 0) | (np.diff(facing) != 0) | ~even)
         kept = slice(0, int(changes[-1]) + 2 if len(changes) else 1)
     # not views that keep all samples
-    return Moved(actor.name, actor.shape, place[kept].copy(), facing[kept].copy(), speed[kept].copy(), actor.deleted)
+    return Moved(
+        actor.name,
+        actor.shape,
+        place[kept].copy(),
+        facing[kept].copy(),
+        speed[kept].copy(),
+        actor.deleted,
+    )
 
 
 def _remark(player: Player) -> None:
@@ -172,7 +199,8 @@ def _remark(player: Player) -> None:
     # In lanes to the right of the reference line both readings are the same.
     if beside is not None or any(whole(each, "laneId") > 0 for each in in_lanes):
         player.remark(
-            "an Orientation relative to a lane counts from its driving direction (ASAM allows the road's, too)"
+            "an Orientation relative to a lane counts from its driving direction (ASAM allows the"
+            " road's, too)"
         )
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")

@@ -1,4 +1,6 @@
-"""A storyboard being played, with an Ego that holds its speed: motions are closed forms from one event to the next."""
+"""A storyboard being played, with an Ego that holds its speed: motions are closed forms from one
+event to the next.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,15 @@ from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Running, actors_of
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
-from safevar_sumo.openscenario.document import Document, Element, attribute, number, part, truth, unsupported
+from safevar_sumo.openscenario.document import (
+    Document,
+    Element,
+    attribute,
+    number,
+    part,
+    truth,
+    unsupported,
+)
 from safevar_sumo.openscenario.places import Place, Way, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network
 
@@ -31,13 +41,15 @@ MAX_TURN = 0.01
 
 
 Key = tuple[str, str]
-"""An element in conditions on states: its kind, and its name after those of all around it, joined by `::`."""
+"""An element in conditions on states: its kind, and its name after those of all around it, joined
+by `::`.
+"""
 
 
 @dataclass
 class Event:
-    """An Event (class Event): its kind and path, those of its maneuver, group, act and story, and its actions that go
-    on, by name.
+    """An Event (class Event): its kind and path, those of its maneuver, group, act and story, and
+    its actions that go on, by name.
     """
 
     element: Element
@@ -95,7 +107,8 @@ class Player:
         actors = {actor.name: actor for actor in actors_of(document.root, len(self.times))}
         if ego not in actors:
             raise unsupported(
-                f"no ScenarioObject is named {ego!r}; there are: {', '.join(actors)}", f"ego = {one_of(actors)}"
+                f"no ScenarioObject is named {ego!r}; there are: {', '.join(actors)}",
+                f"ego = {one_of(actors)}",
             )
         self.actors = actors
         self.ego = actors[ego]
@@ -133,7 +146,9 @@ class Player:
     def actor(self, name: str) -> Actor:
         """The entity of this name."""
         if name not in self.actors:
-            raise unsupported(f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}")
+            raise unsupported(
+                f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}"
+            )
         return self.actors[name]
 
     def other(self, element: Element) -> Actor:
@@ -155,9 +170,13 @@ class Player:
 
     def ego_turns(self, facings: Array) -> None:
         """Refuse directions of Ego that differ from the one at the start."""
-        turn = max(turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings))
+        turn = max(
+            turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings)
+        )
         if turn > MAX_TURN:
-            raise unsupported(f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees")
+            raise unsupported(
+                f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees"
+            )
 
     def remark(self, text: str) -> None:
         """Note a remark, once."""
@@ -177,7 +196,10 @@ class Player:
             for maneuver in group.findall("Maneuver"):
                 key = _below(group_key, maneuver)
                 outer = [key, group_key, act_key, story]
-                events += [Event(event, _below(key, event), outer, own) for event in maneuver.findall("Event")]
+                events += [
+                    Event(event, _below(key, event), outer, own)
+                    for event in maneuver.findall("Event")
+                ]
                 self._remark_repeats(group, maneuver)
         act_of_story = Act(element, act_key, events)
         self._refuse_reactions(act_of_story)
@@ -189,19 +211,28 @@ class Player:
             kind, name = (attribute(one, f"storyboardElement{each}") for each in ("Type", "Ref"))
             found = [self._board]
             for each in name.split("::"):
-                found = [inner for outer in found for inner in outer.iter() if inner.get("name") == each]
+                found = [
+                    inner for outer in found for inner in outer.iter() if inner.get("name") == each
+                ]
             if kind.lower() not in [element.tag.lower() for element in found]:
-                raise unsupported(f"{one.tag}: storyboardElementRef = {name!r}", f"the name of a storyboard's {kind}")
+                raise unsupported(
+                    f"{one.tag}: storyboardElementRef = {name!r}",
+                    f"the name of a storyboard's {kind}",
+                )
 
     def _remark_repeats(self, group: Element, maneuver: Element) -> None:
         for one in (group, *maneuver.findall("Event")):
             times = number(one, "maximumExecutionCount", 1)
             if times > 1:
                 kind = "event" if one.tag == "Event" else "group"
-                self.remark(f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times")
+                self.remark(
+                    f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times"
+                )
 
     def _refuse_reactions(self, one: Act) -> None:
-        """Refuse an act that moves somebody and an event that moves somebody, if only a run can begin them."""
+        """Refuse an act that moves somebody and an event that moves somebody, if only a run can
+        begin them.
+        """
         moving = [event.element for event in one.events if event.moves]
         if not moving:
             return
@@ -209,10 +240,15 @@ class Player:
             for kind in watched(self, element.find("StartTrigger")):
                 if kind in REACTIONS:
                     waiting = f"the {element.tag.lower()} {attribute(element, 'name')}"
-                    raise unsupported(f"{waiting} waits for a {kind} of {self.ego.name}, which only a run can tell")
+                    raise unsupported(
+                        f"{waiting} waits for a {kind} of {self.ego.name}, which only a run can"
+                        " tell"
+                    )
 
     def initialise(self) -> None:
-        """Class Init: places first, then speeds, then all others, as the order of the list is none in time."""
+        """Class Init: places first, then speeds, then all others, as the order of the list is none
+        in time.
+        """
         init = self._board.findall("Init/Actions/*")
         privates = [(self.other(one), each) for one in init if one.tag == "Private" for each in one]
         ranks = {name: rank for rank, names in enumerate(INIT_ORDER) for name in names}
@@ -292,10 +328,16 @@ class Player:
         for action in event.element.findall("Action"):
             key = _below(event.key, action)
             self.begun.setdefault(key, self.now)
-            event.running[key] = [running for each in action for running in act(self, each, event.actors)]
+            event.running[key] = [
+                running for each in action for running in act(self, each, event.actors)
+            ]
 
     def _finish(self, event: Event) -> None:
-        done = [key for key, running in event.running.items() if all(one.is_done(self.now) for one in running)]
+        done = [
+            key
+            for key, running in event.running.items()
+            if all(one.is_done(self.now) for one in running)
+        ]
         for key in done:
             self.ended.setdefault(key, self.now)
         if len(done) == len(event.running):
@@ -319,13 +361,19 @@ class Player:
 
     def _note_ego(self, element: Element) -> None:
         for kind in watched(self, element.find("StartTrigger")):
-            self.depends(self.ego, self.now, f"{element.tag} {attribute(element, 'name')}: {kind} of {self.ego.name}")
+            self.depends(
+                self.ego,
+                self.now,
+                f"{element.tag} {attribute(element, 'name')}: {kind} of {self.ego.name}",
+            )
 
     def _next(self, last: int) -> int:
         """The first sample up to the last of a block at which something may begin or end."""
         events = [event for one in self.acts for event in one.events]
         running = chain(*(chain(*event.running.values()) for event in events))
-        ends = [math.ceil((one.end - 1e-9) / STEP) for one in running if self.now < one.end < math.inf]
+        ends = [
+            math.ceil((one.end - 1e-9) / STEP) for one in running if self.now < one.end < math.inf
+        ]
         last = min([last, *(sample for sample in ends if sample > self.sample)])
         window = slice(self.sample + 1, last + 1)
         triggers = [_stop_trigger(self._board)] if math.isinf(self.stop) else []
@@ -333,7 +381,11 @@ class Player:
             if not one.has_begun:
                 triggers.append(one.element.find("StartTrigger"))
             elif not one.has_ended:
-                triggers += [event.element.find("StartTrigger") for event in one.events if not event.has_begun]
+                triggers += [
+                    event.element.find("StartTrigger")
+                    for event in one.events
+                    if not event.has_begun
+                ]
                 triggers.append(_stop_trigger(one.element))
         for trigger in triggers:
             if trigger is not None:
@@ -372,7 +424,8 @@ class Player:
                 legal = f"one that does, if {self.ego.name} keeps its speed"
                 raise unsupported(f"the StopTrigger does not hold within {LONGEST:g} s", legal)
             self.remark(
-                f"the scene ends at {UNSTOPPED:g} s: it has no StopTrigger, or one that waits for {self.ego.name}"
+                f"the scene ends at {UNSTOPPED:g} s: it has no StopTrigger, or one that waits for"
+                f" {self.ego.name}"
             )
 
     def _road_end(self, last: int) -> int:
@@ -385,5 +438,8 @@ class Player:
                 before = self.sample + int(np.argmax(is_beyond))
                 if is_beyond.any() and before < end:
                     end = before
-                    self.remark(f"the scene ends at {self.times[end]:.1f} s, when {name} is at the end of its road")
+                    self.remark(
+                        f"the scene ends at {self.times[end]:.1f} s, when {name} is at the end of"
+                        " its road"
+                    )
         return end

@@ -1,7 +1,7 @@
 """User code: looked up by its name, checked against a contract; `plugins.check` tries it.
 
-`plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below the models, which
-use it.
+`plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below
+the models, which use it.
 """
 
 from safevar_sumo.plugins.contract import (

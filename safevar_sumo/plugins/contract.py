@@ -1,8 +1,10 @@
-"""The contracts of users' classes: the methods that they must have, and what these may return; and errors of user code.
+"""The contracts of users' classes: the methods that they must have, and what these may return; and
+errors of user code.
 
-A user's class is completed with the defaults of its base class, and its methods are replaced by ones that get read-only
-arguments and check what they return. An exception of user code becomes an error with its file and line. What user code
-tells numpy about floating-point errors (`np.seterr`) ends with the call: `np.errstate()` restores it.
+A user's class is completed with the defaults of its base class, and its methods are replaced by
+ones that get read-only arguments and check what they return. An exception of user code becomes an
+error with its file and line. What user code tells numpy about floating-point errors (`np.seterr`)
+ends with the call: `np.errstate()` restores it.
 """
 
 from __future__ import annotations
@@ -19,7 +21,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, UserCodeError, about, describe_error
+from safevar_sumo.errors import (
+    EnvironmentFault,
+    InputError,
+    SimulationError,
+    UserCodeError,
+    about,
+    describe_error,
+)
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import this_process
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
@@ -37,8 +46,8 @@ _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 
 @contextmanager
 def user_errors(source: str) -> Iterator[None]:
-    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors are about the study
-    `source`.
+    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors
+    are about the study `source`.
     """
     with about(source):
         try:
@@ -52,8 +61,13 @@ def user_errors(source: str) -> Iterator[None]:
 
 
 def user_error_of(error: BaseException) -> UserCodeError | None:
-    """The error with the innermost line of user code that raised an exception; None if there is no such line."""
-    frames = [(frame.filename, frame.lineno, frame.name) for frame in traceback.extract_tb(error.__traceback__)]
+    """The error with the innermost line of user code that raised an exception; None if there is no
+    such line.
+    """
+    frames = [
+        (frame.filename, frame.lineno, frame.name)
+        for frame in traceback.extract_tb(error.__traceback__)
+    ]
     if isinstance(error, SyntaxError) and error.filename:
         frames.append((error.filename, error.lineno, "import"))
     for file, line, name in reversed(frames):
@@ -61,7 +75,9 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
             method = name.replace("<module>", "import")
             place = f"{file}:{line}"
             reason, legal = _reason_of(error)
-            return UserCodeError("", f"user code raised in {method}: {reason} ({place})", legal, place)
+            return UserCodeError(
+                "", f"user code raised in {method}: {reason} ({place})", legal, place
+            )
     return None
 
 
@@ -76,7 +92,8 @@ def _reason_of(error: BaseException) -> tuple[str, str]:
 def check_open_runs(are_open: BoolArray) -> Iterator[None]:
     """Within the block, wrong values are ignored unless their run is open, `are_open`, shape (N,).
 
-    A vehicle whose run has ended still moves while others in its batch drive. `are_open` may change during the block.
+    A vehicle whose run has ended still moves while others in its batch drive. `are_open` may change
+    during the block.
     """
     token = _open_runs.set(are_open)
     try:
@@ -88,12 +105,14 @@ def check_open_runs(are_open: BoolArray) -> Iterator[None]:
 def open_rows(holds: BoolArray) -> IntArray:
     """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
     are_open = _open_runs.get()
-    return np.flatnonzero(holds if are_open is None or are_open.shape != holds.shape else holds & are_open)
+    return np.flatnonzero(
+        holds if are_open is None or are_open.shape != holds.shape else holds & are_open
+    )
 
 
 class Legal(NamedTuple):
-    """Legal numbers: from `lowest`, or above it, to `highest`; `infinite` and `undefined` allow infinities and NaN, and
-    `scalar` a number for all vehicles.
+    """Legal numbers: from `lowest`, or above it, to `highest`; `infinite` and `undefined` allow
+    infinities and NaN, and `scalar` a number for all vehicles.
     """
 
     lowest: float = -INFINITY
@@ -121,15 +140,17 @@ FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0
 
 
 class UserCode(NamedTuple):
-    """User code as errors name it: its key and name in the study, such as `ads.model = 'my_ads:Careful'`;
-    and the class, function or record itself.
+    """User code as errors name it: its key and name in the study, such as `ads.model =
+    'my_ads:Careful'`; and the class, function or record itself.
     """
 
     name: str
     target: Any = None
 
     def definition(self, method: str = "") -> str:
-        """File and line at which a method begins, else the class or function; "" for FMUs and compiled code."""
+        """File and line at which a method begins, else the class or function; "" for FMUs and
+        compiled code.
+        """
         target = getattr(self.target, "function", self.target)
         function = inspect.unwrap(getattr(target, method, target))
         try:
@@ -144,7 +165,9 @@ class UserCode(NamedTuple):
         return UserCodeError("", problem, expected, place)
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call an FMU, or what sets attributes of a user's object: exceptions may show no line of user code."""
+        """Call an FMU, or what sets attributes of a user's object: exceptions may show no line of
+        user code.
+        """
         try:
             return function(*arguments)
         except (UserCodeError, KeyboardInterrupt):
@@ -156,7 +179,12 @@ class UserCode(NamedTuple):
             raise UserCodeError("", f"{self.name} raised in {method}: {reason}", legal) from error
 
     def check_numbers(
-        self, method: str, quantity: str, value: UserValue, shape: tuple[int, ...] | None, legal: Legal = FINITE
+        self,
+        method: str,
+        quantity: str,
+        value: UserValue,
+        shape: tuple[int, ...] | None,
+        legal: Legal = FINITE,
     ) -> np.ndarray:
         """A result as an array, after a check of its type, shape and numbers.
 
@@ -180,10 +208,14 @@ class UserCode(NamedTuple):
         return array
 
     def checked_function(
-        self, function: Callable[..., UserValue], method: str, legal: Legal, count: Callable[[Any], int]
+        self,
+        function: Callable[..., UserValue],
+        method: str,
+        legal: Legal,
+        count: Callable[[Any], int],
     ) -> Callable[..., FloatArray]:
-        """A function that gets read-only arguments, and whose result of shape (N,) is checked; `count` returns N of the
-        first argument.
+        """A function that gets read-only arguments, and whose result of shape (N,) is checked;
+        `count` returns N of the first argument.
         """
 
         def checked(*arguments: Any) -> FloatArray:
@@ -203,8 +235,8 @@ class Returned(NamedTuple):
     parts
         The legal numbers of the attributes of each object.
     like
-        Number of the argument whose speeds or pedals have the shape of the attributes, which is passed read-only; None
-        without such an argument: all others are the user's own.
+        Number of the argument whose speeds or pedals have the shape of the attributes, which is
+        passed read-only; None without such an argument: all others are the user's own.
     then
         A further check with the arguments of this one; its result takes the result's place.
     """
@@ -213,18 +245,28 @@ class Returned(NamedTuple):
     like: int | None = None
     then: Callable[..., UserValue] | None = None
 
-    def check(self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]) -> UserValue:
+    def check(
+        self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]
+    ) -> UserValue:
         """The result after the check."""
         values = (result,) if len(self.parts) <= 1 else result
-        if len(self.parts) > 1 and not (isinstance(result, tuple | list) and len(result) == len(self.parts)):
+        if len(self.parts) > 1 and not (
+            isinstance(result, tuple | list) and len(result) == len(self.parts)
+        ):
             names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
             raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
         shape = None if self.like is None or not self.parts else _shape_of(arguments[self.like])
         for columns, value in zip(self.parts, values, strict=False):
             for name, legal in columns.items():
                 if name and not hasattr(value, name):
-                    raise code.wrong(method, quoted(result), f"an object with the attributes {', '.join(columns)}")
-                code.check_numbers(method, name or "values", getattr(value, name) if name else value, shape, legal)
+                    raise code.wrong(
+                        method,
+                        quoted(result),
+                        f"an object with the attributes {', '.join(columns)}",
+                    )
+                code.check_numbers(
+                    method, name or "values", getattr(value, name) if name else value, shape, legal
+                )
         return result if self.then is None else self.then(code, method, result, *arguments)
 
 
@@ -236,14 +278,17 @@ def _shape_of(argument: Any) -> tuple[int, ...]:
 
 
 def checked_class(code: UserCode, base: type) -> type:
-    """The user's class with the defaults of a base class for members that it lacks, and with checks of what those
-    methods return that the base has in its `RETURNS`.
+    """The user's class with the defaults of a base class for members that it lacks, and with checks
+    of what those methods return that the base has in its `RETURNS`.
     """
     candidate = code.target
 
     def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
         def method(self: Any, *arguments: Any) -> UserValue:
-            passed = [read_only(value) if i == returned.like else value for i, value in enumerate(arguments)]
+            passed = [
+                read_only(value) if i == returned.like else value
+                for i, value in enumerate(arguments)
+            ]
             with np.errstate():
                 result = getattr(super(cls, self), name)(*passed)
             is_optional = returned.then is None and not hasattr(getattr(base, name), ABSTRACT)
@@ -260,16 +305,19 @@ def checked_class(code: UserCode, base: type) -> type:
     }
     bases = (candidate,) if issubclass(candidate, base) else (candidate, base)
     cls = types.new_class(
-        candidate.__name__, bases, exec_body=lambda namespace: namespace.update(methods, is_user_code=True)
+        candidate.__name__,
+        bases,
+        exec_body=lambda namespace: namespace.update(methods, is_user_code=True),
     )
     return cls
 
 
 def violation(candidate: Any, base: type) -> str:
-    """The reason why a class does not meet the contract of a base class, found by inspection only; "" if it does.
+    """The reason why a class does not meet the contract of a base class, found by inspection only;
+    "" if it does.
 
-    The abstract methods of the base must exist, and every method of the base must take the parameters that it takes
-    there. The class need not derive from the base.
+    The abstract methods of the base must exist, and every method of the base must take the
+    parameters that it takes there. The class need not derive from the base.
     """
     if not inspect.isclass(candidate):
         return f"is a {type(candidate).__name__}, not a class"
@@ -279,7 +327,9 @@ def violation(candidate: Any, base: type) -> str:
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
         # A static or class method takes no `self`.
-        takes_self = inspect.isfunction(inspect.getattr_static(candidate, name, getattr(base, name)))
+        takes_self = inspect.isfunction(
+            inspect.getattr_static(candidate, name, getattr(base, name))
+        )
         try:
             inspect.signature(attribute).bind(*[None] * (takes_self + len(parameters)))
         except TypeError:
@@ -294,11 +344,16 @@ def contract_of(base: type) -> str:
         for name, parameters in _methods(base).items()
         if hasattr(getattr(base, name), ABSTRACT)
     ]
-    return f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with {', '.join(methods)}"
+    return (
+        f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with"
+        f" {', '.join(methods)}"
+    )
 
 
 def _methods(base: type) -> dict[str, list[str]]:
-    """The public methods of a class, and the names of their parameters without default and without `self`."""
+    """The public methods of a class, and the names of their parameters without default and without
+    `self`.
+    """
     return {
         name: [
             parameter.name
@@ -320,7 +375,9 @@ def read_only(value: UserValue) -> Any:
         views = map(read_only, value)
         return type(value)(*views) if hasattr(value, "_fields") else tuple(views)
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)})
+        return replace(
+            value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)}
+        )
     if isinstance(value, Mapping):
         return MappingProxyType({key: read_only(inner) for key, inner in value.items()})
     return _ReadOnlyWorld(value) if hasattr(value, "speeds") else value

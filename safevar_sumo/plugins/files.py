@@ -1,5 +1,5 @@
-"""The user's files on which results depend, by names that are the same on every machine: code, and the data files that
-a study names.
+"""The user's files on which results depend, by names that are the same on every machine: code, and
+the data files that a study names.
 """
 
 from __future__ import annotations
@@ -25,19 +25,26 @@ LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
 KNOWN_FOLDERS = tuple(
     f"{folder}{os.sep}"
-    for folder in (PACKAGE, *map(sysconfig.get_path, ("stdlib", "platstdlib")), Path(sys.base_prefix, "DLLs"))
+    for folder in (
+        PACKAGE,
+        *map(sysconfig.get_path, ("stdlib", "platstdlib")),
+        Path(sys.base_prefix, "DLLs"),
+    )
 )
 """The folders of this package and of the interpreter."""
 
 
 def is_user_file(path: str) -> bool:
-    """Whether a file belongs neither to the interpreter, nor to an installed library, nor to this package."""
+    """Whether a file belongs neither to the interpreter, nor to an installed library, nor to this
+    package.
+    """
     is_in_library = any(name in Path(path).parts for name in LIBRARY_FOLDERS)
     return os.path.isabs(path) and not path.startswith(KNOWN_FOLDERS) and not is_in_library
 
 
 def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
-    """The files of user code: of the `modules`, wherever they are, and of all that they import in the study's folders.
+    """The files of user code: of the `modules`, wherever they are, and of all that they import in
+    the study's folders.
 
     A module is a file; of a package every file counts.
     """
@@ -51,15 +58,21 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
         if name in known:
             continue
         known.add(name)
-        found = next(filter(None, (_files_of_module(Path(folder, name)) for folder in search_path)), set())
+        found = next(
+            filter(None, (_files_of_module(Path(folder, name)) for folder in search_path)), set()
+        )
         paths |= found
-        imported = (other for path in found if path.suffix == ".py" for other in _imported_modules(path))
+        imported = (
+            other for path in found if path.suffix == ".py" for other in _imported_modules(path)
+        )
         waiting += [(other, own_folders) for other in imported]
     return paths
 
 
 def _files_of_module(path: Path) -> set[Path]:
-    """The file of a module, or every file of a package, whose path has no ending; empty if there is none."""
+    """The file of a module, or every file of a package, whose path has no ending; empty if there is
+    none.
+    """
     if path.with_suffix(".py").is_file():
         return {path.with_suffix(".py")}
     return set(files_in(path)) if any(path.rglob("*.py")) else set()
@@ -78,7 +91,11 @@ def files_in(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     files = (file for file in path.rglob("*") if file.is_file())
-    return [file for file in files if not any(part[0] == "." or part == CACHE for part in file.relative_to(path).parts)]
+    return [
+        file
+        for file in files
+        if not any(part[0] == "." or part == CACHE for part in file.relative_to(path).parts)
+    ]
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
@@ -90,7 +107,10 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
         The folders of the study's file and of the files that it extends.
     """
     named = {name_of_file(Path(os.path.abspath(path)), folders): path for path in paths}
-    return {name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH] for name, path in sorted(named.items())}
+    return {
+        name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
+        for name, path in sorted(named.items())
+    }
 
 
 def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
@@ -100,7 +120,9 @@ def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
 
 def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """A file's path relative to the first folder that contains it; its whole path if none does."""
-    folder = next((folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor)
+    folder = next(
+        (folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor
+    )
     return path.relative_to(folder).as_posix() if folder != path.anchor else path.as_posix()
 
 

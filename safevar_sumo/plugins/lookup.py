@@ -1,7 +1,7 @@
 """Turns a name in a study into a class, function or record.
 
-The name belongs to this package, or is `package.module:Name` of a module beside the study, in the working directory or
-installed.
+The name belongs to this package, or is `package.module:Name` of a module beside the study, in the
+working directory or installed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,24 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError, UserCodeError, check_name, describe_error, did_you_mean, one_of, subject
+from safevar_sumo.errors import (
+    InputError,
+    UserCodeError,
+    check_name,
+    describe_error,
+    did_you_mean,
+    one_of,
+    subject,
+)
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins.contract import UserCode, checked_class, contract_of, user_error_of, user_errors, violation
+from safevar_sumo.plugins.contract import (
+    UserCode,
+    checked_class,
+    contract_of,
+    user_error_of,
+    user_errors,
+    violation,
+)
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import file_of_module, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
@@ -32,8 +47,8 @@ A_DAY = 86_400.0
 
 
 class Member(NamedTuple):
-    """The class or record that a name in a study stands for; `code` is how errors name it if it is user code, else
-    None; `time_limit` is that of its `__init__` [s].
+    """The class or record that a name in a study stands for; `code` is how errors name it if it is
+    user code, else None; `time_limit` is that of its `__init__` [s].
     """
 
     target: Any
@@ -44,13 +59,16 @@ class Member(NamedTuple):
 class Lookup:
     """Looks up the names of a study, each class once.
 
-    `folders`, searched before the working directory, are those of the study's file and of the files that it extends;
-    `files` are the paths of its data files by the names that it gives them; `time_limit` is that of the import of user
-    code [s].
+    `folders`, searched before the working directory, are those of the study's file and of the files
+    that it extends; `files` are the paths of its data files by the names that it gives them;
+    `time_limit` is that of the import of user code [s].
     """
 
     def __init__(
-        self, folders: Sequence[str] = (), files: Mapping[str, str] = MappingProxyType({}), time_limit: float = A_DAY
+        self,
+        folders: Sequence[str] = (),
+        files: Mapping[str, str] = MappingProxyType({}),
+        time_limit: float = A_DAY,
     ) -> None:
         self._time_limit = time_limit
         self.folders = folders
@@ -63,7 +81,8 @@ class Lookup:
         return cls(study.origin.places, data_files(study), study.search.time_limit)
 
     def find(self, shipped: Mapping[str, Any], name: str, key: str) -> Member:
-        """The object called `name` among the `shipped` ones, or the object that `package.module:Name` names.
+        """The object called `name` among the `shipped` ones, or the object that
+        `package.module:Name` names.
 
         Raises
         ------
@@ -74,12 +93,20 @@ class Lookup:
         """
         if name in shipped:
             return Member(shipped[name])
-        expected = f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
+        expected = (
+            f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
+        )
         module_name, colon, attribute = name.partition(":")
         if colon and module_name.endswith(".py"):
             dotted = module_name.removesuffix(".py").replace("/", ".")
-            raise InputError("", f"{key} = {name!r} names a file", f"its module: '{dotted}:{attribute}'")
-        if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
+            raise InputError(
+                "", f"{key} = {name!r} names a file", f"its module: '{dotted}:{attribute}'"
+            )
+        if not (
+            colon
+            and attribute.isidentifier()
+            and all(part.isidentifier() for part in module_name.split("."))
+        ):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
@@ -87,13 +114,18 @@ class Lookup:
         try:
             target = getattr(module, attribute)
         except AttributeError:
-            problem = f"{code.name} cannot be imported: {file_of_module(module_name)} has no {attribute!r}"
+            problem = (
+                f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
+                f" {attribute!r}"
+            )
             raise InputError("", problem, expected) from None
         return Member(target, code._replace(target=target), self._time_limit)
 
-    def class_of(self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = "") -> Member:
-        """A class by name; a user's class must meet the contract of the first base that it derives from, else of that
-        which it meets, else of the last one.
+    def class_of(
+        self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = ""
+    ) -> Member:
+        """A class by name; a user's class must meet the contract of the first base that it derives
+        from, else of that which it meets, else of the last one.
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
@@ -103,20 +135,28 @@ class Lookup:
         if member.code is None:
             return member
         base = next((base for base in bases if _derives(member.target, base)), None)
-        base = base or next((base for base in bases if not violation(member.target, base)), bases[-1])
+        base = base or next(
+            (base for base in bases if not violation(member.target, base)), bases[-1]
+        )
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
-            raise UserCodeError("", f"{member.code.name} {reason}", expected, member.code.definition())
-        member = self._classes[name, bases] = member._replace(target=checked_class(member.code, base))
+            raise UserCodeError(
+                "", f"{member.code.name} {reason}", expected, member.code.definition()
+            )
+        member = self._classes[name, bases] = member._replace(
+            target=checked_class(member.code, base)
+        )
         return member
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
-        """Parameters of a member; for user code, the names of the study's data files become absolute paths.
+        """Parameters of a member; for user code, the names of the study's data files become
+        absolute paths.
 
         Raises
         ------
         InputError
-            If a text names a file that is none of the data files: results would depend on it unnoticed.
+            If a text names a file that is none of the data files: results would depend on it
+            unnoticed.
         """
         return dict(parameters) if member.code is None else self._with_paths(parameters, key)
 
@@ -143,11 +183,18 @@ class Lookup:
         dont_write_bytecode = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
         try:
-            with user_errors(subject()), np.errstate(), end_if_longer(self._time_limit, f"the import of {name}"):
+            with (
+                user_errors(subject()),
+                np.errstate(),
+                end_if_longer(self._time_limit, f"the import of {name}"),
+            ):
                 return importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
-            expected = getattr(error, "legal", "") or f"a module in {' or '.join(folders)}, or an installed one"
+            expected = (
+                getattr(error, "legal", "")
+                or f"a module in {' or '.join(folders)}, or an installed one"
+            )
             raise UserCodeError("", f"{key} cannot be imported: {problem}", expected) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
@@ -167,8 +214,8 @@ def unload_user_modules() -> None:
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory. The folders come directly before the working
-    directory on Python's path: what is listed before it keeps precedence.
+    """Let modules import from `folders` and the working directory. The folders come directly before
+    the working directory on Python's path: what is listed before it keeps precedence.
     """
     sys.path[:] = [folder for folder in sys.path if folder not in this_process.added_folders]
     added = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
@@ -196,8 +243,9 @@ class ImportPath(NamedTuple):
 
 @contextmanager
 def only_from(folder: str) -> Iterator[None]:
-    """Within the block, also in processes that start in it, user code and files that it names without their folder are
-    those of one folder, the working directory; only libraries are imported from elsewhere.
+    """Within the block, also in processes that start in it, user code and files that it names
+    without their folder are those of one folder, the working directory; only libraries are imported
+    from elsewhere.
     """
     place = os.getcwd()
     path = ImportPath.here()
@@ -250,4 +298,6 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         except TypeError as error:
             if user_error_of(error):
                 raise
-            raise InputError("", f"{name} does not take {key} = {dict(parameters)}: {error}") from None
+            raise InputError(
+                "", f"{name} does not take {key} = {dict(parameters)}: {error}"
+            ) from None

@@ -1,5 +1,5 @@
-"""User code in this process: what it has changed here, and what it uses though its text may not tell: modules imported
-by computed names, and files that it opens.
+"""User code in this process: what it has changed here, and what it uses though its text may not
+tell: modules imported by computed names, and files that it opens.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ this_process = _Process()
 
 
 class Use(NamedTuple):
-    """What user code has used: digests of the modules in its folders by name, and names of the files that it has
-    opened.
+    """What user code has used: digests of the modules in its folders by name, and names of the
+    files that it has opened.
     """
 
     modules: Files
@@ -68,8 +68,8 @@ class Use(NamedTuple):
 def record_use(folders: Sequence[str]) -> Iterator[Use]:
     """Record what user code uses within the block: the record is complete at its end.
 
-    `folders` are those of the study's file and of the files that it extends; modules count from there and from the
-    working directory.
+    `folders` are those of the study's file and of the files that it extends; modules count from
+    there and from the working directory.
     """
     if not this_process.is_listening:
         sys.addaudithook(_listen)  # for the life of this process
@@ -84,15 +84,21 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
     loaded = sys.modules.keys() - before
     this_process.modules |= loaded
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
-    files = {file for file in map(file_of_module, loaded) if is_user_file(file) and file.startswith(tuple(own_folders))}
+    files = {
+        file
+        for file in map(file_of_module, loaded)
+        if is_user_file(file) and file.startswith(tuple(own_folders))
+    }
     use.modules.update(digests((Path(file) for file in files if os.path.isfile(file)), folders))
     data = (path for path in opened - files if os.path.isfile(path) and not path.endswith(".pyc"))
-    use.opened.extend(sorted(name_of_file(Path(path), folders) for path in data if is_user_file(path)))
+    use.opened.extend(
+        sorted(name_of_file(Path(path), folders) for path in data if is_user_file(path))
+    )
 
 
 def file_of_module(name: str) -> str:
-    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module of the
-    interpreter.
+    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module
+    of the interpreter.
     """
     module = sys.modules.get(name)
     return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))

@@ -1,6 +1,8 @@
-"""The time limit of a simulation, and of the import and `__init__` of user code: what takes longer counts as hung.
+"""The time limit of a simulation, and of the import and `__init__` of user code: what takes longer
+counts as hung.
 
-It ends a worker, whose pool reports where it was; in any other process, where the system has timers, it is an error.
+It ends a worker, whose pool reports where it was; in any other process, where the system has
+timers, it is an error.
 """
 
 from __future__ import annotations
@@ -27,8 +29,9 @@ class _TimeIsUp(KeyboardInterrupt):
 
 @contextmanager
 def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[None]:
-    """End this process, if it is a worker, when the context takes longer than a time limit [s]; raise an error, which
-    names it by `what`, in the main thread of any other process. Within such a context another one has no effect.
+    """End this process, if it is a worker, when the context takes longer than a time limit [s];
+    raise an error, which names it by `what`, in the main thread of any other process. Within such a
+    context another one has no effect.
 
     Raises
     ------
@@ -37,7 +40,9 @@ def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[Non
     SimulationError
         If no user code did.
     """
-    has_timer = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    has_timer = (
+        hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    )
     words = this_process.last_words
     if this_process.is_limited or not (has_timer or words is not None):
         yield
@@ -67,7 +72,9 @@ def _raise_error(time_limit: float, what: str) -> Iterator[None]:
             if is_user_file(frame.f_code.co_filename):
                 place = f"{frame.f_code.co_filename}:{frame.f_lineno}"
                 legal = "code that ends, or more time"
-                raise _TimeIsUp(UserCodeError("search.time_limit", f"{problem} ({place})", legal, place))
+                raise _TimeIsUp(
+                    UserCodeError("search.time_limit", f"{problem} ({place})", legal, place)
+                )
             frame = frame.f_back
         raise _TimeIsUp(SimulationError(f"{problem}, search.time_limit"))
 

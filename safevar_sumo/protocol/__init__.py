@@ -1,4 +1,6 @@
-"""Euro NCAP's crash avoidance protocol as data: matrices, colours, and the computation of points."""
+"""Euro NCAP's crash avoidance protocol as data: matrices, colours, and the computation of
+points.
+"""
 
 from safevar_sumo.protocol.cells import (
     COLOURS as COLOURS,

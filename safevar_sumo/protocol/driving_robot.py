@@ -1,4 +1,6 @@
-"""The robot that holds the speed of a test until the system under test acts, as in Euro NCAP's tests."""
+"""The robot that holds the speed of a test until the system under test acts, as in Euro NCAP's
+tests.
+"""
 
 from __future__ import annotations
 
@@ -13,45 +15,58 @@ from safevar_sumo.vehicles import Vehicle, VehicleState
 from safevar_sumo.vehicles.base import Prepared, State
 
 MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
-"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB test protocols, "test
-execution").
+"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB
+test protocols, "test execution").
 """
 PROPORTIONAL_GAIN, INTEGRAL_GAIN = 1.0, 1.0
-"""Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s after a pedal error of
-0.15.
+"""Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s
+after a pedal error of 0.15.
 """
 ACTION_THRESHOLD = 0.03
-"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset of an AEB by Euro
-NCAP.
+"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset
+of an AEB by Euro NCAP.
 """
 
 
 class DrivingRobot:
-    """Holds N vehicles at the speeds of their tests, by accelerator and brake and in their initial gear.
+    """Holds N vehicles at the speeds of their tests, by accelerator and brake and in their initial
+    gear.
 
-    The robot drives as long as the system under test neither brakes nor eases off an accelerator that the system had
-    pressed. Once the system has braked, it controls the vehicle and its automatic gearbox. Euro NCAP (AEB car-to-car,
-    "test execution") requires a steady speed and allows a cruise control; an automatic gearbox is in D, a manual one in
-    the highest gear of at least 1,500 r/min. The robot holds the gear, since a gearbox that hunts between two gears
-    would not keep the speed steady.
+    The robot drives as long as the system under test neither brakes nor eases off an accelerator
+    that the system had pressed. Once the system has braked, it controls the vehicle and its
+    automatic gearbox. Euro NCAP (AEB car-to-car, "test execution") requires a steady speed and
+    allows a cruise control; an automatic gearbox is in D, a manual one in the highest gear of at
+    least 1,500 r/min. The robot holds the gear, since a gearbox that hunts between two gears would
+    not keep the speed steady.
 
     Parameters
     ----------
     points
-        Scenario points, each with an equal part of the vehicles; the robot drives only where the scenario has a
-        `test_speed`.
+        Scenario points, each with an equal part of the vehicles; the robot drives only where the
+        scenario has a `test_speed`.
     vehicle, prepared, state
-        The vehicle model, its prepared settings, and the state at the start; the pedals in this state hold the speed.
+        The vehicle model, its prepared settings, and the state at the start; the pedals in this
+        state hold the speed.
     step
         Time between two commands [s].
     """
 
     def __init__(
-        self, points: Sequence[Point], vehicle: Vehicle, prepared: Prepared, state: VehicleState, step: float
+        self,
+        points: Sequence[Point],
+        vehicle: Vehicle,
+        prepared: Prepared,
+        state: VehicleState,
+        step: float,
     ) -> None:
         n = len(state.speed)
-        speeds = [np.nan if speed is None else speed for speed in (point.scenario.test_speed for point in points)]
-        self._test_speed = np.concatenate([np.broadcast_to(speed, n // len(points)) for speed in speeds])
+        speeds = [
+            np.nan if speed is None else speed
+            for speed in (point.scenario.test_speed for point in points)
+        ]
+        self._test_speed = np.concatenate(
+            [np.broadcast_to(speed, n // len(points)) for speed in speeds]
+        )
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
@@ -65,8 +80,8 @@ class DrivingRobot:
         self._has_braked = ~self.has_test_speed
         self._max_system_pedal = np.full(n, -np.inf)
         self.error = np.where(self.has_test_speed, 0.0, np.nan)
-        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the robot drove; NaN
-        without a test.
+        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the
+        robot drove; NaN without a test.
         """
         self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
         self._depends_until = np.concatenate(
@@ -74,13 +89,16 @@ class DrivingRobot:
         )
         self._sample = 0
         self.acted_early = np.full(n, np.nan)
-        """Times at which systems act before motions no longer depend on the vehicle [s]; NaN for all others."""
+        """Times at which systems act before motions no longer depend on the vehicle [s]; NaN for
+        all others.
+        """
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
-        """The command of the robot while it drives, otherwise of the system; and the state, with the gear held while
-        the robot drives.
+        """The command of the robot while it drives, otherwise of the system; and the state, with
+        the gear held while the robot drives.
 
-        `is_open` marks the runs that are not over; the speeds of other runs are not compared with the tolerance.
+        `is_open` marks the runs that are not over; the speeds of other runs are not compared with
+        the tolerance.
         """
         if not self._is_needed:
             return command, state
@@ -98,7 +116,9 @@ class DrivingRobot:
         )
         time = self._sample * self._step
         self._sample = self._sample + 1
-        acts = is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
+        acts = (
+            is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
+        )
         np.copyto(self.acted_early, time, where=acts)
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(
@@ -113,5 +133,7 @@ class DrivingRobot:
 
     @property
     def invalid(self) -> BoolArray:
-        """Which vehicles left the tolerance before the system acted, or acted too early; shape (N,)."""
+        """Which vehicles left the tolerance before the system acted, or acted too early; shape
+        (N,).
+        """
         return np.asarray((self._error_share > 1) | ~np.isnan(self.acted_early))

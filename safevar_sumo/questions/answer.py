@@ -1,4 +1,6 @@
-"""What every question returns: a verdict, numbers and tables; and the one renderer of them in every format."""
+"""What every question returns: a verdict, numbers and tables; and the one renderer of them in every
+format.
+"""
 
 from __future__ import annotations
 
@@ -56,16 +58,19 @@ NOTHING: Mapping[str, list[str]] = {}
 
 
 class Contents(NamedTuple):
-    """The names of an answer's numbers, and of the columns of its tables; `...` among them stands for names that a
-    study gives, such as its metrics, and `{by}` for the name in a value NAME=... of the option `by`.
+    """The names of an answer's numbers, and of the columns of its tables; `...` among them stands
+    for names that a study gives, such as its metrics, and `{by}` for the name in a value NAME=...
+    of the option `by`.
     """
 
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
 
-    def with_options(self, values: Mapping[str, Any], given: Mapping[str, list[str]] = NOTHING) -> Contents:
-        """The names that an answer has with these values of options, `NAME` for an option that has none, and those that
-        a study has `given`, by table; of numbers under "".
+    def with_options(
+        self, values: Mapping[str, Any], given: Mapping[str, list[str]] = NOTHING
+    ) -> Contents:
+        """The names that an answer has with these values of options, `NAME` for an option that has
+        none, and those that a study has `given`, by table; of numbers under "".
         """
         named = defaultdict(lambda: "NAME")
         for option, text in values.items():
@@ -74,7 +79,11 @@ class Contents(NamedTuple):
         tables = {"": self.numbers, **self.tables}
         for table, names in tables.items():
             of_study = given.get(table, [...])
-            tables[table] = [one for name in names for one in (of_study if name is ... else [name.format_map(named)])]
+            tables[table] = [
+                one
+                for name in names
+                for one in (of_study if name is ... else [name.format_map(named)])
+            ]
         return Contents(tables.pop(""), tables)
 
     def check_table(self, name: str) -> None:
@@ -87,7 +96,9 @@ class Contents(NamedTuple):
         names = self.numbers
         wanted = key
         legal = [number for number in self.numbers if number != ...]
-        legal += [f"{table}.COLUMN" for table in self.tables]  # the columns of all tables would fill the screen
+        legal += [
+            f"{table}.COLUMN" for table in self.tables
+        ]  # the columns of all tables would fill the screen
         if name in self.tables:
             names = self.tables[name]
             wanted = rest
@@ -101,15 +112,21 @@ class Contents(NamedTuple):
     @property
     def keys(self) -> list[str]:
         """All names of numbers, and `table.column`, without those that a study gives."""
-        columns = [f"{table}.{name}" for table, names in self.tables.items() for name in names if name != ...]
+        columns = [
+            f"{table}.{name}"
+            for table, names in self.tables.items()
+            for name in names
+            if name != ...
+        ]
         return [*(name for name in self.numbers if name != ...), *columns]
 
 
 def contents(
     *numbers: str | EllipsisType, **tables: Collection[str | EllipsisType]
 ) -> Callable[[AnswerFunction], AnswerFunction]:
-    """Decorator: declares the names of all numbers that a function's answers may hold, and of the columns of their
-    tables, so that its command refuses others before anything is computed. `driven` is among the numbers.
+    """Decorator: declares the names of all numbers that a function's answers may hold, and of the
+    columns of their tables, so that its command refuses others before anything is computed.
+    `driven` is among the numbers.
     """
 
     def declare(function: AnswerFunction) -> AnswerFunction:
@@ -141,7 +158,8 @@ class Answer:
     tables
         Frames by name, made by `tabulate`.
     failures
-        Sentences that say which of the user's limits are not kept; the command then ends with exit code 3.
+        Sentences that say which of the user's limits are not kept; the command then ends with exit
+        code 3.
     folded
         Names of tables that readers see only if they ask for them; JSON and CSV have all.
     command
@@ -161,17 +179,23 @@ class Answer:
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
     def to_dict(self) -> JsonObject:
-        """Plain values: question, study, verdict, numbers, and of each table its columns and rows; null where
-        undefined.
+        """Plain values: question, study, verdict, numbers, and of each table its columns and rows;
+        null where undefined.
         """
         tables = {}
         for name, frame in self.tables.items():
             columns = columns_of(frame).items()
             tables[name] = {
-                "columns": {key: {"unit": column.unit, "meaning": column.meaning} for key, column in columns},
+                "columns": {
+                    key: {"unit": column.unit, "meaning": column.meaning} for key, column in columns
+                },
                 "rows": [plain(row) for row in frame.to_dict("records")],
             }
-        head = {"question": self.question, "study": getattr(self.study, "name", None), "verdict": self.verdict}
+        head = {
+            "question": self.question,
+            "study": getattr(self.study, "name", None),
+            "verdict": self.verdict,
+        }
         return {**head, "numbers": plain(self.numbers), "tables": tables}
 
     def table(self, name: str | None = None) -> pd.DataFrame:
@@ -198,12 +222,16 @@ class Answer:
         tables = {name: self.table(name)}
         remarks = self.tables.get("remarks")
         if remarks is not None:
-            is_about_it = remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
+            is_about_it = (
+                remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
+            )
             tables["remarks"] = remarks[is_about_it]
         return replace(self, tables=tables, folded=())
 
     def render(self, form: str, table: str | None = None) -> str:
-        """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default the first, as CSV."""
+        """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default
+        the first, as CSV.
+        """
         if form == "csv":
             return self.table(table).map(csv_cell).to_csv(index=False, lineterminator="\n")
         if table is not None:
@@ -213,14 +241,19 @@ class Answer:
         if form == "latex":
             shown = self._short_tables
             remarks = shown.pop("remarks", None)
-            parts = [LATEX_PREAMBLE, *(latex_table(self._label_of(name), frame) for name, frame in shown.items())]
+            parts = [
+                LATEX_PREAMBLE,
+                *(latex_table(self._label_of(name), frame) for name, frame in shown.items()),
+            ]
             parts += [] if remarks is None else [latex_notes(remarks)]
             return "\n".join(parts)
         if form == "html":
             first, *later = map(escape, SENTENCE_END.split(self.verdict))
             verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])
             others = [f"<p>{escape(self._other_tables)}</p>"] if self._other_tables else []
-            return "\n".join([f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others])
+            return "\n".join(
+                [f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others]
+            )
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
             self.print(console)
@@ -238,26 +271,41 @@ class Answer:
         if self._other_tables:
             print_text(console, self._other_tables)
         if self.study is not None:  # `list` has checked nothing
-            print_text(console, "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()))
+            print_text(
+                console,
+                "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()),
+            )
 
     @property
     def _reader_tables(self) -> dict[str, pd.DataFrame]:
-        """The tables that readers see, by name; without remarks on others, and without a table of no remark."""
+        """The tables that readers see, by name; without remarks on others, and without a table of
+        no remark.
+        """
         shown = {name: frame for name, frame in self.tables.items() if name not in self.folded}
         remarks = shown.pop("remarks", None)
         if remarks is not None:
             about = remarks[~remarks["table"].isin(self.folded)] if "table" in remarks else remarks
             shown |= {} if about.empty else {"remarks": about}
-        return {label: part for name, frame in shown.items() for label, part in reader_tables(name, frame)}
+        return {
+            label: part
+            for name, frame in shown.items()
+            for label, part in reader_tables(name, frame)
+        }
 
     @property
     def _short_tables(self) -> dict[str, pd.DataFrame]:
-        return {name: frame for name, frame in self._reader_tables.items() if len(frame) <= MAX_ROWS}
+        return {
+            name: frame for name, frame in self._reader_tables.items() if len(frame) <= MAX_ROWS
+        }
 
     @property
     def _other_tables(self) -> str:
         """The tables that readers do not see, in sentences."""
-        long = [f"{name} ({len(frame):,} rows)" for name, frame in self._reader_tables.items() if len(frame) > MAX_ROWS]
+        long = [
+            f"{name} ({len(frame):,} rows)"
+            for name, frame in self._reader_tables.items()
+            if len(frame) > MAX_ROWS
+        ]
         sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
         folded = [name for name in self.folded if len(self.tables.get(name, ()))]
         by_all = "" if self.question == "study" else "--all, or "
@@ -265,9 +313,12 @@ class Answer:
         return " ".join(sentences)
 
     def _label_of(self, table: str) -> str:
-        """The label of a table in LaTeX, which tables of other studies, questions and commands do not have."""
+        """The label of a table in LaTeX, which tables of other studies, questions and commands do
+        not have.
+        """
         digest = f"-{zlib.crc32(self.command.encode()) % 0x10000:04x}" if self.command else ""
-        return f"{getattr(self.study, 'name', 'safevar')}-{self.question.replace(':', '-')}-{table}{digest}"
+        study = getattr(self.study, "name", "safevar")
+        return f"{study}-{self.question.replace(':', '-')}-{table}{digest}"
 
     def _repr_html_(self) -> str:
         return self.render("html")
@@ -280,15 +331,17 @@ class Answer:
         return (self.draw or _draw_intervals)(self)
 
     def values(self, key: str) -> list[Any]:
-        """The numbers under a key: a number's name, with an index if it is a list (`interval.1`), or
-        `table.column`, a value for each row.
+        """The numbers under a key: a number's name, with an index if it is a list (`interval.1`),
+        or `table.column`, a value for each row.
 
         Raises
         ------
         InputError
             If there is no such number.
         """
-        Contents(self.numbers, {name: [*map(str, frame)] for name, frame in self.tables.items()}).check_key(key)
+        Contents(
+            self.numbers, {name: [*map(str, frame)] for name, frame in self.tables.items()}
+        ).check_key(key)
         name, _, rest = key.rpartition(".")
         if name in self.tables:
             return list(plain(self.tables[name][rest].tolist()))
@@ -296,7 +349,9 @@ class Answer:
             return [self.numbers[key]]
         value = self.numbers[name]
         if not (isinstance(value, list | tuple) and int(rest) < len(value)):
-            raise InputError("fail_if", f"the answer has no number {key!r}", f"{name}, which is {text_of(value)}")
+            raise InputError(
+                "fail_if", f"the answer has no number {key!r}", f"{name}, which is {text_of(value)}"
+            )
         return [value[int(rest)]]
 
 
@@ -305,7 +360,9 @@ def _draw_intervals(answer: Answer) -> Figure:
     from safevar_sumo.questions.figures import BLUE, FONT_SIZE, escape_dollars, new_figure
 
     frame = answer.table()
-    names = [name for name in map(str, frame) if f"{name}{LOW}" in frame and frame[name].notna().any()]
+    names = [
+        name for name in map(str, frame) if f"{name}{LOW}" in frame and frame[name].notna().any()
+    ]
     if not names or frame.empty:
         raise InputError("plot", "the answer has nothing to draw", "the answer as a table")
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
@@ -313,7 +370,15 @@ def _draw_intervals(answer: Answer) -> Figure:
     places = range(len(frame), 0, -1)
     for axis, name in zip(axes[0], names, strict=True):
         value, low, high = (frame[f"{name}{end}"].to_numpy(float) for end in ("", LOW, HIGH))
-        axis.errorbar(value, places, xerr=[value - low, high - value], fmt="o", color=BLUE, capsize=2, markersize=4)
+        axis.errorbar(
+            value,
+            places,
+            xerr=[value - low, high - value],
+            fmt="o",
+            color=BLUE,
+            capsize=2,
+            markersize=4,
+        )
         axis.set_xlabel(escape_dollars(name.replace("_", " ")))
     labels = [escape_dollars(str(label)) for label in frame.iloc[:, 0]]
     axes[0][0].set_yticks(places, labels, fontsize=FONT_SIZE - 1)

@@ -1,7 +1,8 @@
-"""Every question is one function `(subject, evaluator, *, options) -> Answer`; here it becomes a call of the library.
+"""Every question is one function `(subject, evaluator, *, options) -> Answer`; here it becomes a
+call of the library.
 
-The command line makes its command from the same signature and docstring (`cli/command.py`), as of every other public
-function.
+The command line makes its command from the same signature and docstring (`cli/command.py`), as of
+every other public function.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         before, between = ("between", "and") if self.is_open else ("from", "to")
-        ends = [f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)]
+        ends = [
+            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)
+        ]
         return f"{before} {ends[0]} {between} {ends[1]}"
 
 
@@ -66,9 +69,9 @@ Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""
 CRITERION = '"METRIC < X"|collision|below=X|points=X'
 Criterion = Annotated[str | None, CRITERION]
-"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a metric of the study with
-<, <=, > or >= and a number; by default a collision if any evaluated setting collides, else half of the original's
-safety degree; of a rated study, any point lost.
+"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
+metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
+setting collides, else half of the original's safety degree; of a rated study, any point lost.
 """
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
@@ -86,15 +89,18 @@ COMMON_OPTIONS = (
     ),
     (
         *("as_it_is_now", bool, False),
-        "If results were computed with other files or versions, simulate with the present ones and say so.",
+        (
+            "If results were computed with other files or versions, simulate with the present ones"
+            " and say so."
+        ),
     ),
 )
 """Options that every question has: name, type, default, and meaning."""
 
 
 class Option(NamedTuple):
-    """An option of a function: the type of a value, its range, choices or the form of its text, its default and its
-    meaning.
+    """An option of a function: the type of a value, its range, choices or the form of its text, its
+    default and its meaning.
     """
 
     name: str
@@ -111,8 +117,8 @@ class Option(NamedTuple):
         return f"--{self.name.replace('_', '-')}"
 
     def check(self, value: Any) -> Any:
-        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has another type or is
-        outside the range.
+        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has
+        another type or is outside the range.
         """
         if self.is_repeated:
             if isinstance(value, Mapping):
@@ -124,7 +130,11 @@ class Option(NamedTuple):
             return check_text(self.name, value)
         number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
         words = f"{words} {self.limits}" if self.limits else words
-        if isinstance(value, bool) or not isinstance(value, number) or (self.limits and value not in self.limits):
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, number)
+            or (self.limits and value not in self.limits)
+        ):
             raise InputError(self.name, repr(value), words)
         return value
 
@@ -138,10 +148,15 @@ class Question:
         self.compute = compute
         self.name = f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
         parameters = list(inspect.signature(compute).parameters.values())
-        if sum(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in parameters) < 2:
+        if (
+            sum(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in parameters)
+            < 2
+        ):
             takes = f"takes ({', '.join(map(str, parameters))})"
             raise InputError(
-                f"question {self.name!r}", takes, "(subject, evaluator), then other subjects, * and options"
+                f"question {self.name!r}",
+                takes,
+                "(subject, evaluator), then other subjects, * and options",
             )
         self.takes_results_only = str(parameters[0].annotation) == "Case"
         self.others = {
@@ -151,7 +166,9 @@ class Question:
         }
         """Further positional parameters, and whether each is a file instead of a subject."""
         common = [
-            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
+            )
             for name, kind, default, _ in COMMON_OPTIONS
         ]
         shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
@@ -183,7 +200,9 @@ class Question:
         values = {name: known[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Study | Case:
-            subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only)
+            subject = study_or_case(
+                source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only
+            )
             shortfall = "" if isinstance(subject, Study) else subject.shortfall
             if shortfall:
                 warn(shortfall)
@@ -193,7 +212,9 @@ class Question:
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
-        return replace(self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress), command=command)
+        return replace(
+            self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress), command=command
+        )
 
     def answer(
         self,
@@ -204,14 +225,19 @@ class Question:
         jobs: int | None = None,
         progress: bool | Progress = False,
     ) -> Answer:
-        """The answer about subjects that have been loaded, and files; `values` are those of options."""
+        """The answer about subjects that have been loaded, and files; `values` are those of
+        options.
+        """
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
         from safevar_sumo.questions.measure import subject_by
 
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
-            criterion = next((values.get(option.name) for option in self.options if option.metavar == CRITERION), None)
+            criterion = next(
+                (values.get(option.name) for option in self.options if option.metavar == CRITERION),
+                None,
+            )
             if criterion is not None:
                 unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
@@ -228,23 +254,28 @@ class Question:
         return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
     def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
-        """The command that asks this question; it has a flag for each option that is not at its default."""
+        """The command that asks this question; it has a flag for each option that is not at its
+        default.
+        """
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
         for option in self.options:
             value = values.get(option.name, option.default)
             if value == option.default:
                 continue
             texts = [""] if option.kind is bool else value if option.is_repeated else [value]
-            words += [f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag for text in texts]
+            words += [
+                f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag
+                for text in texts
+            ]
         return " ".join([*words, *([f"--point {quote(str(point))}"] if point else [])])
 
 
 def question(compute: Callable[..., Answer]) -> Question:
     """Decorator: makes a function `(subject, evaluator, *, options) -> Answer` a question.
 
-    Defaults are those of its signature, ranges those of `Annotated` types, texts those of its numpydoc docstring. A
-    first parameter of type `Case` takes results only; further positional parameters are further subjects, of
-    type `Path` files.
+    Defaults are those of its signature, ranges those of `Annotated` types, texts those of its
+    numpydoc docstring. A first parameter of type `Case` takes results only; further positional
+    parameters are further subjects, of type `Path` files.
     """
     return Question(compute)
 
@@ -262,7 +293,9 @@ def find_question(name: str) -> Question:
         raise InputError("question", f"there is no {name!r}", legal)
     module, _, function = name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
     if ":" in name:
-        add_import_folders(())  # the working directory, which an installed program does not have on its path
+        add_import_folders(
+            ()
+        )  # the working directory, which an installed program does not have on its path
     invalidate_caches()  # the module may have been written a moment ago
     try:
         with user_errors(name):
@@ -272,12 +305,16 @@ def find_question(name: str) -> Question:
     found = getattr(imported, function, None)
     if not isinstance(found, Question):
         known = [name for name, value in vars(imported).items() if isinstance(value, Question)]
-        raise unknown_name("question", f"{module} has no function {function!r} with @question", function, known)
+        raise unknown_name(
+            "question", f"{module} has no function {function!r} with @question", function, known
+        )
     return found
 
 
 def options_of(function: Callable[..., Any]) -> list[Option]:
-    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring describe them."""
+    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring
+    describe them.
+    """
     pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
     texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
     names = inspect.unwrap(function).__globals__
@@ -286,12 +323,15 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
         if parameter.kind is parameter.KEYWORD_ONLY:
             hint = parameter.annotation  # a text where the module postpones annotations
             meaning = " ".join(texts.get(parameter.name, "").split())
-            options.append(_option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning))
+            options.append(
+                _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
+            )
     return options
 
 
 def parse_question(text: str) -> tuple[Question, JsonObject]:
-    """A question and values of its options, from its command without subjects: `risk --samples 4000`.
+    """A question and values of its options, from its command without subjects: `risk --samples
+    4000`.
 
     Raises
     ------
@@ -301,7 +341,9 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     try:
         name, *words = split(text)
     except ValueError:  # nothing, or a quotation mark without its second one
-        raise InputError("ask", repr(text), 'a question with its options, such as "risk --samples 4000"') from None
+        raise InputError(
+            "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
+        ) from None
     asked = find_question(name)
     values = dict[str, Any]()
     waiting = iter(words)
@@ -314,7 +356,9 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
             value = value if option.kind is bool else option.kind(value)
         except (TypeError, ValueError):
             raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
-        values[option.name] = option.check((*values.get(option.name, ()), value) if option.is_repeated else value)
+        values[option.name] = option.check(
+            (*values.get(option.name, ()), value) if option.is_repeated else value
+        )
     return asked, values
 
 
@@ -335,7 +379,9 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
     kind = str if is_repeated or not kinds else kinds[0]
     choices = get_args(hint) if get_origin(hint) is Literal else ()
-    return Option(parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning)
+    return Option(
+        parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
+    )
 
 
 def _undefined_in_words(evaluator: Evaluator) -> str:
@@ -343,7 +389,9 @@ def _undefined_in_words(evaluator: Evaluator) -> str:
     undefined = sum(count for count, _ in evaluator.undefined)
     total = sum(number for _, number in evaluator.undefined)
     of_all = f"{undefined:,} of {total:,} simulated settings, which count as safe"
-    return f"{evaluator.measure} is undefined, without a collision, in {of_all}." if undefined else ""
+    return (
+        f"{evaluator.measure} is undefined, without a collision, in {of_all}." if undefined else ""
+    )
 
 
 def _name(source: StudyLike | Results) -> str:
@@ -354,5 +402,7 @@ def _name(source: StudyLike | Results) -> str:
 
 
 def has_criterion(text: str, unsafe: str | None) -> bool:
-    """Whether a question as `with_criterion` gives it is asked by a criterion, and not by another one or none."""
+    """Whether a question as `with_criterion` gives it is asked by a criterion, and not by another
+    one or none.
+    """
     return parse_question(text)[1].get("unsafe") == (None if unsafe is None else str(unsafe))

@@ -14,13 +14,18 @@ from safevar_sumo.records import FloatArray
 GENERATION, PARENTS = 512, 32
 """Settings of a generation; the worst ones so far, which are its parents."""
 STEP, PULL = 0.1, 0.5
-"""Step of a mutation, as a share of the way to a random value; share of the way to a worse parent."""
+"""Step of a mutation, as a share of the way to a random value; share of the way to a worse parent.
+"""
 DIFFERENCE = 0.7
 """Factor on the difference of two parents (F of differential evolution; Storn and Price 1997)."""
 MORE_GENERATIONS = 2
-"""Generations after the first with an unsafe setting: several failures at once spare attacks on boxes beside them."""
+"""Generations after the first with an unsafe setting: several failures at once spare attacks on
+boxes beside them.
+"""
 Judge = Callable[[FloatArray], FloatArray]
-"""What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it does not count."""
+"""What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it
+does not count.
+"""
 Rows = npt.NDArray[np.intp]
 
 
@@ -30,7 +35,8 @@ class Attack(NamedTuple):
     Attributes
     ----------
     settings, judges, left
-        Settings, shape (K, n), the numbers of the judges that they met, and what they leave, shape (K,).
+        Settings, shape (K, n), the numbers of the judges that they met, and what they leave, shape
+        (K,).
     simulated
         Number of settings that were simulated, each in one encounter and one model.
     """
@@ -50,19 +56,24 @@ class Attack(NamedTuple):
 
 
 def attack(
-    box: Box, judges: Sequence[Judge], known: Sequence[FloatArray], budget: int, rng: np.random.Generator
+    box: Box,
+    judges: Sequence[Judge],
+    known: Sequence[FloatArray],
+    budget: int,
+    rng: np.random.Generator,
 ) -> Attack:
-    """Search the settings of a box that leave least, with `budget` simulations; it ends `MORE_GENERATIONS` after one is
-    unsafe.
+    """Search the settings of a box that leave least, with `budget` simulations; it ends
+    `MORE_GENERATIONS` after one is unsafe.
 
     `known` are settings for each judge, or none, with which the attack begins, beside random ones.
 
     Notes
     -----
-    Half of a generation are children of two parents, each value from one of the two; on average one value mutates: to a
-    random value, a step towards one, or to an end of the box. The other half moves a parent towards a worse one and by
-    a difference of two others, as differential evolution does. After the first generation, half of each meets the
-    judge to whom least is left, and half another one, in turn, the next worst first: few at once make large batches.
+    Half of a generation are children of two parents, each value from one of the two; on average one
+    value mutates: to a random value, a step towards one, or to an end of the box. The other half
+    moves a parent towards a worse one and by a difference of two others, as differential evolution
+    does. After the first generation, half of each meets the judge to whom least is left, and half
+    another one, in turn, the next worst first: few at once make large batches.
     """
     return attack_all([box], judges, [known], budget, [rng])[0]
 
@@ -75,8 +86,9 @@ def attack_all(
     rngs: Sequence[np.random.Generator],
     generation: int = GENERATION,
 ) -> list[Attack]:
-    """Attack several boxes side by side, each with `budget` simulations, `generation` of them at once: a judge meets a
-    generation of all boxes together, as few large batches cost less than many small ones.
+    """Attack several boxes side by side, each with `budget` simulations, `generation` of them at
+    once: a judge meets a generation of all boxes together, as few large batches cost less than many
+    small ones.
     """
     attacks = dict[int, Attack]()
     steps = [
@@ -116,7 +128,12 @@ class _Generation(NamedTuple):
 
 
 def _steps(
-    box: Box, n_judges: int, known: Sequence[FloatArray], budget: int, size: int, rng: np.random.Generator
+    box: Box,
+    n_judges: int,
+    known: Sequence[FloatArray],
+    budget: int,
+    size: int,
+    rng: np.random.Generator,
 ) -> Generator[_Generation, FloatArray, Attack]:
     """The generations of an attack, which takes what each leaves."""
     found = Attack(np.zeros((0, len(box.lower))), np.zeros(0, dtype=np.intp), np.zeros(0), 0)
@@ -161,13 +178,19 @@ def _new_ones(
     seen: set[tuple[int, bytes]],
     rng: np.random.Generator,
 ) -> tuple[FloatArray, Rows]:
-    """Up to `size` settings of the box that their judges have not met; random ones where there are too few."""
+    """Up to `size` settings of the box that their judges have not met; random ones where there are
+    too few.
+    """
     is_held = box.holds(settings)
     random = box.draw(size, rng)
     settings = np.concatenate([settings[is_held], random])
-    numbers = np.concatenate([numbers[is_held], choice[rng.integers(len(choice), size=len(random))]])
+    numbers = np.concatenate(
+        [numbers[is_held], choice[rng.integers(len(choice), size=len(random))]]
+    )
     rows = list[int]()
-    for row, key in enumerate(zip(numbers.tolist(), map(np.ndarray.tobytes, settings), strict=True)):
+    for row, key in enumerate(
+        zip(numbers.tolist(), map(np.ndarray.tobytes, settings), strict=True)
+    ):
         if key not in seen and len(rows) < size:
             seen.add(key)
             rows.append(row)
@@ -199,8 +222,14 @@ def _children(box: Box, found: Attack, number: int, rng: np.random.Generator) ->
     ends = np.where(rng.random(shape) < 0.5, box.lower, box.upper)
     # Of a child's values, 0.4 on average are drawn anew, 0.4 make a step, and 0.4 go to an end.
     draw = rng.random(shape) * max(int(np.count_nonzero(box.lower < box.upper)), 1)
-    mutated = np.select([draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed)
+    mutated = np.select(
+        [draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed
+    )
     worse = parents[np.minimum(first, second)]  # the worst parents come first
-    moved = parents[first] + PULL * (worse - parents[first]) + DIFFERENCE * (parents[third] - parents[fourth])
+    moved = (
+        parents[first]
+        + PULL * (worse - parents[first])
+        + DIFFERENCE * (parents[third] - parents[fourth])
+    )
     is_moved = (np.arange(number) % 2 == 1)[:, np.newaxis]
     return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))

@@ -1,4 +1,6 @@
-"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages and in blocks for the terminal."""
+"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages and in blocks
+for the terminal.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +16,16 @@ WIDTH, HEIGHT = 120, 14
 """Size of a bar on a page [px]."""
 LEGEND = {
     "text": "bar: █ together, ▒ alone (all others as new), · domain, o original, | specified",
-    "html": "range: strong together, faint alone (all others as new), outline the domain, dot the original, "
-    "tick the specified limit",
+    "html": (
+        "range: strong together, faint alone (all others as new), outline the domain, dot the"
+        " original, tick the specified limit"
+    ),
 }
 
 
 class Bar(NamedTuple):
-    """A domain, and in it the ranges together and alone, the original and the specified limits, as shares from 0 to 1;
-    a range is empty where there is none.
+    """A domain, and in it the ranges together and alone, the original and the specified limits, as
+    shares from 0 to 1; a range is empty where there is none.
     """
 
     original: float
@@ -53,9 +57,15 @@ class Bar(NamedTuple):
             if not ends:
                 return ""
             width = f"{max(inside * (ends[1] - ends[0]), 1):.1f}"
-            return f'<rect class="{name}" x="{x(ends[0])}" y="3" width="{width}" height="{HEIGHT - 6}"/>'
+            return (
+                f'<rect class="{name}" x="{x(ends[0])}" y="3" width="{width}"'
+                f' height="{HEIGHT - 6}"/>'
+            )
 
-        ranges = [rectangle(ends, name) for ends, name in ((self.alone, "alone"), (self.together, "together"))]
+        ranges = [
+            rectangle(ends, name)
+            for ends, name in ((self.alone, "alone"), (self.together, "together"))
+        ]
         ticks = [f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>' for share in self.specified]
         parts = [
             *ranges,

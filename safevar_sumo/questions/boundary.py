@@ -1,4 +1,6 @@
-"""The boundary between what is safe and what is unsafe on a straight way: the last safe value before some failures."""
+"""The boundary between what is safe and what is unsafe on a straight way: the last safe value
+before some failures.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +12,20 @@ import numpy as np
 from safevar_sumo.records import BoolArray, FloatArray
 
 PARTS, ROUNDS = 8, 4
-"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts."""
+"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts.
+"""
 MOVED_BEFORE = 8
-"""Number of failures, the nearest to the safe value, in whose encounters the last safe value is safe at once."""
+"""Number of failures, the nearest to the safe value, in whose encounters the last safe value is
+safe at once.
+"""
 
 
 class Tested(Protocol):
     """A model in which settings are tested, such as `models.Model`."""
 
     def left(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it does not
-        count.
+        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
+        where it does not count.
         """
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
@@ -28,8 +33,8 @@ class Tested(Protocol):
 
 
 class Move:
-    """The way of one column from a safe value to the nearest of some failures, shape (K, n): to the last value before
-    it that is safe in the encounters of them all.
+    """The way of one column from a safe value to the nearest of some failures, shape (K, n): to the
+    last value before it that is safe in the encounters of them all.
 
     Attributes
     ----------
@@ -47,7 +52,9 @@ class Move:
     @property
     def _values(self) -> FloatArray:
         """The values of a round."""
-        return np.asarray(self.safe + (self.failure[self.column] - self.safe) * np.arange(1, PARTS) / PARTS)
+        return np.asarray(
+            self.safe + (self.failure[self.column] - self.safe) * np.arange(1, PARTS) / PARTS
+        )
 
     @property
     def settings(self) -> FloatArray:

@@ -1,4 +1,6 @@
-"""Boxes of settings: a promise, limits; settings in them, and the proof that hardly any of them is unsafe."""
+"""Boxes of settings: a promise, limits; settings in them, and the proof that hardly any of them is
+unsafe.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ MET_BY_CORNERS = 32_768
 
 @dataclass(frozen=True)
 class Box:
-    """Settings from `lower` to `upper`, shape (n,), that satisfy the constraints; where both ends are equal, a
-    characteristic does not vary.
+    """Settings from `lower` to `upper`, shape (n,), that satisfy the constraints; where both ends
+    are equal, a characteristic does not vary.
     """
 
     region: FeasibleRegion
@@ -40,16 +42,22 @@ class Box:
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
-        return self.region.draw_feasible(lambda count: self.at(rng.random((count, len(self.lower)))), number)
+        return self.region.draw_feasible(
+            lambda count: self.at(rng.random((count, len(self.lower)))), number
+        )
 
     def with_ends(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Random settings with half of their values at ends, shape (number, n); fewer where not all are feasible."""
+        """Random settings with half of their values at ends, shape (number, n); fewer where not all
+        are feasible.
+        """
         points = rng.random((number, len(self.lower)))
         settings = self.at(np.where(rng.random(points.shape) < 0.5, np.round(points), points))
         return np.asarray(settings[self.region.feasible(settings)])
 
     def spread_and_corners(self, number: int, seed: int) -> FloatArray:
-        """Settings at Sobol points, and at as many corners, where all changes of the vehicle add up."""
+        """Settings at Sobol points, and at as many corners, where all changes of the vehicle add
+        up.
+        """
         points = sobol_points(number, len(self.lower), seed)
         corners = np.where(self.region.characteristics.of_vehicle, np.round(points), points)
         return self.at(np.concatenate([points, corners]))
@@ -57,15 +65,19 @@ class Box:
     def corners(self, seed: int, attempt: int) -> FloatArray:
         """Settings at all corners; at `MAX_CORNERS` random ones if it has more.
 
-        In a study that searches its scenario, each corner of the vehicle's characteristics meets equally many
-        encounters, drawn anew in each attempt.
+        In a study that searches its scenario, each corner of the vehicle's characteristics meets
+        equally many encounters, drawn anew in each attempt.
         """
         of_vehicle = self.region.characteristics.of_vehicle
         is_open = self.lower < self.upper
         worn = np.flatnonzero(of_vehicle & is_open)
         rng = np.random.default_rng(seed)
         size = len(worn)
-        numbers = np.arange(2**size) if 2**size <= MAX_CORNERS else rng.integers(2**size, size=MAX_CORNERS)
+        numbers = (
+            np.arange(2**size)
+            if 2**size <= MAX_CORNERS
+            else rng.integers(2**size, size=MAX_CORNERS)
+        )
         points = np.zeros((len(numbers), len(self.lower)))
         points[:, worn] = numbers[:, np.newaxis] >> np.arange(size) & 1
         if not (~of_vehicle & is_open).any():
@@ -84,8 +96,9 @@ class Judgement(NamedTuple):
 
 
 class Proof(NamedTuple):
-    """`failures` of `samples` settings drawn after the box was chosen, and those that could not be simulated; at most
-    the share `at_most` of all is unsafe or cannot be simulated, with `CONFIDENCE`.
+    """`failures` of `samples` settings drawn after the box was chosen, and those that could not be
+    simulated; at most the share `at_most` of all is unsafe or cannot be simulated, with
+    `CONFIDENCE`.
     """
 
     samples: int
@@ -95,7 +108,9 @@ class Proof(NamedTuple):
 
 
 def proof_size(attempt: int, share: float) -> int:
-    """The number of settings of which none may be unsafe in a test, so that at most this share of all is."""
+    """The number of settings of which none may be unsafe in a test, so that at most this share of
+    all is.
+    """
     return math.ceil(math.log(_error_of(attempt)) / math.log1p(-share))
 
 
@@ -105,17 +120,22 @@ def _error_of(attempt: int) -> float:
 
 
 def prove(
-    draw: Callable[[int], FloatArray], judge: Callable[[FloatArray], Judgement], share: float, attempt: int
+    draw: Callable[[int], FloatArray],
+    judge: Callable[[FloatArray], Judgement],
+    share: float,
+    attempt: int,
 ) -> tuple[Proof, FloatArray]:
-    """Test with settings drawn anew that at most `share` of all are unsafe: the proof, and the unsafe settings.
+    """Test with settings drawn anew that at most `share` of all are unsafe: the proof, and the
+    unsafe settings.
 
     Notes
     -----
-    The settings are drawn independently and uniformly, by a random generator that no search uses. Test k, k = 1, 2,
-    ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 - `CONFIDENCE`: its bound is Clopper and
-    Pearson's at confidence 1 - alpha_k. Box k depends on earlier samples alone, so given box k the bound fails with
-    probability at most alpha_k. So the probability that any bound is wrong, and with it the bound of the box that
-    passes, is at most sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `share` if all of
+    The settings are drawn independently and uniformly, by a random generator that no search uses.
+    Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 -
+    `CONFIDENCE`: its bound is Clopper and Pearson's at confidence 1 - alpha_k. Box k depends on
+    earlier samples alone, so given box k the bound fails with probability at most alpha_k. So the
+    probability that any bound is wrong, and with it the bound of the box that passes, is at most
+    sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `share` if all of
     them are safe.
     """
     import scipy  # takes longer to load than a simulation

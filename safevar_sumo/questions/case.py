@@ -1,5 +1,5 @@
-"""The results of one study, which all questions read: solutions by algorithm and run, and the metrics of the original
-vehicle.
+"""The results of one study, which all questions read: solutions by algorithm and run, and the
+metrics of the original vehicle.
 """
 
 from __future__ import annotations
@@ -88,15 +88,26 @@ class Case:
         return np.concatenate([self.characteristics.original[np.newaxis], solutions])
 
     def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
-        """The case of another form of its study, in which its settings have been simulated again."""
-        columns = {"f_safe": evaluations.f_safe, **evaluations.metrics, "outcome": evaluations.outcome}
+        """The case of another form of its study, in which its settings have been simulated
+        again.
+        """
+        columns = {
+            "f_safe": evaluations.f_safe,
+            **evaluations.metrics,
+            "outcome": evaluations.outcome,
+        }
         columns["collision_speed"] = evaluations.collision_speed
-        solutions = self.solutions.drop(columns=[name for name in self.original if name not in evaluations.metrics])
+        solutions = self.solutions.drop(
+            columns=[name for name in self.original if name not in evaluations.metrics]
+        )
         return replace(
             self,
             study=study,
             scoring=scoring,
-            original={metric.name: float(evaluations.metrics[metric.name][0]) for metric in scoring.metrics},
+            original={
+                metric.name: float(evaluations.metrics[metric.name][0])
+                for metric in scoring.metrics
+            },
             solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
         )
 
@@ -113,19 +124,27 @@ class Case:
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
         names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished_runs)}
-        return tuple(name for name in dict.fromkeys([*self.study.search.labels, *sorted(names)]) if name in names)
+        return tuple(
+            name
+            for name in dict.fromkeys([*self.study.search.labels, *sorted(names)])
+            if name in names
+        )
 
     def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
-        """The original vehicle's safety degree beside each solution: in the solution's own encounter, if the study
-        searches its scenario.
+        """The original vehicle's safety degree beside each solution: in the solution's own
+        encounter, if the study searches its scenario.
         """
         own = solutions.get(ORIGINAL_DEGREE)
-        return pd.Series(self.original[SAFETY_DEGREE], index=solutions.index) if own is None else own
+        return (
+            pd.Series(self.original[SAFETY_DEGREE], index=solutions.index) if own is None else own
+        )
 
     def require_solutions(self) -> None:
         """Raise `UnanswerableError` if no run is finished."""
         if not self.algorithms:
-            raise UnanswerableError(self.name, "has no finished run", "results with at least one finished run")
+            raise UnanswerableError(
+                self.name, "has no finished run", "results with at least one finished run"
+            )
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.
@@ -138,7 +157,9 @@ class Case:
         if algorithm not in self.algorithms:
             names = ", ".join(self.algorithms) or "no algorithm"
             raise UnanswerableError(
-                self.name, f"has no finished run of {algorithm}", f"results of {algorithm} (it has results of {names})"
+                self.name,
+                f"has no finished run of {algorithm}",
+                f"results of {algorithm} (it has results of {names})",
             )
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
@@ -152,20 +173,31 @@ class Case:
         """
         if not self.has_runs:
             raise UnanswerableError(
-                self.name, "is imported: the runs of its solutions are unknown", "results of the command `study`"
+                self.name,
+                "is imported: the runs of its solutions are unknown",
+                "results of the command `study`",
             )
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
     def shortfall(self) -> str:
-        """Note on unfinished runs, for the readers of every answer about the solutions; empty if there are none."""
+        """Note on unfinished runs, for the readers of every answer about the solutions; empty if
+        there are none.
+        """
         finished = Counter(algorithm for algorithm, _ in self.finished_runs)
         planned = self.study.search.runs
         labels = self.study.search.labels if self.has_runs else ()
-        unfinished = [f"{name} {finished[name]} of {planned} runs" for name in labels if finished[name] < planned]
+        unfinished = [
+            f"{name} {finished[name]} of {planned} runs"
+            for name in labels
+            if finished[name] < planned
+        ]
         if not unfinished:
             return ""
-        return f"{self.name}: unfinished, {', '.join(unfinished)}; only solutions of finished runs count."
+        return (
+            f"{self.name}: unfinished, {', '.join(unfinished)}; only solutions of finished runs"
+            " count."
+        )
 
     @property
     def remarks(self) -> list[str]:
@@ -173,20 +205,22 @@ class Case:
         remarks = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
             remarks.append(
-                f"{self.name}: imported solutions, without runs; the original vehicle's metrics are published or "
-                "supplied."
+                f"{self.name}: imported solutions, without runs; the original vehicle's metrics are"
+                " published or supplied."
             )
         if self.failures:
             remarks.append(
-                f"{self.name}: {len(self.failures)} settings could not be simulated (simulator-error) and are in no "
-                f"result: {'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them again."
+                f"{self.name}: {len(self.failures)} settings could not be simulated"
+                " (simulator-error) and are in no result:"
+                f" {'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them"
+                " again."
             )
         return remarks
 
 
 def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:
-    """The solutions that count for a metric; for TET and TIT only those without collision (docs/method.md, section
-    4).
+    """The solutions that count for a metric; for TET and TIT only those without collision
+    (docs/method.md, section 4).
     """
     return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
 
@@ -205,25 +239,46 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         If a directory holds no results, is damaged or is given twice.
     """
     paths = [Path(check_text("directory", directory)) for directory in directories]
-    duplicates = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
+    duplicates = [
+        path for path, count in Counter(path.resolve() for path in paths).items() if count > 1
+    ]
     if duplicates:
-        raise InputError("directories", f"{duplicates[0]} is given twice", "each results directory once")
+        raise InputError(
+            "directories", f"{duplicates[0]} is given twice", "each results directory once"
+        )
     cases = []
     for path in paths:
         try:
             manifest, evaluations, solutions, finished, failures = load_runs(path)
             study = msgspec.convert(manifest["study"], Study)
             study = msgspec.structs.replace(study, origin=Origin(places=folders_of(path, manifest)))
-            scoring = msgspec.convert(manifest["scoring"], Scoring) if "scoring" in manifest else PUBLISHED_SCORING
+            scoring = (
+                msgspec.convert(manifest["scoring"], Scoring)
+                if "scoring" in manifest
+                else PUBLISHED_SCORING
+            )
             has_runs = "imported" not in manifest
             case = build_case(
-                study, manifest["original"], solutions, evaluations, finished, has_runs, failures, scoring
+                study,
+                manifest["original"],
+                solutions,
+                evaluations,
+                finished,
+                has_runs,
+                failures,
+                scoring,
             )
             stop_by_themselves = manifest.get("stop_by_themselves", case.stop_by_themselves)
-            cases.append(replace(case, titles=manifest.get("titles", {}), stop_by_themselves=stop_by_themselves))
+            cases.append(
+                replace(
+                    case, titles=manifest.get("titles", {}), stop_by_themselves=stop_by_themselves
+                )
+            )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
-                path, f"is damaged: {describe_error(error)}", "an unchanged directory of the command `study`"
+                path,
+                f"is damaged: {describe_error(error)}",
+                "an unchanged directory of the command `study`",
             ) from error
     names = Counter(case.name for case in cases)
     return [
@@ -245,7 +300,9 @@ def build_case(
     """Put a case together; in `original` an undefined metric is None or missing."""
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
-    metrics = {name: np.nan if original.get(name) is None else float(original[name]) for name in names}
+    metrics = {
+        name: np.nan if original.get(name) is None else float(original[name]) for name in names
+    }
 
     def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:
         return frame.assign(**{name: np.nan for name in columns if name not in frame})

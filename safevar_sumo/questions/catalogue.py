@@ -1,4 +1,6 @@
-"""What can be named in a study, and whether the user's own code keeps the promises that results rest on."""
+"""What can be named in a study, and whether the user's own code keeps the promises that results
+rest on.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
 SCENARIO: Columns = DESCRIBED | {"search": "what [scenario.search] may vary, and its widest domain"}
-STUDIES: Columns = NAME | {key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")}
+STUDIES: Columns = NAME | {
+    key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")
+}
 VEHICLES: Columns = {
     "vehicle": "vehicle",
     "name": "characteristic",
@@ -53,7 +57,11 @@ WEATHER: Columns = NAME | {
     "effect": "none: an ADS drives as in clear weather, unless its parameters differ",
 }
 FURTHER_OBJECTIVES: Mapping[str, object] = {
-    **{name: f"{one.title.capitalize()} [{one.unit}]." for name, one in OBJECTIVES.items() if name not in METRICS},
+    **{
+        name: f"{one.title.capitalize()} [{one.unit}]."
+        for name, one in OBJECTIVES.items()
+        if name not in METRICS
+    },
     RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
 }
 FINDINGS: Columns = {
@@ -78,8 +86,8 @@ FINDINGS: Columns = {
     objectives=DESCRIBED,
 )
 def list_models(kind: str | None = None) -> Answer:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with KIND only these, or
-    your own scenario, package.module:Name.
+    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with
+    KIND only these, or your own scenario, package.module:Name.
     """
     own = {}
     if kind is not None and ":" in kind:
@@ -96,7 +104,9 @@ def list_models(kind: str | None = None) -> Answer:
         "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
         "metrics": tabulate(METRICS_TITLE, DESCRIBED, metrics),
-        "objectives": tabulate("Objectives; every metric can be one, too", DESCRIBED, FURTHER_OBJECTIVES.items()),
+        "objectives": tabulate(
+            "Objectives; every metric can be one, too", DESCRIBED, FURTHER_OBJECTIVES.items()
+        ),
     }
     if kind is not None:
         check_name("kind", f"there is no {kind!r} to list", kind, tables)
@@ -104,13 +114,22 @@ def list_models(kind: str | None = None) -> Answer:
     counts = ", ".join(f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items())
     verdict = f"A study can name {', '.join(own) or counts}."
     no_study: Any = None
-    return Answer(question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables)
+    return Answer(
+        question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables
+    )
 
 
 def _studies() -> Iterator[tuple[str, ...]]:
     for study in map(load_study, study_names()):
         weather = study.weather if isinstance(study.weather, str) else study.weather.name
-        yield study.name, study.title, study.vehicle.model, study.ads.model, study.scenario.model, weather
+        yield (
+            study.name,
+            study.title,
+            study.vehicle.model,
+            study.ads.model,
+            study.scenario.model,
+            weather,
+        )
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
@@ -131,25 +150,34 @@ def description_of(model: Any) -> str:
 
 def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:
     for name, description in _described(models):
-        own = {} if models[name].brakes_fully else {**free_parameters(models[name]), **WEATHER_PARAMETERS}
-        domains = (f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in own.items())
+        own = (
+            {}
+            if models[name].brakes_fully
+            else {**free_parameters(models[name]), **WEATHER_PARAMETERS}
+        )
+        domains = (
+            f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in own.items()
+        )
         yield name, description, "; ".join(domains)
 
 
 @contents("passed", findings=FINDINGS)
 def check(name: str) -> Answer:
-    """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep the promises that
-    results rest on.
+    """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
+    the promises that results rest on.
 
-    NAME is the name or path of a study, all of whose code is checked, or a driving system, by its name or
-    package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME passes, 1 with findings, 2
-    if it cannot be loaded.
+    NAME is the name or path of a study, all of whose code is checked, or a driving system, by its
+    name or package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME
+    passes, 1 with findings, 2 if it cannot be loaded.
     """
     from safevar_sumo.plugins.check import CHECKS, check as find, study_to_check  # loads SUMO
 
     study = study_to_check(name)
     findings = find(study)
-    rows = [(one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check]) for one in findings]
+    rows = [
+        (one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check])
+        for one in findings
+    ]
     return Answer(
         question="check",
         study=study,

@@ -1,4 +1,6 @@
-"""Counterexamples in sentences: unsafe vehicles with the values that are printed, simulated again with these values."""
+"""Counterexamples in sentences: unsafe vehicles with the values that are printed, simulated again
+with these values.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,17 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
-"""Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is unsafe."""
+"""Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is
+unsafe.
+"""
 OF_ENCOUNTER = ("test", "weather")
 """Keys of a point's parameters that are no numbers of its scenario."""
 STAGE = "what fails first"
 
 
 class Failure(NamedTuple):
-    """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with the encounter, and
-    the parameters of the point of the matrix where it does.
+    """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with
+    the encounter, and the parameters of the point of the matrix where it does.
     """
 
     setting: FloatArray
@@ -35,12 +39,14 @@ class Failure(NamedTuple):
     point: JsonObject
 
 
-def describe(model: Model, settings: Mapping[str, FloatArray], within: Box | None = None) -> dict[str, Failure]:
+def describe(
+    model: Model, settings: Mapping[str, FloatArray], within: Box | None = None
+) -> dict[str, Failure]:
     """How unsafe settings of a model fail at their worst points, by the same names.
 
-    Values are rounded as they are printed, away from the original, and simulated again; where the rounded vehicle is
-    safe, with further digits. A setting that is safe with all of them is left out. A value that lies `within` a box
-    stays there.
+    Values are rounded as they are printed, away from the original, and simulated again; where the
+    rounded vehicle is safe, with further digits. A setting that is safe with all of them is left
+    out. A value that lies `within` a box stays there.
     """
     failures = dict[str, Failure]()
     waiting = dict(settings)
@@ -48,7 +54,9 @@ def describe(model: Model, settings: Mapping[str, FloatArray], within: Box | Non
         if not waiting:
             break
         members = model.evaluator.characteristics
-        rows = np.array([as_printed(members, setting, further, within) for setting in waiting.values()])
+        rows = np.array(
+            [as_printed(members, setting, further, within) for setting in waiting.values()]
+        )
         found = _failing(model, rows)
         failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
         waiting = {name: setting for name, setting in waiting.items() if name not in failures}
@@ -60,9 +68,11 @@ def limit_text(item: Characteristic, value: float) -> str:
     return f"{value:.10g}{item.suffix}"
 
 
-def as_printed(members: CharacteristicSet, setting: FloatArray, further: int, within: Box | None = None) -> FloatArray:
-    """A setting with its values rounded to the digits of limits and some further ones: the vehicle's away from the
-    original, those of the encounter to the nearest.
+def as_printed(
+    members: CharacteristicSet, setting: FloatArray, further: int, within: Box | None = None
+) -> FloatArray:
+    """A setting with its values rounded to the digits of limits and some further ones: the
+    vehicle's away from the original, those of the encounter to the nearest.
     """
     printed = setting.copy()
     for column, item in enumerate(members):
@@ -93,25 +103,34 @@ def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[worst[row]]
-        values = dict(zip(members.scenario.names, settings[row, ~members.of_vehicle].tolist(), strict=True))
+        values = dict(
+            zip(members.scenario.names, settings[row, ~members.of_vehicle].tolist(), strict=True)
+        )
         scenario = encounter(point, values).scenario
-        how = _failure_in_words(scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row]))
+        how = _failure_in_words(
+            scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
+        )
         where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
         failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters))
     return failures
 
 
-def where_in_words(points: Sequence[Point], point: Point, scenario: Scenario, values: Mapping[str, float]) -> str:
-    """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`, from one of the
-    points of a matrix, the values of searched parameters, and the scenario with them; empty where there is but one.
+def where_in_words(
+    points: Sequence[Point], point: Point, scenario: Scenario, values: Mapping[str, float]
+) -> str:
+    """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`,
+    from one of the points of a matrix, the values of searched parameters, and the scenario with
+    them; empty where there is but one.
     """
     own = dict(point.parameters)
     numbers = {**{name: value for name, value in own.items() if name not in OF_ENCOUNTER}, **values}
     units = searchable_in(point.scenario)
     texts = {
-        name: f"{value:.10g}{unit_text(units[name].unit) if name in units else ''}"
-        if isinstance(value, int | float)
-        else str(value)
+        name: (
+            f"{value:.10g}{unit_text(units[name].unit) if name in units else ''}"
+            if isinstance(value, int | float)
+            else str(value)
+        )
         for name, value in numbers.items()
     }
     speed = texts.pop(SPEED_DIMENSION, "")
@@ -137,4 +156,7 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
         impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
         return f"the car hits {scenario.obstacle()}{impact}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
-    return f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from {scenario.obstacle()}"
+    return (
+        f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from"
+        f" {scenario.obstacle()}"
+    )

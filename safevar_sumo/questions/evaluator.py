@@ -1,4 +1,6 @@
-"""Evaluates settings for all questions about a study, and draws settings that cover the study's domain."""
+"""Evaluates settings for all questions about a study, and draws settings that cover the study's
+domain.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ import numpy as np
 
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import COMPILING, ask_why_no_verdict, compile_vehicle, evaluate_all
+from safevar_sumo.campaign.questions import (
+    COMPILING,
+    ask_why_no_verdict,
+    compile_vehicle,
+    evaluate_all,
+)
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -27,8 +34,8 @@ from safevar_sumo.vehicles import region_of
 
 Found = TypeVar("Found")
 CRITERION_SETTINGS = 1024
-"""Number of settings over the whole domain that decide the default criterion: a collision if any setting collides, else
-a safety degree.
+"""Number of settings over the whole domain that decide the default criterion: a collision if any
+setting collides, else a safety degree.
 """
 FIRST_SETTINGS = 64
 """Number of them that are tried first: one collision decides."""
@@ -39,7 +46,8 @@ CANDIDATES = 512
 
 
 class _Stage:
-    """Progress of a stage over several calls: `earlier` settings are done, and about `total` are expected.
+    """Progress of a stage over several calls: `earlier` settings are done, and about `total` are
+    expected.
 
     A call shows a stage of its own; where that begins again, its count may go on.
     """
@@ -56,7 +64,9 @@ class _Stage:
         show(name, earlier, self._total or 0)
 
     def show_part(self, call: str, done: int, total: int) -> None:
-        """Show the progress of a call; where its count falls, or its own stage is another, it is the next call."""
+        """Show the progress of a call; where its count falls, or its own stage is another, it is
+        the next call.
+        """
         if call == COMPILING:
             self._show(call, done, total)
             return
@@ -68,7 +78,9 @@ class _Stage:
             self._call_total = total
         self.done = self._before_call + done - self._done_at_first
         of_all_calls = self._before_call + total - self._done_at_first
-        self._show(self._name, self.done, 0 if self._total is None else max(self._total, of_all_calls))
+        self._show(
+            self._name, self.done, 0 if self._total is None else max(self._total, of_all_calls)
+        )
 
     def expect(self, left: int) -> None:
         """Expect so many settings after the call under way."""
@@ -76,19 +88,25 @@ class _Stage:
 
 
 class Evaluator:
-    """Evaluates settings of one study without the filter, and draws settings that cover the study's domain.
+    """Evaluates settings of one study without the filter, and draws settings that cover the study's
+    domain.
 
     Attributes
     ----------
     simulated
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     measure, undefined
-        The metric of the question's criterion, if it has one; for each call, also of evaluators of other studies, the
-        number of settings without a collision that have no such value, and of all.
+        The metric of the question's criterion, if it has one; for each call, also of evaluators of
+        other studies, the number of settings without a collision that have no such value, and of
+        all.
     """
 
     def __init__(
-        self, study: Study, pool: Pool, progress: Progress = show_no_progress, verified: int = VERIFIED_SETTINGS
+        self,
+        study: Study,
+        pool: Pool,
+        progress: Progress = show_no_progress,
+        verified: int = VERIFIED_SETTINGS,
     ) -> None:
         self.study = study
         with about(study.source):
@@ -103,12 +121,14 @@ class Evaluator:
         self.measure = ""
         self.undefined = list[tuple[int, int]]()
 
-    def evaluate(self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False) -> Evaluations:
+    def evaluate(
+        self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False
+    ) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
 
-        Settings that violate a constraint of the study are not simulated and get the outcome `infeasible`, unless
-        `ignore_constraints` is true. So do settings in whose encounter the original vehicle is not safe, in a study
-        that searches its scenario.
+        Settings that violate a constraint of the study are not simulated and get the outcome
+        `infeasible`, unless `ignore_constraints` is true. So do settings in whose encounter the
+        original vehicle is not safe, in a study that searches its scenario.
         """
         is_feasible = self.region.feasible(settings) | ignore_constraints
         if is_feasible.all():
@@ -140,9 +160,9 @@ class Evaluator:
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
-        """Show all that is evaluated within the context, by evaluators of other studies, too, as one stage of about
-        `total` settings, None where that is open; the function that it yields takes a better estimate of how many are
-        left.
+        """Show all that is evaluated within the context, by evaluators of other studies, too, as
+        one stage of about `total` settings, None where that is open; the function that it yields
+        takes a better estimate of how many are left.
         """
         show = self.progress
         stage = _Stage(show, name, self._counts.get(name, 0), total)
@@ -154,10 +174,11 @@ class Evaluator:
             self._counts[name] = stage.done
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
-        """Evaluate M settings as `selection` says: at some points, and with values of P parameters of the ADS.
+        """Evaluate M settings as `selection` says: at some points, and with values of P parameters
+        of the ADS.
 
-        The values stand beside the settings, shape (M, n + P). Encounters in which the original vehicle is not safe
-        count, too.
+        The values stand beside the settings, shape (M, n + P). Encounters in which the original
+        vehicle is not safe count, too.
         """
         return self._evaluate_shown(rows, stage, 0, selection)
 
@@ -177,36 +198,55 @@ class Evaluator:
             done += increment
             self.progress(stage, done, total)
 
-        evaluations = evaluate_all(self.study, settings, self._pool, show_more_done, verified, selection)
+        evaluations = evaluate_all(
+            self.study, settings, self._pool, show_more_done, verified, selection
+        )
         self.simulated += total
         if self.measure:
-            is_undefined = np.isnan(evaluations.column(self.measure)) & evaluations.valid & ~evaluations.collided
+            is_undefined = (
+                np.isnan(evaluations.column(self.measure))
+                & evaluations.valid
+                & ~evaluations.collided
+            )
             self.undefined.append((int(np.count_nonzero(is_undefined)), len(evaluations)))
         if selection != EVERYTHING:
             return evaluations
         return self._without_unsafe_originals(evaluations)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
-        """Evaluations whose results are undefined where the original vehicle is not safe in the same encounter."""
+        """Evaluations whose results are undefined where the original vehicle is not safe in the
+        same encounter.
+        """
         if not len(self.characteristics.scenario):
             return evaluations
         is_left_out = assemble(self.study).measuring.scoring.violation(evaluations) > 0
-        metrics = {name: np.where(is_left_out, np.nan, values) for name, values in evaluations.metrics.items()}
+        metrics = {
+            name: np.where(is_left_out, np.nan, values)
+            for name, values in evaluations.metrics.items()
+        }
         return replace(
             evaluations,
-            outcome=np.where(is_left_out & ~evaluations.failed, Outcome.INFEASIBLE.value, evaluations.outcome),
+            outcome=np.where(
+                is_left_out & ~evaluations.failed, Outcome.INFEASIBLE.value, evaluations.outcome
+            ),
             metrics={**metrics, ORIGINAL_DEGREE: evaluations.column(ORIGINAL_DEGREE)},
         )
 
-    def evaluate_over_encounters(self, settings: FloatArray, unsafe: Unsafe, stage: str) -> Evaluations:
-        """Evaluate M settings, shape (M, n); in a study that searches its scenario, in that of its critical encounters
-        and the original one which is worst by the criterion.
+    def evaluate_over_encounters(
+        self, settings: FloatArray, unsafe: Unsafe, stage: str
+    ) -> Evaluations:
+        """Evaluate M settings, shape (M, n); in a study that searches its scenario, in that of its
+        critical encounters and the original one which is worst by the criterion.
         """
         if not len(self.characteristics.scenario):
             return self.evaluate(settings, stage)
         of_vehicle = self.characteristics.of_vehicle
-        encounters = np.concatenate([self.characteristics.original[np.newaxis], self.critical_encounters])
-        pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(-1, settings.shape[1])
+        encounters = np.concatenate(
+            [self.characteristics.original[np.newaxis], self.critical_encounters]
+        )
+        pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(
+            -1, settings.shape[1]
+        )
         evaluations = self.evaluate(pairs, stage)
         worst = np.argmin(unsafe.left(evaluations).reshape(-1, len(encounters)), axis=1)
         first_rows = np.arange(len(settings)) * len(encounters)
@@ -214,8 +254,8 @@ class Evaluator:
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
-        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe, shape (k, n); none
-        if the study searches no scenario.
+        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe,
+        shape (k, n); none if the study searches no scenario.
         """
         if not len(self.characteristics.scenario):
             return np.zeros((0, len(self.characteristics)))
@@ -226,8 +266,8 @@ class Evaluator:
 
     @cached_property
     def share_left_out(self) -> float:
-        """The share of the encounters over the domain in which the original vehicle is not safe, so that they do not
-        count; 0 if the study searches no scenario.
+        """The share of the encounters over the domain in which the original vehicle is not safe, so
+        that they do not count; 0 if the study searches no scenario.
         """
         if not len(self.characteristics.scenario):
             return 0.0
@@ -239,9 +279,13 @@ class Evaluator:
     def _originals(self) -> Evaluations:
         """Evaluations of the original vehicle in encounters over the domain."""
         drawn = sobol_settings(self.characteristics, CANDIDATES)
-        return self.evaluate(self.characteristics.with_original_vehicle(drawn), "encounters of the original")
+        return self.evaluate(
+            self.characteristics.with_original_vehicle(drawn), "encounters of the original"
+        )
 
-    def feasible_settings(self, number: int, seed: int = 0, *, feasible_after_filter: bool = False) -> FloatArray:
+    def feasible_settings(
+        self, number: int, seed: int = 0, *, feasible_after_filter: bool = False
+    ) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly.
 
         With `feasible_after_filter`, they are also feasible after the filter.
@@ -267,7 +311,9 @@ class Evaluator:
         evaluations = self.evaluate_selection(settings, Selection(each=True), stage)
         if evaluations.cells is None:
             reason = evaluations.reason(int(np.argmax(evaluations.failed)))
-            raise SimulationError(f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}")
+            raise SimulationError(
+                f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}"
+            )
         return evaluations.cells
 
     def evaluate_original(self) -> Evaluations:
@@ -278,29 +324,38 @@ class Evaluator:
         SimulationError
             If the original vehicle cannot be simulated.
         InputError
-            If the study searches its scenario, and the original vehicle is not safe in the original encounter.
+            If the study searches its scenario, and the original vehicle is not safe in the original
+            encounter.
         """
         evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
-            problem = "scenario.search: the original vehicle is not safe in the encounter of the original values"
-            raise InputError(self.study.source, problem, "original values with which it is, as in all results")
+            problem = (
+                "scenario.search: the original vehicle is not safe in the encounter of the original"
+                " values"
+            )
+            raise InputError(
+                self.study.source, problem, "original values with which it is, as in all results"
+            )
         if not evaluations.valid[0]:
             raise SimulationError(
-                f"study {self.study.name!r} cannot be simulated with the original vehicle: {evaluations.outcome[0]}"
+                f"study {self.study.name!r} cannot be simulated with the original vehicle:"
+                f" {evaluations.outcome[0]}"
             )
         return evaluations
 
     @cached_property
     def no_verdict(self) -> str:
-        """Why simulations tell nothing about the ADS, in a sentence with which every answer begins; "" if they do."""
+        """Why simulations tell nothing about the ADS, in a sentence with which every answer begins;
+        "" if they do.
+        """
         compile_vehicle(self.study, self._pool, self.progress)
         return ask_why_no_verdict(self.study, self._pool)
 
     def choose_criterion(
         self, text: Unsafe | str | None, source: Study | Case, original: Evaluations | None = None
     ) -> Unsafe:
-        """The criterion that an option states, or else the default for the solutions of results, or for settings over
-        the whole domain of a study.
+        """The criterion that an option states, or else the default for the solutions of results, or
+        for settings over the whole domain of a study.
 
         Raises what `parse_criterion` and `Unsafe.default_among` raise.
         """
@@ -309,7 +364,9 @@ class Evaluator:
         if not isinstance(source, Study) and len(source.solutions):
             return source.unsafe
         original = original or self.evaluate_original()
-        if RATING_POINTS.name in original.metrics:  # a lost point depends on the original vehicle alone
+        if (
+            RATING_POINTS.name in original.metrics
+        ):  # a lost point depends on the original vehicle alone
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
@@ -321,12 +378,15 @@ class Evaluator:
     def parse_criterion(self, text: Unsafe | str) -> Unsafe:
         """Parse the criterion that an option states.
 
-        Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the study is not rated.
+        Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the
+        study is not rated.
         """
         criterion = Unsafe.parse(text)
         if criterion.points is not None and not is_rated(self.study):
             raise InputError(
-                "unsafe", f"{text!r}: study {self.study.name!r} is not rated and has no points", "collision or below=X"
+                "unsafe",
+                f"{text!r}: study {self.study.name!r} is not rated and has no points",
+                "collision or below=X",
             )
         return criterion
 
@@ -334,11 +394,17 @@ class Evaluator:
         """An evaluator of the same study with another time step [s]."""
         # The interval may be no multiple of this step.
         metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
-        return self.for_study(msgspec.structs.replace(self.study, step_length=step, metrics=metrics))
+        return self.for_study(
+            msgspec.structs.replace(self.study, step_length=step, metrics=metrics)
+        )
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
-        """An evaluator of another study, on the same pool; `verified` settings are simulated in SUMO, too."""
-        other = Evaluator(study, self._pool, self._show, self._verified if verified is None else verified)
+        """An evaluator of another study, on the same pool; `verified` settings are simulated in
+        SUMO, too.
+        """
+        other = Evaluator(
+            study, self._pool, self._show, self._verified if verified is None else verified
+        )
         other.measure = self.measure
         other.undefined = self.undefined
         return other
@@ -351,8 +417,8 @@ class Evaluator:
 def side_by_side(
     evaluators: Sequence[Evaluator], measure: Callable[[Evaluator], Found], stage: str = ""
 ) -> list[Found]:
-    """What `measure` finds with each evaluator of one pool; as many at the same time as there are workers. Progress
-    is shown for `stage`, or by the evaluators if they have no company.
+    """What `measure` finds with each evaluator of one pool; as many at the same time as there are
+    workers. Progress is shown for `stage`, or by the evaluators if they have no company.
     """
     if len(evaluators) < 2:
         return [measure(one) for one in evaluators]
@@ -379,10 +445,13 @@ def side_by_side(
 
 @contextmanager
 def open_evaluator(
-    study: Study, pool: Pool | None = None, jobs: int | None = None, progress: Progress = show_no_progress
+    study: Study,
+    pool: Pool | None = None,
+    jobs: int | None = None,
+    progress: Progress = show_no_progress,
 ) -> Iterator[Evaluator]:
-    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by default one for each
-    core.
+    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by
+    default one for each core.
 
     Raises
     ------

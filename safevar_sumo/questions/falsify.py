@@ -1,5 +1,5 @@
-"""The falsification of a claim about a box: a search for a setting in it that is unsafe in any of some models; and the
-largest value of a parameter, such as a speed, up to which it finds none.
+"""The falsification of a claim about a box: a search for a setting in it that is unsafe in any of
+some models; and the largest value of a parameter, such as a speed, up to which it finds none.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.records import FloatArray
 
 LEAST_SIMULATIONS = 1000
-"""Fewest simulations that search for a counterexample before a value is printed as one that holds."""
+"""Fewest simulations that search for a counterexample before a value is printed as one that holds.
+"""
 POINTS = 128
-"""Number of Sobol points, of corners, of random settings with half of their values at ends, and of settings at a value
-that is tested, with which a falsification begins in each model.
+"""Number of Sobol points, of corners, of random settings with half of their values at ends, and of
+settings at a value that is tested, with which a falsification begins in each model.
 """
 KNOWN = 16
 """Number of the worst of these with which the search goes on in each model."""
@@ -29,8 +30,8 @@ AnyModel = TypeVar("AnyModel", bound=Tested)
 
 
 class Falsification(NamedTuple, Generic[AnyModel]):
-    """The unsafe settings that a falsification found, shape (K, n), with the model of each group, none if the claim
-    held; and its search.
+    """The unsafe settings that a falsification found, shape (K, n), with the model of each group,
+    none if the claim held; and its search.
     """
 
     failures: list[tuple[AnyModel, FloatArray]]
@@ -38,8 +39,8 @@ class Falsification(NamedTuple, Generic[AnyModel]):
 
 
 class Reach(NamedTuple, Generic[AnyModel]):
-    """The largest value that holds, None if none does; the falsification that found nothing up to it; and all unsafe
-    settings that were found beyond it.
+    """The largest value that holds, None if none does; the falsification that found nothing up to
+    it; and all unsafe settings that were found beyond it.
     """
 
     value: float | None = None
@@ -48,7 +49,9 @@ class Reach(NamedTuple, Generic[AnyModel]):
 
 
 def enough(budget: int) -> int:
-    """The number of simulations with which a value that is printed is tested; 0 leaves the falsification out."""
+    """The number of simulations with which a value that is printed is tested; 0 leaves the
+    falsification out.
+    """
     return max(budget, LEAST_SIMULATIONS) if budget else 0
 
 
@@ -62,7 +65,8 @@ def falsify(
 ) -> Falsification[AnyModel]:
     """Search a box for unsafe settings with `budget` simulations, in all models.
 
-    `tested` is a column and its value that is to be printed: a part of the first settings has just this value.
+    `tested` is a column and its value that is to be printed: a part of the first settings has just
+    this value.
     """
     rng = np.random.default_rng(seed)
     settings = _first_settings(box, seed, rng, tested)
@@ -106,10 +110,12 @@ def reach(
     stage: str,
     known: Sequence[tuple[AnyModel, FloatArray]] = (),
 ) -> Reach[AnyModel]:
-    """The largest value of a column of a box up to which a falsification finds nothing, from its lower end on.
+    """The largest value of a column of a box up to which a falsification finds nothing, from its
+    lower end on.
 
-    Where a setting fails, a `known` one or one that is found, the value moves down to the last one before it with which
-    its encounter is safe. A value is rounded down as it is printed, and falsified again.
+    Where a setting fails, a `known` one or one that is found, the value moves down to the last one
+    before it with which its encounter is safe. A value is rounded down as it is printed, and
+    falsified again.
     """
     item = box.region.characteristics.members[column]
     low = float(box.lower[column])
@@ -131,7 +137,14 @@ def reach(
             break
         upper = box.upper.copy()
         upper[column] = high
-        found = falsify(Box(box.region, box.lower, upper), models, budget, (*seed, number), stage, (column, high))
+        found = falsify(
+            Box(box.region, box.lower, upper),
+            models,
+            budget,
+            (*seed, number),
+            stage,
+            (column, high),
+        )
         if not found.failures:
             return Reach(high, found.attack, failures)
         new = found.failures

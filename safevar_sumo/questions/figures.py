@@ -19,15 +19,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DPI = 200
-PICTURE_METADATA: Mapping[str, JsonObject] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-"""Metadata by file ending; they keep the date out of the file, so that equal figures have equal bytes."""
+PICTURE_METADATA: Mapping[str, JsonObject] = {
+    ".pdf": {"CreationDate": None},
+    ".svg": {"Date": None},
+}
+"""Metadata by file ending; they keep the date out of the file, so that equal figures have equal
+bytes.
+"""
 TRUETYPE = 42
 """matplotlib's number of the fonts in a pdf: publishers refuse its default, Type 3."""
 FONT_SIZE = 8
 DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
-"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they differ in a print without
-colours too.
+"""Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they
+differ in a print without colours too.
 """
 
 
@@ -50,15 +55,23 @@ def new_figure(
 
 
 def new_panels(
-    title: str, number: int, max_columns: int, panel_size: tuple[float, float], min_width: float, title_height: float
+    title: str,
+    number: int,
+    max_columns: int,
+    panel_size: tuple[float, float],
+    min_width: float,
+    title_height: float,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of the panels; all sizes
-    are in inches.
+    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of
+    the panels; all sizes are in inches.
     """
     columns = min(max_columns, number)
     rows = math.ceil(number / columns)
     figure, axes = new_figure(
-        title, rows, columns, (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows)
+        title,
+        rows,
+        columns,
+        (max(panel_size[0] * columns, min_width), title_height + panel_size[1] * rows),
     )
     for axis in axes.flat[number:]:
         axis.set_axis_off()

@@ -1,4 +1,6 @@
-"""A study and results by the measure of a criterion: it is simulated, and decides which point of a matrix is worst."""
+"""A study and results by the measure of a criterion: it is simulated, and decides which point of a
+matrix is worst.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ STAGE = "solutions by the measure"
 
 
 def study_by(study: Study, unsafe: Unsafe) -> Study:
-    """A study in which each setting has the measure of a criterion's bound, and in a matrix counts at the point where
-    that is worst; any other criterion leaves it as it is.
+    """A study in which each setting has the measure of a criterion's bound, and in a matrix counts
+    at the point where that is worst; any other criterion leaves it as it is.
 
     Raises
     ------
@@ -37,22 +39,34 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     metrics = study.metrics
     matrix = study.matrix
     known = [metric.name for metric in assemble(study).measuring.scoring.metrics]
-    check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS])
+    check_name(
+        "unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS]
+    )
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     if matrix is not None and not unsafe.is_of_points:
-        matrix = replace_in(matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}")
+        matrix = replace_in(
+            matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}"
+        )
     return replace_in(study, metrics=metrics, matrix=matrix)
 
 
-def subject_by(subject: Study | Case | Path, unsafe: Unsafe, evaluator: Evaluator) -> Study | Case | Path:
+def subject_by(
+    subject: Study | Case | Path, unsafe: Unsafe, evaluator: Evaluator
+) -> Study | Case | Path:
     """A subject of a question by a criterion; files stay as they are."""
     if isinstance(subject, Path):
         return subject
-    return study_by(subject, unsafe) if isinstance(subject, Study) else case_by(subject, unsafe, evaluator)
+    return (
+        study_by(subject, unsafe)
+        if isinstance(subject, Study)
+        else case_by(subject, unsafe, evaluator)
+    )
 
 
-def cases_by(cases: Sequence[Case], text: str | None, jobs: int | None, progress: Progress) -> list[Case]:
+def cases_by(
+    cases: Sequence[Case], text: str | None, jobs: int | None, progress: Progress
+) -> list[Case]:
     """Results by the criterion that a text states; as they are without one.
 
     Raises
@@ -70,11 +84,13 @@ def cases_by(cases: Sequence[Case], text: str | None, jobs: int | None, progress
 
 
 def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
-    """Results by a criterion: with a bound on a metric that they lack, or that is of another point of a matrix, all
-    solutions are simulated again.
+    """Results by a criterion: with a bound on a metric that they lack, or that is of another point
+    of a matrix, all solutions are simulated again.
     """
     study = study_by(case.study, unsafe)
     if study == case.study:
         return replace(case, stated=unsafe)
     evaluations = evaluator.for_study(study, verified=0).evaluate(case.settings, STAGE)
-    return replace(case.simulated_as(study, assemble(study).measuring.scoring, evaluations), stated=unsafe)
+    return replace(
+        case.simulated_as(study, assemble(study).measuring.scoring, evaluations), stated=unsafe
+    )

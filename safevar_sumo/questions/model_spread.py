@@ -1,5 +1,5 @@
-"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the published data
-equally well.
+"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the
+published data equally well.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ FITS_AT_ONCE = "fits of the vehicle model"
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
-"""Half the width [standard deviations] of the interval that holds `BAND_SHARE` of a normal distribution."""
+"""Half the width [standard deviations] of the interval that holds `BAND_SHARE` of a normal
+distribution.
+"""
 ROUNDING_TOLERANCE = 1e-5
-"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in the first set of
-[spread].
+"""Relative tolerance within which a parameter's value in the study equals its (rounded) value in
+the first set of [spread].
 """
 LEAST_DISTANCE = 0.3
-"""The model's error takes no vehicle as nearer to the original than this distance [domain widths]: near the original,
-too, a decision may fall a frame off.
+"""The model's error takes no vehicle as nearer to the original than this distance [domain widths]:
+near the original, too, a decision may fall a frame off.
 """
 
 
@@ -43,8 +45,9 @@ class ModelSpread(NamedTuple):
     sets
         Number of parameter sets.
     lower, upper
-        Ends of the band that holds 90 % of the sets' safety degrees and of repeats of a simulation [m, or -m/s]. The
-        model's error widens the band if the study states this error. None if no set has a safety degree.
+        Ends of the band that holds 90 % of the sets' safety degrees and of repeats of a simulation
+        [m, or -m/s]. The model's error widens the band if the study states this error. None if no
+        set has a safety degree.
     collisions
         Number of parameter sets with which the vehicle collides.
     """
@@ -58,7 +61,8 @@ class ModelSpread(NamedTuple):
 def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
     """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.
 
-    In a matrix, all settings are simulated at `point`; if no point is named, each setting at its worst point.
+    In a matrix, all settings are simulated at `point`; if no point is named, each setting at its
+    worst point.
 
     Raises
     ------
@@ -74,30 +78,41 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
 
 
 def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper ends, shape (M,) each, of the band of the sets' predictions for M settings."""
-    error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(study, evaluations[0].settings)
+    """Lower and upper ends, shape (M,) each, of the band of the sets' predictions for M
+    settings.
+    """
+    error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(
+        study, evaluations[0].settings
+    )
     return prediction_band(
-        np.stack([prediction.f_safe for prediction in evaluations]), study.repeatability.get(SAFETY_DEGREE, 0.0), error
+        np.stack([prediction.f_safe for prediction in evaluations]),
+        study.repeatability.get(SAFETY_DEGREE, 0.0),
+        error,
     )
 
 
 def error_distance(study: Study, settings: FloatArray) -> FloatArray:
-    """The distance of settings from the original vehicle to which the model's error is proportional, shape (M,).
+    """The distance of settings from the original vehicle to which the model's error is
+    proportional, shape (M,).
 
-    It is the Euclidean distance, each characteristic in widths of its domain, but at least `LEAST_DISTANCE`.
+    It is the Euclidean distance, each characteristic in widths of its domain, but at least
+    `LEAST_DISTANCE`.
     """
     characteristics = CharacteristicSet.of(study)
-    changes = (settings - characteristics.original) / (characteristics.upper - characteristics.lower)
+    changes = (settings - characteristics.original) / (
+        characteristics.upper - characteristics.lower
+    )
     return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
 
 
 def prediction_band(
     safety_degrees: FloatArray, repeatability: float, error: FloatArray | float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper ends, shape (M,) each, of the band of predicted safety degrees, shape (sets, M).
+    """Lower and upper ends, shape (M,) each, of the band of predicted safety degrees, shape (sets,
+    M).
 
-    Repeats of a simulation, with the standard deviation `repeatability`, and the model's `error` widen the band on each
-    side.
+    Repeats of a simulation, with the standard deviation `repeatability`, and the model's `error`
+    widen the band on each side.
     """
     ends = np.full((2, safety_degrees.shape[1]), np.nan)
     is_defined = np.isfinite(safety_degrees).any(axis=0)
@@ -108,22 +123,28 @@ def prediction_band(
 
 
 def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
-    """Evaluate settings, shape (M, n), in this process with each parameter set, first with the study's values."""
+    """Evaluate settings, shape (M, n), in this process with each parameter set, first with the
+    study's values.
+    """
     if point:
         study = at_point(study, point)
     systems = []
     for k, one in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
         systems.append(
-            assemble(msgspec.structs.replace(one, origin=msgspec.structs.replace(one.origin, called=called)))
+            assemble(
+                msgspec.structs.replace(
+                    one, origin=msgspec.structs.replace(one.origin, called=called)
+                )
+            )
         )
     return [evaluate(system, settings) for system in systems]
 
 
 def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
-    """What `measure` finds with the study's own parameters, then with each other of the first `fits` parameter sets;
-    several at the same time, in threads. The others are not verified in SUMO, because scene and equations are those of
-    the study.
+    """What `measure` finds with the study's own parameters, then with each other of the first
+    `fits` parameter sets; several at the same time, in threads. The others are not verified in
+    SUMO, because scene and equations are those of the study.
     """
     study = evaluator.study
     others = studies_of_sets(study)[1:fits] if study.spread else []
@@ -140,11 +161,18 @@ def studies_of_sets(study: Study) -> list[Study]:
         If the study has no parameter sets, or lacks a parameter that they name.
     """
     if not study.spread:
-        raise InputError(study.source, "has no table [spread]", "a study that was fitted to data, such as sun or rain")
+        raise InputError(
+            study.source,
+            "has no table [spread]",
+            "a study that was fitted to data, such as sun or rain",
+        )
     outside_names = parameters_outside_sets(study)
     sets = {key: values[1:] for key, values in study.spread.items() if key not in outside_names}
     number = len(next(iter(study.spread.values()))) - 1
-    return [study, *(with_values(study, {key: sets[key][k] for key in sets}) for k in range(number))]
+    return [
+        study,
+        *(with_values(study, {key: sets[key][k] for key in sets}) for k in range(number)),
+    ]
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
@@ -168,7 +196,8 @@ def remarks_on_sets(study: Study) -> list[str]:
 
 
 def with_values(study: Study, values: Mapping[str, float]) -> Study:
-    """A study with other values of some parameters, which are named by their keys in the study file.
+    """A study with other values of some parameters, which are named by their keys in the study
+    file.
 
     Raises
     ------

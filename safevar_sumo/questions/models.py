@@ -1,4 +1,6 @@
-"""Models of the vehicle in which a claim is tested: the fits of its study, at the study's points and between them."""
+"""Models of the vehicle in which a claim is tested: the fits of its study, at the study's points
+and between them.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,8 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 SEARCHED_MARGIN = 0.1
-"""Distance to keep in a study that searches its scenario [m]: where the original keeps just its margin, wear may use up
-the rest, and contact is no limit to release.
+"""Distance to keep in a study that searches its scenario [m]: where the original keeps just its
+margin, wear may use up the rest, and contact is no limit to release.
 """
 BETWEEN_DECIMALS = 2
 """Decimals of a parameter between two values of a matrix."""
@@ -58,10 +60,14 @@ class Model(NamedTuple):
         return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
 
     def left(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it does not
-        count.
+        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
+        where it does not count.
         """
-        return np.where(self.evaluator.region.feasible(settings), self.left_by(self.evaluate(settings, stage)), np.inf)
+        return np.where(
+            self.evaluator.region.feasible(settings),
+            self.left_by(self.evaluate(settings, stage)),
+            np.inf,
+        )
 
     def left_by(self, evaluations: Evaluations) -> FloatArray:
         """What evaluated settings leave; see `left`."""
@@ -72,8 +78,8 @@ class Model(NamedTuple):
         return self.left(settings, stage) < 0
 
     def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
-        """The model at the points of the study's matrix at which settings are worst; without a matrix, and in a study
-        that searches its scenario, as it is.
+        """The model at the points of the study's matrix at which settings are worst; without a
+        matrix, and in a study that searches its scenario, as it is.
         """
         if len(self.evaluator.characteristics.scenario):
             return self
@@ -81,12 +87,14 @@ class Model(NamedTuple):
         if worst is None:
             return self
         numbers = np.unique(worst).tolist()
-        return self._replace(points=tuple(self.points[number] for number in numbers) if self.points else (*numbers,))
+        return self._replace(
+            points=tuple(self.points[number] for number in numbers) if self.points else (*numbers,)
+        )
 
 
 class Models(NamedTuple):
-    """The fits in which a claim is tested, the study's own first, and the numbers of those left out: fits in which the
-    original itself is unsafe, or keeps less than the margin.
+    """The fits in which a claim is tested, the study's own first, and the numbers of those left
+    out: fits in which the original itself is unsafe, or keeps less than the margin.
     """
 
     members: tuple[Model, ...]
@@ -113,8 +121,9 @@ def limit_criterion(
     margin: float | None,
     original: Evaluations,
 ) -> Unsafe:
-    """What is unsafe for limits: the stated criterion as it is, else a collision or less than the margin [m], which
-    is by default that of the study; `SEARCHED_MARGIN` in one that searches its scenario, whose originals keep more.
+    """What is unsafe for limits: the stated criterion as it is, else a collision or less than the
+    margin [m], which is by default that of the study; `SEARCHED_MARGIN` in one that searches its
+    scenario, whose originals keep more.
     """
     study = evaluator.study
     is_distance = unsafe is None and margin is not None
@@ -131,7 +140,9 @@ def check_margin(criterion: Unsafe, margin: float | None) -> None:
     """Refuse a distance to keep beside another criterion than a collision."""
     if margin is not None and not criterion.is_collision:
         raise InputError(
-            "margin", f"{margin:g} m beside {str(criterion)!r}", "a collision, from which a distance is kept"
+            "margin",
+            f"{margin:g} m beside {str(criterion)!r}",
+            "a collision, from which a distance is kept",
         )
 
 
@@ -140,9 +151,12 @@ def distance_to_keep(study: Study, margin: float | None) -> float:
     return SEARCHED_MARGIN if margin is None and study.scenario.search else margin_of(study, margin)
 
 
-def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False) -> Models:
-    """The first `fits` fits of a study, by default all: what is unsafe holds in the study's own, and a distance to keep
-    there alone. No other fit may collide. Those with an unsafe original are left out unless they are wanted.
+def models_of(
+    evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False
+) -> Models:
+    """The first `fits` fits of a study, by default all: what is unsafe holds in the study's own,
+    and a distance to keep there alone. No other fit may collide. Those with an unsafe original are
+    left out unless they are wanted.
     """
     study = evaluator.study
     studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
@@ -151,7 +165,9 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_un
     left_out = list[int]()
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
-        original = model.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "original with each fit")
+        original = model.evaluator.evaluate(
+            evaluator.characteristics.original[np.newaxis], "original with each fit"
+        )
         if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
             left_out.append(number)
         else:
@@ -162,9 +178,9 @@ def models_of(evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_un
 def with_points_between(
     model: Model, unsafe: Unsafe, count: int, cells: Sequence[MatrixTest] | None = None
 ) -> tuple[Model, int]:
-    """A model whose study also has points between those of its matrix, or of other `cells`, drawn at random, and the
-    number of those left out: points at which the original itself is unsafe, by a criterion that may be stricter than
-    the model's. For another `count` the points are others.
+    """A model whose study also has points between those of its matrix, or of other `cells`, drawn
+    at random, and the number of those left out: points at which the original itself is unsafe, by a
+    criterion that may be stricter than the model's. For another `count` the points are others.
     """
     study = model.evaluator.study
     rng = Stream.TESTS_BETWEEN.generator(study.search.seed, count)
@@ -182,7 +198,9 @@ def with_points_between(
         return model, len(tests)
     assert study.matrix is not None
     denser = _with_tests(study, [*study.matrix.tests, *kept])
-    return model._replace(evaluator=model.evaluator.for_study(denser, verified=0)), len(tests) - len(kept)
+    return model._replace(evaluator=model.evaluator.for_study(denser, verified=0)), len(
+        tests
+    ) - len(kept)
 
 
 def _with_tests(study: Study, tests: Sequence[MatrixTest]) -> Study:
@@ -190,9 +208,12 @@ def _with_tests(study: Study, tests: Sequence[MatrixTest]) -> Study:
     return replace_in(study, matrix=replace_in(study.matrix, tests=[*tests]))
 
 
-def tests_between(study: Study, rng: np.random.Generator, cells: Sequence[MatrixTest] | None) -> list[MatrixTest]:
-    """A test at one random point in each cell of each test's grid: between neighbouring values of every axis that a
-    study may search, at all values of other axes; none without such an axis. `cells` are tests in place of the study's.
+def tests_between(
+    study: Study, rng: np.random.Generator, cells: Sequence[MatrixTest] | None
+) -> list[MatrixTest]:
+    """A test at one random point in each cell of each test's grid: between neighbouring values of
+    every axis that a study may search, at all values of other axes; none without such an axis.
+    `cells` are tests in place of the study's.
     """
     if study.matrix is None or study.matrix.protocol or study.scenario.search or cells == []:
         return []
@@ -201,10 +222,14 @@ def tests_between(study: Study, rng: np.random.Generator, cells: Sequence[Matrix
     tests = list[MatrixTest]()
     for test, points in points_of_tests(study, assemble(study).points):
         searchable = searchable_in(points[0].scenario)
-        pairs = {name: _cells(values) if name in searchable else [] for name, values in test.over.items()}
+        pairs = {
+            name: _cells(values) if name in searchable else [] for name, values in test.over.items()
+        }
         if not any(pairs.values()):
             continue
-        for cell in product(*(pairs[name] or [(value,) for value in values] for name, values in test.over.items())):
+        for cell in product(
+            *(pairs[name] or [(value,) for value in values] for name, values in test.over.items())
+        ):
             drawn = [_draw(ends, rng) for ends in cell]
             over = {name: [value] for name, value in zip(test.over, drawn, strict=True)}
             tests.append(replace_in(test, over=over))

@@ -1,4 +1,6 @@
-"""The same settings in two systems, A and B: where they are unsafe, and a test of their safety degrees."""
+"""The same settings in two systems, A and B: where they are unsafe, and a test of their safety
+degrees.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
 
 SIDES = ("a", "b")
 UNSAFE_IN = {"a": "only_a_unsafe", "b": "only_b_unsafe", "both": "both", "neither": "neither"}
-"""In which systems a setting is unsafe, as the table says it, and the number that counts such settings."""
+"""In which systems a setting is unsafe, as the table says it, and the number that counts such
+settings.
+"""
 SETTING_COLUMNS = {
     "solution": Column("", "handle of the solution"),
     "unsafe_in": Column("", f"systems in which it is unsafe: {', '.join(UNSAFE_IN)}"),
@@ -26,7 +30,10 @@ SETTING_COLUMNS = {
         for side in SIDES
         for name, column in (
             ("outcome", Column("", f"outcome in {side.upper()}")),
-            ("degree", Column("m", f"safety degree in {side.upper()}; in -m/s on a collision", ".2f")),
+            (
+                "degree",
+                Column("m", f"safety degree in {side.upper()}; in -m/s on a collision", ".2f"),
+            ),
         )
     },
 }
@@ -34,37 +41,55 @@ ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 
 def table_of_pairs(
-    solutions: Sequence[str] | pd.Series[str], a: Evaluations, b: Evaluations, in_a: BoolArray, in_b: BoolArray
+    solutions: Sequence[str] | pd.Series[str],
+    a: Evaluations,
+    b: Evaluations,
+    in_a: BoolArray,
+    in_b: BoolArray,
 ) -> pd.DataFrame:
-    """The frame with `SETTING_COLUMNS` of settings that were evaluated in two systems, and are unsafe `in_a` and
-    `in_b`.
+    """The frame with `SETTING_COLUMNS` of settings that were evaluated in two systems, and are
+    unsafe `in_a` and `in_b`.
     """
-    where = np.select([in_a & ~in_b, in_b & ~in_a, in_a & in_b], [*UNSAFE_IN][:-1], [*UNSAFE_IN][-1])
+    where = np.select(
+        [in_a & ~in_b, in_b & ~in_a, in_a & in_b], [*UNSAFE_IN][:-1], [*UNSAFE_IN][-1]
+    )
     values = (solutions, where, a.outcome, a.f_safe, b.outcome, b.f_safe)
     return pd.DataFrame(dict(zip(SETTING_COLUMNS, values, strict=True)))
 
 
 def counts_of(settings: pd.DataFrame) -> dict[str, int]:
     """How many settings of a table are unsafe in A only, in B only, in both and in neither."""
-    return {number: int((settings["unsafe_in"] == where).sum()) for where, number in UNSAFE_IN.items()}
+    return {
+        number: int((settings["unsafe_in"] == where).sum()) for where, number in UNSAFE_IN.items()
+    }
 
 
 def paired_test(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """The p-value of the signed-rank test of pairs, and the probability that A's value is greater (Vargha and Delaney's
-    A12); NaN without pairs.
+    """The p-value of the signed-rank test of pairs, and the probability that A's value is greater
+    (Vargha and Delaney's A12); NaN without pairs.
     """
     return signed_rank_test(a - b).p_value, compare_samples(a, b).effect_size
 
 
 def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
     """The safety degree of every setting in B over that in A; on the line they agree."""
-    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, VERMILION, escape_dollars, new_figure
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        FONT_SIZE,
+        GREY,
+        SKY_BLUE,
+        VERMILION,
+        escape_dollars,
+        new_figure,
+    )
 
     frame = answer.tables["settings"]
     figure, ((axis,),) = new_figure(f"Unsafe: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0))
     for where, colour in {"neither": GREY, "both": SKY_BLUE, "a": BLUE, "b": VERMILION}.items():
         rows = frame[frame["unsafe_in"] == where]
-        axis.scatter(rows["a_degree"], rows["b_degree"], s=6, color=colour, label=where, rasterized=True)
+        axis.scatter(
+            rows["a_degree"], rows["b_degree"], s=6, color=colour, label=where, rasterized=True
+        )
     axis.axline((0, 0), slope=1, color="black", linewidth=0.6)
     labels = [escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles]
     axis.set(xlabel=labels[0], ylabel=labels[1])

@@ -1,11 +1,13 @@
-"""Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in the same vehicle?
+"""Preventability of collisions (ISO 34502, UN R157): would a reference driver have avoided them in
+the same vehicle?
 
-If a competent driver avoids a collision, the driving system failed. If not even full braking at the first possible
-moment avoids it, the vehicle is the cause. A driver who collides at a point in the original vehicle, too, says nothing
-about a changed vehicle there: no verdict. UN R157 means its driver for cars that cut in, cut out or brake on
-motorways; its use for pedestrians is ours. How fast a driver reacts to a pedestrian is therefore uncertain: the share
-of collisions that the driver avoids is computed for a later reaction, too. The regulation names no danger if a leader
-brakes with 5 m/s^2 or less: there are two conventions, and both are computed.
+If a competent driver avoids a collision, the driving system failed. If not even full braking at the
+first possible moment avoids it, the vehicle is the cause. A driver who collides at a point in the
+original vehicle, too, says nothing about a changed vehicle there: no verdict. UN R157 means its
+driver for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours. How
+fast a driver reacts to a pedestrian is therefore uncertain: the share of collisions that the driver
+avoids is computed for a later reaction, too. The regulation names no danger if a leader brakes with
+5 m/s^2 or less: there are two conventions, and both are computed.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from safevar_sumo.sumo.system import System, assemble
 REFERENCE_DRIVERS = "reference drivers in the same vehicle"
 """The stage of progress."""
 MAX_SIMULATIONS = 20_000
-"""Approximate maximum number of simulations; if all given collisions need more, a random sample of them is simulated.
+"""Approximate maximum number of simulations; if all given collisions need more, a random sample of
+them is simulated.
 """
 DELAY = 0.4
 """Time by which a competent driver reacts later in the second of two computations [s]."""
@@ -45,17 +48,26 @@ DRIVERS: dict[str, tuple[str, JsonObject]] = {
     f"{LETTER}_later": ("competent_driver", LATER),
     f"{ANY_LEADER}_later": ("competent_driver", ANY | LATER),
 }
-"""Model and parameters of each driver, the weakest first; those who react later are not counted as drivers."""
-OF_LANES: dict[str, tuple[str, JsonObject]] = {name: (name, {}) for name in ("rss", "fuzzy_safety", "r157")}
+"""Model and parameters of each driver, the weakest first; those who react later are not counted as
+drivers.
+"""
+OF_LANES: dict[str, tuple[str, JsonObject]] = {
+    name: (name, {}) for name in ("rss", "fuzzy_safety", "r157")
+}
 """Further drivers where somebody drives ahead in the lane, or comes into it."""
-TITLES = {LETTER: "competent driver", ANY_LEADER: "competent driver, any braking of a leader", FULL: "full braking"}
+TITLES = {
+    LETTER: "competent driver",
+    ANY_LEADER: "competent driver, any braking of a leader",
+    FULL: "full braking",
+}
 NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
 COLUMNS: Columns = {
     "driver": (
-        "reference driver in the same vehicle: a competent driver; one who reacts to any braking of a leader, not only "
-        "above 5 m/s^2; full braking at the first possible moment; where a car ahead brakes, or takes or leaves "
-        "the lane, rss (responsibility-sensitive safety), fuzzy_safety and r157 (UN R157, 5.2.5)"
+        "reference driver in the same vehicle: a competent driver; one who reacts to any braking of"
+        " a leader, not only above 5 m/s^2; full braking at the first possible moment; where a car"
+        " ahead brakes, or takes or leaves the lane, rss (responsibility-sensitive safety),"
+        " fuzzy_safety and r157 (UN R157, 5.2.5)"
     ),
     "avoided": "collisions that he avoids",
     "later": f"collisions that he avoids if he needs {DELAY:g} s longer",
@@ -65,19 +77,19 @@ COLUMNS: Columns = {
     "later_share": Column("-", f"the share if he needs {DELAY:g} s longer", is_shown=False),
     "no_verdict_points": Column("", "points without a verdict", is_shown=False),
 }
-"""The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for the finite
-population), the share itself if all collisions were simulated.
+"""The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for
+the finite population), the share itself if all collisions were simulated.
 """
 
 
 def judge_sample(
     evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
 ) -> tuple[pd.DataFrame, int]:
-    """The result of `judge_collisions` for evaluated collisions, of which equal settings count once, and the number of
-    these collisions.
+    """The result of `judge_collisions` for evaluated collisions, of which equal settings count
+    once, and the number of these collisions.
 
-    If that takes more than about `max_simulations` simulations, only a random sample is simulated, drawn with the
-    study's seed.
+    If that takes more than about `max_simulations` simulations, only a random sample is simulated,
+    drawn with the study's seed.
     """
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
@@ -86,12 +98,16 @@ def judge_sample(
 
 
 def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
-    """The share that each driver avoids of the collisions on which he has a verdict; without a verdict no share."""
+    """The share that each driver avoids of the collisions on which he has a verdict; without a
+    verdict no share.
+    """
     return verdicts.drop(columns="point").mean().dropna()
 
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
-    """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of `judge_sample`."""
+    """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of
+    `judge_sample`.
+    """
     rows = []
     share_of = avoided_shares(verdicts)
     drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
@@ -108,38 +124,55 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
         rows.append((*counts, share_of.get(driver), low, high, share_of.get(later), points))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     return frame.astype(
-        {"later": "Int64", "share": float, "share_low": float, "share_high": float, "later_share": float}
+        {
+            "later": "Int64",
+            "share": float,
+            "share_low": float,
+            "share_high": float,
+            "later_share": float,
+        }
     )
 
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:
-    """The weakest driver who avoids a collision, in words; `verdicts` is a row of `judge_collisions`."""
+    """The weakest driver who avoids a collision, in words; `verdicts` is a row of
+    `judge_collisions`.
+    """
     otherwise = NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
     return next((title for driver, title in TITLES.items() if verdicts[driver] == 1), otherwise)
 
 
 def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
-    """Whether each driver avoids each of M evaluated collisions at its worst point: 1, 0, or NaN for no verdict.
+    """Whether each driver avoids each of M evaluated collisions at its worst point: 1, 0, or NaN
+    for no verdict.
 
-    A driver has no verdict on a collision at a point where he collides with the original vehicle, too, or if he cannot
-    be simulated. The columns are the drivers' names and `point`, the name of the point.
+    A driver has no verdict on a collision at a point where he collides with the original vehicle,
+    too, or if he cannot be simulated. The columns are the drivers' names and `point`, the name of
+    the point.
     """
     system = assemble(evaluator.study)
     drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
-    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(point="")
+    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(
+        point=""
+    )
     for index in np.unique(collisions.points).tolist():
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
         study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
         settings = collisions.settings[rows]
         there = system.at(point)
-        verdicts.loc[rows, list(drivers)] = _judge_at_point(evaluator.for_study(study), there, settings, drivers)
+        verdicts.loc[rows, list(drivers)] = _judge_at_point(
+            evaluator.for_study(study), there, settings, drivers
+        )
         verdicts.loc[rows, "point"] = point.name
     return verdicts
 
 
 def _judge_at_point(
-    evaluator: Evaluator, system: System, settings: FloatArray, drivers: Mapping[str, tuple[str, JsonObject]]
+    evaluator: Evaluator,
+    system: System,
+    settings: FloatArray,
+    drivers: Mapping[str, tuple[str, JsonObject]],
 ) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
     approach = approach_parameters(system)
@@ -151,27 +184,33 @@ def _judge_at_point(
     is_led = scenario.pre_crash in (PreCrash.LEAD_DECELERATING, PreCrash.CUT_IN)
     is_searched = len(system.characteristics.scenario) > 0
     for driver, (model, parameters) in drivers.items():
-        if ANY.items() <= parameters.items() and not is_led:  # nobody brakes: both conventions are one
+        if (
+            ANY.items() <= parameters.items() and not is_led
+        ):  # nobody brakes: both conventions are one
             verdicts[driver] = verdicts[driver.replace(ANY_LEADER, LETTER)]
             continue
         ads = ModelTable(model=model, parameters={**approach, **parameters})
         verified = 0 if driver in OF_LANES else None
-        with_driver = evaluator.for_study(replace(evaluator.study, ads=ads, spread={}), verified=verified)
+        with_driver = evaluator.for_study(
+            replace(evaluator.study, ads=ads, spread={}), verified=verified
+        )
         runs = with_driver.evaluate(with_original, REFERENCE_DRIVERS)
         avoided = np.where(runs.valid, ~runs.collided, np.nan)
-        # In a searched scenario the original meets each encounter: where it is unsafe, the setting is infeasible.
+        # In a searched scenario the original meets each encounter: where it is unsafe, the setting
+        # is infeasible.
         has_verdict = is_searched or avoided[0] == 1
         verdicts[driver] = avoided[1:] if has_verdict else np.full(len(settings), np.nan)
     return np.column_stack(list(verdicts.values()))
 
 
 def approach_parameters(system: System) -> JsonObject | None:
-    """Parameters with which a reference driver approaches from rest as the driving system does with the original
-    vehicle; None in a study that searches its scenario, where that would be the approach to another encounter.
+    """Parameters with which a reference driver approaches from rest as the driving system does with
+    the original vehicle; None in a study that searches its scenario, where that would be the
+    approach to another encounter.
 
-    The driver replays the throttle until the driving system first brakes or reaches its peak speed, and holds that
-    speed, so that both are at the same position when the danger begins. If the run begins at speed, the driver keeps
-    that speed.
+    The driver replays the throttle until the driving system first brakes or reaches its peak speed,
+    and holds that speed, so that both are at the same position when the danger begins. If the run
+    begins at speed, the driver keeps that speed.
     """
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     speed = trace.speed[:, 0]

@@ -1,6 +1,7 @@
 """How many Euro NCAP points does a vehicle earn, and how many does a worn variant lose?
 
-All cells and robustness layers of the protocol are simulated, and scored by the official rules (`protocol/rater.py`).
+All cells and robustness layers of the protocol are simulated, and scored by the official rules
+(`protocol/rater.py`).
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ DECIMALS = 9
 """Decimals of points and measured values; further decimals would hold only rounding errors."""
 POINTS = partial(Column, "", number_format=".2f")
 VEHICLE: Columns = {"variant": "the original vehicle, or its variant"}
-TEST: Columns = VEHICLE | {"test": "test of the protocol, with the light if it is driven by day and by night"}
+TEST: Columns = VEHICLE | {
+    "test": "test of the protocol, with the light if it is driven by day and by night"
+}
 TESTS: Columns = TEST | {
     "possible": POINTS(meaning="points of the test"),
     "points": POINTS(meaning="points that the vehicle earns"),
@@ -60,7 +63,10 @@ VEHICLES: Columns = VEHICLE | {
     "invalid_cells": "cells in which the vehicle cannot hold the speed; they earn nothing",
     "remark": "what the protocol or its calculator makes of this vehicle",
 }
-NOT_SIMULATED: Columns = {"test": "test of the protocol", "points": POINTS(meaning="points of the test")}
+NOT_SIMULATED: Columns = {
+    "test": "test of the protocol",
+    "points": POINTS(meaning="points of the test"),
+}
 CELLS: Columns = TEST | {
     "range": "standard or extended range, or a robustness layer",
     "condition": "condition of the robustness layer",
@@ -88,17 +94,19 @@ def rating(
     set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
 ) -> Answer:
-    """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as Euro NCAP does in 2026.
+    """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as
+    Euro NCAP does in 2026.
 
-    Tests by day take place in the study's weather. Its numbers are the points of the original vehicle, the possible
-    ones, and those that the variant loses.
+    Tests by day take place in the study's weather. Its numbers are the points of the original
+    vehicle, the possible ones, and those that the variant loses.
 
     Parameters
     ----------
     set
         A characteristic of the variant, in its unit or as +10% of the original; may be repeated.
     solution
-        The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it further.
+        The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it
+        further.
     """
     study = evaluator.study
     original = evaluator.characteristics.original
@@ -113,7 +121,9 @@ def rating(
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
     rater = assemble(study).rater
     assert rater is not None
-    cells = evaluator.for_study(study).at_each_point(np.stack([*settings.values()]), "cells and robustness layers")
+    cells = evaluator.for_study(study).at_each_point(
+        np.stack([*settings.values()]), "cells and robustness layers"
+    )
     return rate(study, rater, settings, cells)
 
 
@@ -125,29 +135,41 @@ def _variant(
     Raises
     ------
     InputError
-        If there is no such solution, a value is outside its domain, or the changed variant violates a constraint.
+        If there is no such solution, a value is outside its domain, or the changed variant violates
+        a constraint.
     """
     characteristics = evaluator.characteristics
     setting = characteristics.original
     name = "variant"
     if solution is not None:
         if isinstance(subject, Study):
-            raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
+            raise InputError(
+                "solution",
+                f"{subject.name!r} is a study and has no solutions",
+                "a results directory",
+            )
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(solution))]
         setting = row[list(characteristics.names)].to_numpy(float)
         name = solution
     if changes:
         with about("set"):
             values = dict(zip(characteristics.names, setting.tolist(), strict=True))
-            values |= {key: value for key, (value,) in read_changes(changes, characteristics, single=True).items()}
+            values |= {
+                key: value
+                for key, (value,) in read_changes(changes, characteristics, single=True).items()
+            }
             setting = characteristics.setting(values)
             evaluator.region.check(setting[np.newaxis])
         name = "variant" if solution is None else f"{solution} changed"
     return {name: setting} if changes or solution else {}
 
 
-def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: CellResults) -> Answer:
-    """The answer about the original vehicle and its variant, settings by name, that were simulated in all cells."""
+def rate(
+    study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: CellResults
+) -> Answer:
+    """The answer about the original vehicle and its variant, settings by name, that were simulated
+    in all cells.
+    """
     protocol = rater.protocol
     scores = rater.points(cells)
     names = list(settings)
@@ -157,9 +179,13 @@ def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: 
     changes = [_changes(study, setting) for setting in settings.values()]
     invalid = (~cells.valid).sum(axis=1)
     remarks = [*_remarks(rater, scores, cells)]
-    vehicles = tabulate("Vehicles", VEHICLES, zip(names, scores.total, lost, changes, invalid, remarks, strict=True))
+    vehicles = tabulate(
+        "Vehicles", VEHICLES, zip(names, scores.total, lost, changes, invalid, remarks, strict=True)
+    )
     not_simulated = tabulate(
-        "Not simulated, neither passed nor failed", NOT_SIMULATED, protocol.points_not_simulated.items()
+        "Not simulated, neither passed nor failed",
+        NOT_SIMULATED,
+        protocol.points_not_simulated.items(),
     )
     return Answer(
         question="rating",
@@ -182,7 +208,9 @@ def rate(study: Study, rater: Rater, settings: Mapping[str, FloatArray], cells: 
     )
 
 
-def _rows_of_tests(rater: Rater, scores: Points, names: list[str]) -> Iterator[tuple[float | str | None, ...]]:
+def _rows_of_tests(
+    rater: Rater, scores: Points, names: list[str]
+) -> Iterator[tuple[float | str | None, ...]]:
     for number, name in enumerate(names):
         for matrix in rater.protocol.matrices:
             points = scores.tests[matrix.name].round(DECIMALS)
@@ -194,12 +222,22 @@ def _rows_of_tests(rater: Rater, scores: Points, names: list[str]) -> Iterator[t
             ]
             yield (
                 *(name, matrix.name, sum(matrix.points)),
-                *(totals[number], round(totals[0] - totals[number], DECIMALS), *points[number], *matrix.points[:2]),
-                *(", ".join(layers) or None for layers in (failing, rater.claims.get(matrix.test_name, ()))),
+                *(
+                    totals[number],
+                    round(totals[0] - totals[number], DECIMALS),
+                    *points[number],
+                    *matrix.points[:2],
+                ),
+                *(
+                    ", ".join(layers) or None
+                    for layers in (failing, rater.claims.get(matrix.test_name, ()))
+                ),
             )
 
 
-def _cells(protocol: Protocol, scores: Points, results: CellResults, names: list[str]) -> pd.DataFrame:
+def _cells(
+    protocol: Protocol, scores: Points, results: CellResults, names: list[str]
+) -> pd.DataFrame:
     """The rows of `CELLS`: all cells of each vehicle."""
     placed = pd.DataFrame(
         [
@@ -238,7 +276,9 @@ def _remarks(rater: Rater, scores: Points, cells: CellResults) -> Iterator[str |
     for number, fails in enumerate(scores.fails):
         remarks = []
         if fails:
-            remarks.append(f"it earns nothing, because {REQUIRED} is not green in the whole standard range")
+            remarks.append(
+                f"it earns nothing, because {REQUIRED} is not green in the whole standard range"
+            )
         elif scores.colours[number, protocol.unchecked_cells].any():
             remarks.append(
                 f"{UNCHECKED} is not green, which Euro NCAP requires; Euro NCAP's calculator "
@@ -262,20 +302,29 @@ def _points_of_open_layers(rater: Rater) -> float:
 
 
 def _verdict(
-    study: Study, settings: Mapping[str, FloatArray], scores: Points, possible: float, tests: pd.DataFrame
+    study: Study,
+    settings: Mapping[str, FloatArray],
+    scores: Points,
+    possible: float,
+    tests: pd.DataFrame,
 ) -> str:
-    """How many points the variant loses and in which tests; without a variant, the original's points."""
+    """How many points the variant loses and in which tests; without a variant, the original's
+    points.
+    """
     weather = weather_of(study.weather)
     road = ""
     if weather.water or weather.road_friction != 1:
         road = (
-            f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by night "
-            f"{darken(weather).name!r}."
+            f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by"
+            f" night {darken(weather).name!r}."
         )
     *others, variant = settings
     earned = f"{scores.total[0]:.2f}"
     if not others:
-        return f"The original vehicle earns {earned} of the {possible:g} points of the tests that are simulated.{road}"
+        return (
+            f"The original vehicle earns {earned} of the {possible:g} points of the tests that are"
+            f" simulated.{road}"
+        )
     items = {item.name: item for item in CharacteristicSet.of(study)}
     changes = [
         f"{items[name].short_name} {float(items[name].text(value)):g}{items[name].suffix}"
@@ -283,33 +332,47 @@ def _verdict(
     ]
     lost = round(scores.total[0] - scores.total[-1], DECIMALS)
     where = ""
-    result = f"earns {-lost:.2f} points more, {scores.total[-1]:.2f} instead" if lost < 0 else f"loses {lost:.2f}"
+    result = (
+        f"earns {-lost:.2f} points more, {scores.total[-1]:.2f} instead"
+        if lost < 0
+        else f"loses {lost:.2f}"
+    )
     losses = tests[tests["variant"] == variant]
     largest = losses[losses["lost"] == losses["lost"].max()]
     if lost > 0:
         each = "each of " if len(largest) > 1 else ""
-        where = f", {largest['lost'].iloc[0]:.2f} of them in {each}{join_phrases([*largest['test']])}"
+        where = (
+            f", {largest['lost'].iloc[0]:.2f} of them in {each}{join_phrases([*largest['test']])}"
+        )
     return (
-        f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned} points that the "
-        f"original earns (of {possible:g} that are simulated){where}.{road}"
+        f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned}"
+        f" points that the original earns (of {possible:g} that are simulated){where}.{road}"
     )
 
 
 def _draw(protocol: Protocol, scores: Points, answer: Answer) -> Figure:
-    """The matrices of all tests with the colours of their cells, of the original and its variant side by side."""
+    """The matrices of all tests with the colours of their cells, of the original and its variant
+    side by side.
+    """
     vehicles = answer.tables["vehicles"]
     points = "; ".join(
-        f"{name}: {total:.2f} points" for name, total in zip(vehicles["variant"], vehicles["points"], strict=True)
+        f"{name}: {total:.2f} points"
+        for name, total in zip(vehicles["variant"], vehicles["points"], strict=True)
     )
     arrangement = " (original left, variant right)" if len(vehicles) > 1 else ""
     title = f"{answer.study.name}: {points} of {answer.numbers['possible']:g}{arrangement}"
-    figure, axes = new_panels(title, len(protocol.matrices), 4, (3.75, 2.6), min_width=15.0, title_height=0.0)
+    figure, axes = new_panels(
+        title, len(protocol.matrices), 4, (3.75, 2.6), min_width=15.0, title_height=0.0
+    )
     for axis, matrix in zip(axes, protocol.matrices, strict=True):
         _draw_matrix(axis, protocol, scores, matrix)
-    legend = ", ".join(f"{colour[0].upper()} {colour}" for colour in COLOURS) + "; small letters: extended range"
+    legend = (
+        ", ".join(f"{colour[0].upper()} {colour}" for colour in COLOURS)
+        + "; small letters: extended range"
+    )
     figure.supxlabel(
-        f"impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp; {legend}; "
-        "asterisk: colour differs from the original's",
+        "impact location [% of the width], or speed of the target [km/h] in CCCscp and CMCscp;"
+        f" {legend}; asterisk: colour differs from the original's",
         fontsize=FONT_SIZE,
     )
     figure.supylabel("speed of the vehicle under test [km/h]", fontsize=FONT_SIZE)
@@ -322,10 +385,16 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
     from matplotlib.colors import ListedColormap
 
     columns = [*(f"{value:g}" for value in matrix.column_values), ""]
-    rows = [f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}" for number, row in enumerate(matrix.rows)]
+    rows = [
+        f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}"
+        for number, row in enumerate(matrix.rows)
+    ]
     known = protocol.matrix_cell_numbers
     numbers = np.array(
-        [[known.get((matrix.name, row, column), -1) for column in range(len(columns))] for row in range(len(rows))]
+        [
+            [known.get((matrix.name, row, column), -1) for column in range(len(columns))]
+            for row in range(len(rows))
+        ]
     )
     is_extended = np.array([cell.range_or_layer == EXTENDED for cell in protocol.cells])
     colours = [np.where(numbers < 0, np.nan, of_vehicle[numbers]) for of_vehicle in scores.colours]
@@ -338,8 +407,19 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
     frame = pd.DataFrame(np.hstack(colours), rows, columns * len(colours))
     palette = ListedColormap(["#808080", *(f"#{protocol.colours[colour]}" for colour in COLOURS)])
     limits = {"vmin": -1, "vmax": len(COLOURS) - 1}
-    sns.heatmap(frame, annot=np.hstack(letters), fmt="", cmap=palette, **limits, cbar=False, linewidths=0.6, ax=axis)
+    sns.heatmap(
+        frame,
+        annot=np.hstack(letters),
+        fmt="",
+        cmap=palette,
+        **limits,
+        cbar=False,
+        linewidths=0.6,
+        ax=axis,
+    )
     axis.grid(False)
     axis.tick_params(labelsize=FONT_SIZE - 2, length=0, rotation=0)
     totals = " / ".join(f"{total:.2f}" for total in scores.tests[matrix.name].sum(axis=1))
-    axis.set_title(escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT_SIZE)
+    axis.set_title(
+        escape_dollars(f"{matrix.name}: {totals} of {sum(matrix.points):g}"), fontsize=FONT_SIZE
+    )

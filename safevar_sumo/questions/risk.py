@@ -1,9 +1,10 @@
-"""How likely is an unsafe vehicle when vehicles vary as a study specifies, and which characteristic decides?
+"""How likely is an unsafe vehicle when vehicles vary as a study specifies, and which characteristic
+decides?
 
-Plain Monte Carlo with the exact interval of Clopper and Pearson. What decides: Sobol indices, first order and total
-(Saltelli's design); where characteristics are correlated or constrained, for which Sobol's design does not exist, the
-first-order index from the drawn vehicles themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational
-Research 226, 536-550).
+Plain Monte Carlo with the exact interval of Clopper and Pearson. What decides: Sobol indices, first
+order and total (Saltelli's design); where characteristics are correlated or constrained, for which
+Sobol's design does not exist, the first-order index from the drawn vehicles themselves (Plischke,
+Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
 """
 
 from __future__ import annotations
@@ -18,7 +19,16 @@ import pandas as pd
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import HIGH, LOW, Answer, Column, Columns, contents, tabulate, with_interval
+from safevar_sumo.questions.answer import (
+    HIGH,
+    LOW,
+    Answer,
+    Column,
+    Columns,
+    contents,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.ask import Count, Criterion, Share, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -40,7 +50,9 @@ RESAMPLES = 200
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
 UNSURE = 0.5
-"""Width of an interval of a share of the variance from which on the verdict says that it is unsure [-]."""
+"""Width of an interval of a share of the variance from which on the verdict says that it is unsure
+[-].
+"""
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
@@ -49,14 +61,23 @@ UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
     "characteristic",
-    *(f"{output}_{index}{end}" for output in OUTPUTS for index in ("first", "total") for end in ("", LOW, HIGH)),
+    *(
+        f"{output}_{index}{end}"
+        for output in OUTPUTS
+        for index in ("first", "total")
+        for end in ("", LOW, HIGH)
+    ),
 ]
 Indices = Mapping[str, FloatArray]
-"""SALib's results: by key, an index of each characteristic, shape (n,), or half of its confidence interval."""
+"""SALib's results: by key, an index of each characteristic, shape (n,), or half of its confidence
+interval.
+"""
 
 
 @question
-@contents(*("unsafe", "samples", "failures", "probability", "interval", "confidence"), sensitivity=COLUMNS)
+@contents(
+    *("unsafe", "samples", "failures", "probability", "interval", "confidence"), sensitivity=COLUMNS
+)
 def risk(
     subject: Study | Case,
     evaluator: Evaluator,
@@ -65,8 +86,8 @@ def risk(
     confidence: Share = 0.95,
     unsafe: Criterion = None,
 ) -> Answer:
-    """Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which characteristics
-    decide it.
+    """Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which
+    characteristics decide it.
 
     Parameters
     ----------
@@ -92,7 +113,9 @@ def risk(
     failures = int(criterion.of(simulated).sum())
     total = len(simulated)
     if not total:
-        raise SimulationError(f"study {study.name!r}: none of {samples} vehicles could be simulated")
+        raise SimulationError(
+            f"study {study.name!r}: none of {samples} vehicles could be simulated"
+        )
     low, high = clopper_pearson(failures, total, confidence)
     if model.is_correlated or model.region or study.scenario.search:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
@@ -107,19 +130,30 @@ def risk(
         "confidence": confidence,
     }
     verdict = (
-        f"{_probability_in_words(study, failures / total)} ({criterion.description}; from {100 * low:.3g} to "
-        f"{100 * high:.3g} % with {100 * confidence:g} % confidence, {failures:,} of {total:,} vehicles)."
+        f"{_probability_in_words(study, failures / total)} ({criterion.description}; from"
+        f" {100 * low:.3g} to {100 * high:.3g} % with {100 * confidence:g} % confidence,"
+        f" {failures:,} of {total:,} vehicles)."
     )
     left_out = int(drawn.infeasible.sum())
     if total + left_out < samples:
-        verdict += f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
+        verdict += (
+            f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
+        )
     verdict += deciding_in_words(table, failures)
     verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
-    return Answer(question="risk", study=study, verdict=verdict, numbers=numbers, tables={"sensitivity": table})
+    return Answer(
+        question="risk",
+        study=study,
+        verdict=verdict,
+        numbers=numbers,
+        tables={"sensitivity": table},
+    )
 
 
 def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
-    """Which characteristic has the largest share of the safety degree's variance, and which shares are unsure."""
+    """Which characteristic has the largest share of the safety degree's variance, and which shares
+    are unsure.
+    """
     if table.empty:
         return ""
     index = "total" if table["degree_total"].notna().any() else "first"
@@ -128,20 +162,33 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     words = ""
     if np.isfinite(share):
         name = first["characteristic"]
-        words = f" {name} has the largest share of the safety degree's variance, {share:.2f} ({low:.2f} to {high:.2f})."
-    of_output = {name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS}
+        words = (
+            f" {name} has the largest share of the safety degree's variance, {share:.2f} ({low:.2f}"
+            f" to {high:.2f})."
+        )
+    of_output = {
+        name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
+    }
     for name, widths in of_output.items():
         if widths.max() > UNSURE:
-            words += f" Shares of {OUTPUTS[name]} are unsure: intervals of up to {widths.max():.2f}."
+            words += (
+                f" Shares of {OUTPUTS[name]} are unsure: intervals of up to {widths.max():.2f}."
+            )
     if failures and of_output["unsafe"].isna().all():
-        words += f" Too few vehicles of the design are unsafe, or safe, for shares of that ({MIN_OUTCOMES})."
+        words += (
+            " Too few vehicles of the design are unsafe, or safe, for shares of that"
+            f" ({MIN_OUTCOMES})."
+        )
     return words
 
 
 def _probability_in_words(study: Study, probability: float) -> str:
     """The probability, and how vehicles vary."""
     if not study.variation:
-        return f"{100 * probability:.3g} % of the domain is unsafe, no probability in the field without [variation]"
+        return (
+            f"{100 * probability:.3g} % of the domain is unsafe, no probability in the field"
+            " without [variation]"
+        )
     variation = [
         f"{name} {distribution.__struct_config__.tag}"
         for name, distribution in study.variation.items()
@@ -149,12 +196,18 @@ def _probability_in_words(study: Study, probability: float) -> str:
     ]
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
-    return f"The probability of an unsafe vehicle is {100 * probability:.3g} % if vehicles vary as specified, {manner}"
+    return (
+        f"The probability of an unsafe vehicle is {100 * probability:.3g} % if vehicles vary as"
+        f" specified, {manner}"
+    )
 
 
-def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float) -> pd.DataFrame:
-    """Sobol indices, first order and total, of independent characteristics; undefined where nothing varies, or too few
-    settings are unsafe or safe. Base points with a setting that could not be simulated do not count.
+def sobol_indices(
+    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float
+) -> pd.DataFrame:
+    """Sobol indices, first order and total, of independent characteristics; undefined where nothing
+    varies, or too few settings are unsafe or safe. Base points with a setting that could not be
+    simulated do not count.
     """
     from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
@@ -167,38 +220,66 @@ def sobol_indices(evaluator: Evaluator, model: VariationModel, criterion: Unsafe
     is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
     def indices_of(output: FloatArray) -> Indices:
-        options = {"calc_second_order": False, "num_resamples": RESAMPLES, "conf_level": confidence, "seed": seed}
+        options = {
+            "calc_second_order": False,
+            "num_resamples": RESAMPLES,
+            "conf_level": confidence,
+            "seed": seed,
+        }
         indices: Indices = analysis.analyze(problem, output[is_complete], **options)
         return indices
 
     outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
-    return _table(names, found, {"first": ("S1", "first order"), "total": ("ST", "total, with all others")})
+    return _table(
+        names, found, {"first": ("S1", "first order"), "total": ("ST", "total, with all others")}
+    )
 
 
-def given_data_indices(evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float) -> pd.DataFrame:
-    """The first-order index of correlated or constrained characteristics, from the vehicles as they were drawn: the
-    share of the variance that knowing a characteristic removes, with what is correlated with it.
+def given_data_indices(
+    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
+) -> pd.DataFrame:
+    """The first-order index of correlated or constrained characteristics, from the vehicles as they
+    were drawn: the share of the variance that knowing a characteristic removes, with what is
+    correlated with it.
     """
     from SALib.analyze import delta as analysis
 
     varies = np.ptp(drawn.settings, axis=0) > 0
-    names = [name for name, it_varies in zip(evaluator.characteristics.names, varies, strict=True) if it_varies]
-    problem = {"num_vars": len(names), "names": [str(number) for number in range(len(names))]}  # SALib reserves endings
+    names = [
+        name
+        for name, it_varies in zip(evaluator.characteristics.names, varies, strict=True)
+        if it_varies
+    ]
+    problem = {
+        "num_vars": len(names),
+        "names": [str(number) for number in range(len(names))],
+    }  # SALib reserves endings
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:
         seed = evaluator.study.search.seed % 2**32
-        with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):  # SALib sets both for the process
-            indices: Indices = analysis.analyze(problem, drawn.settings[:, varies], output, seed=seed, **options)
+        with (
+            warnings.catch_warnings(),
+            patch.object(warnings, "formatwarning"),
+        ):  # SALib sets both for the process
+            indices: Indices = analysis.analyze(
+                problem, drawn.settings[:, varies], output, seed=seed, **options
+            )
         return indices
 
     outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
-    return _table(names, found, {"first": ("S1", "first order, with what is correlated with it"), "total": UNDEFINED})
+    return _table(
+        names,
+        found,
+        {"first": ("S1", "first order, with what is correlated with it"), "total": UNDEFINED},
+    )
 
 
-def _outputs(evaluations: Evaluations, criterion: Unsafe, counts: BoolArray) -> dict[str, FloatArray | None]:
+def _outputs(
+    evaluations: Evaluations, criterion: Unsafe, counts: BoolArray
+) -> dict[str, FloatArray | None]:
     """The outputs by name; None where there are no indices."""
     is_unsafe = criterion.of(evaluations)
     failures = int(is_unsafe[counts].sum())
@@ -210,9 +291,11 @@ def _outputs(evaluations: Evaluations, criterion: Unsafe, counts: BoolArray) -> 
     }
 
 
-def _table(names: list[str], found: Mapping[str, Indices], indices: dict[str, tuple[str, str]]) -> pd.DataFrame:
-    """A row for each characteristic, the one that decides most of the safety degree first; `indices` maps an index to
-    SALib's key and its meaning.
+def _table(
+    names: list[str], found: Mapping[str, Indices], indices: dict[str, tuple[str, str]]
+) -> pd.DataFrame:
+    """A row for each characteristic, the one that decides most of the safety degree first;
+    `indices` maps an index to SALib's key and its meaning.
     """
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
     values = dict[str, FloatArray]()
@@ -224,7 +307,9 @@ def _table(names: list[str], found: Mapping[str, Indices], indices: dict[str, tu
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            columns |= with_interval(name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f"))
+            columns |= with_interval(
+                name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f")
+            )
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)

@@ -1,8 +1,9 @@
 """In which regions of the domain do failures lie, in physical units?
 
-A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the smallest tree whose
-score in cross-validation is within a standard error of the best score. Its boxes with more unsafe than safe settings
-become rules. A rule then loses the conditions that do not make it denser. Other vehicles test the rules.
+A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the
+smallest tree whose score in cross-validation is within a standard error of the best score. Its
+boxes with more unsafe than safe settings become rules. A rule then loses the conditions that do not
+make it denser. Other vehicles test the rules.
 """
 
 from __future__ import annotations
@@ -41,27 +42,37 @@ MIN_ADDED_SHARE = 0.01
 LIMIT_DIGITS = 3
 """Limits are rounded to this many digits of the domain's width."""
 UNLIMITED = np.array([[-np.inf], [np.inf]])
-"""Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in row 1."""
+"""Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in
+row 1.
+"""
 COLUMNS: Columns = {
     "rule": "limits of the characteristics; all others anywhere in their domains",
     **with_interval("density", Column("-", "unsafe share of the vehicles within the rule", ".2f")),
-    **with_interval("coverage", Column("-", "share of all unsafe vehicles that lie within the rule", ".2f")),
+    **with_interval(
+        "coverage", Column("-", "share of all unsafe vehicles that lie within the rule", ".2f")
+    ),
 }
 
 
 @question
 @contents("unsafe", "samples", "failures", "share", "interval", rules=COLUMNS)
-def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None) -> Answer:
+def rules(
+    subject: Study | Case,
+    evaluator: Evaluator,
+    *,
+    samples: Count = 16_384,
+    unsafe: Criterion = None,
+) -> Answer:
     """Find rules, in physical units, that say where in the domain a study is unsafe.
 
-    In a rule all characteristics vary together over the whole domain; how far one may go while all others stay as in
-    the original says `tolerance`.
+    In a rule all characteristics vary together over the whole domain; how far one may go while all
+    others stay as in the original says `tolerance`.
 
     Parameters
     ----------
     samples
-        Number of vehicles, drawn as [variation] says, without it evenly over the domain; one half yields the rules, the
-        other half tests them.
+        Number of vehicles, drawn as [variation] says, without it evenly over the domain; one half
+        yields the rules, the other half tests them.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
@@ -78,21 +89,33 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     total = len(training) + len(testing)
     failures = int(is_unsafe.sum() + is_unsafe_in_test.sum())
     if not total:
-        raise SimulationError(f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated")
+        raise SimulationError(
+            f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated"
+        )
     boxes = []
     remark = ""
     if is_unsafe.all() and len(training):
         boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
     elif min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
-        remark = f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N draws more)."
+        remark = (
+            f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N"
+            " draws more)."
+        )
     else:
         boxes = _find_boxes(training.settings, is_unsafe, characteristics)
-    rows = [(conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test)) for box in boxes]
+    rows = [
+        (conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test))
+        for box in boxes
+    ]
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
     table = tabulate("Where failures lie", COLUMNS, frame)
     low, high = clopper_pearson(failures, total)
-    drawn = "drawn as [variation] says" if study.variation or study.correlations else "over the whole domain"
+    drawn = (
+        "drawn as [variation] says"
+        if study.variation or study.correlations
+        else "over the whole domain"
+    )
     verdict = (
         f"{100 * failures / total:.2f} % of {total:,} vehicles {drawn} are unsafe "
         f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
@@ -101,8 +124,8 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     if len(denser):
         rule = denser.iloc[0]
         verdict += (
-            f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like that "
-            f"{100 * rule['density']:.0f} % are unsafe."
+            f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like"
+            f" that {100 * rule['density']:.0f} % are unsafe."
         )
     numbers = {
         "unsafe": str(criterion),
@@ -113,7 +136,9 @@ def rules(subject: Study | Case, evaluator: Evaluator, *, samples: Count = 16_38
     }
     left_out = int(evaluations.infeasible.sum())
     verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
-    return Answer(question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table})
+    return Answer(
+        question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
+    )
 
 
 def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
@@ -130,7 +155,9 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
 
 
 def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[float]:
-    """The unsafe share within a box, and the share of the unsafe settings within it, each with its interval."""
+    """The unsafe share within a box, and the share of the unsafe settings within it, each with its
+    interval.
+    """
     is_inside = is_within(box, settings)
     count = int(np.count_nonzero(is_inside & is_unsafe))
     values = []
@@ -139,9 +166,11 @@ def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[
     return values
 
 
-def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet) -> list[FloatArray]:
-    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to those before it is
-    dropped.
+def _find_boxes(
+    settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
+) -> list[FloatArray]:
+    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to
+    those before it is dropped.
     """
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
@@ -150,7 +179,9 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
-    rounded = [np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes]
+    rounded = [
+        np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes
+    ]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
     boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
     chosen = list[FloatArray]()
@@ -165,7 +196,9 @@ def _find_boxes(settings: FloatArray, is_unsafe: BoolArray, characteristics: Cha
 
 
 def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
-    """The smallest tree whose cross-validated Brier score is within a standard error of the best score."""
+    """The smallest tree whose cross-validated Brier score is within a standard error of the best
+    score.
+    """
     from sklearn.model_selection import GridSearchCV, StratifiedKFold  # takes a second to load
     from sklearn.tree import DecisionTreeClassifier
 
@@ -176,20 +209,28 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
         return int(np.flatnonzero(means >= least)[-1])
 
-    tree = DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0)
-    strengths = np.unique(np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0))
+    tree = DecisionTreeClassifier(
+        max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0
+    )
+    strengths = np.unique(
+        np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0)
+    )
     strengths = strengths[:-1]  # the strongest pruning leaves no condition
     evenly_spaced = np.unique(np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int))
     prunings = {"ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)}
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
-    search = GridSearchCV(tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough)
+    search = GridSearchCV(
+        tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough
+    )
     return search.fit(inputs, is_unsafe).best_estimator_
 
 
 def _boxes_of_leaves(
     tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
 ) -> Iterator[tuple[FloatArray, float]]:
-    """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of unsafe settings."""
+    """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of
+    unsafe settings.
+    """
     if tree.children_left[node] < 0:  # a leaf
         counts = tree.value[node][0]
         yield box, float(counts[-1] / counts.sum())
@@ -204,12 +245,16 @@ def _boxes_of_leaves(
     yield from _boxes_of_leaves(tree, int(tree.children_left[node]), below, lower, width)
 
 
-def _drop_useless_conditions(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> FloatArray:
+def _drop_useless_conditions(
+    box: FloatArray, settings: FloatArray, is_unsafe: BoolArray
+) -> FloatArray:
     """Drop conditions while the lower bound of the density does not fall."""
 
     def least_density(box: FloatArray) -> float:
         inside = is_unsafe[is_within(box, settings)]
-        return clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0] if len(inside) else 0.0
+        return (
+            clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0] if len(inside) else 0.0
+        )
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))

@@ -47,8 +47,8 @@ class Stream(IntEnum):
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if `number` is a power of
-    two.
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if
+    `number` is a power of two.
     """
     import scipy  # takes longer to load than a simulation
 

@@ -1,4 +1,6 @@
-"""The scope of a claim in words: the tests with their speeds and impact locations, the road, and the light."""
+"""The scope of a claim in words: the tests with their speeds and impact locations, the road, and
+the light.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,21 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:
-    """What a claim about a study covers, as a phrase for a manual: `crossing (CPFA) at 10 to 40 km/h; road wet`.
+    """What a claim about a study covers, as a phrase for a manual: `crossing (CPFA) at 10 to 40
+    km/h; road wet`.
 
     Without `between`, nothing was simulated between the values of a matrix, which are then listed.
     """
     points = assemble(study).points
     if study.matrix is None or study.matrix.protocol:
         name = "" if study.matrix is None else str(study.matrix.protocol)
-        drives = [(_model_in_words(study.scenario.model), name, _parameters_in_words(study, None, points, between))]
+        drives = [
+            (
+                _model_in_words(study.scenario.model),
+                name,
+                _parameters_in_words(study, None, points, between),
+            )
+        ]
     else:
         drives = [
             (
@@ -45,7 +54,9 @@ def scope_of(study: Study, *, between: bool = True) -> str:
         ]
     phrases = []
     for model, parameters in dict.fromkeys((model, parameters) for model, _, parameters in drives):
-        names = [name for other, name, same in drives if (other, same) == (model, parameters) and name]
+        names = [
+            name for other, name, same in drives if (other, same) == (model, parameters) and name
+        ]
         tests = f" ({join_phrases(names)})" if names else ""
         phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
     weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
@@ -56,8 +67,12 @@ def _model_in_words(model: str) -> str:
     return model.rpartition(":")[2].replace("_", " ")
 
 
-def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence[Point], between: bool) -> str:
-    """The speeds and other parameters of a test that vary: over its axes, and in a search over the scenario."""
+def _parameters_in_words(
+    study: Study, test: MatrixTest | None, points: Sequence[Point], between: bool
+) -> str:
+    """The speeds and other parameters of a test that vary: over its axes, and in a search over the
+    scenario.
+    """
     over = {} if test is None else test.over
     searchable = searchable_in(points[0].scenario)
     phrases = {}
@@ -66,7 +81,9 @@ def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence
         phrases[name] = f"{_values_in_words(values, between and name in searchable)}{unit}"
     for name, domain in study.scenario.search.items():
         phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
-    speeds = sorted({point.scenario.test_speed for point in points if point.scenario.test_speed is not None})
+    speeds = sorted(
+        {point.scenario.test_speed for point in points if point.scenario.test_speed is not None}
+    )
     if SPEED_DIMENSION not in phrases and speeds:
         ends = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in (speeds[0], speeds[-1]))
         phrases = {SPEED_DIMENSION: f"{' to '.join(ends)} km/h", **phrases}
@@ -79,7 +96,9 @@ def _parameters_in_words(study: Study, test: MatrixTest | None, points: Sequence
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
     if is_range and len(values) > 1:
         return f"{min(values):g} to {max(values):g}"
-    return join_phrases(f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+    return join_phrases(
+        f"{value:g}" if isinstance(value, float) else str(value) for value in values
+    )
 
 
 def _weather_in_words(weather: Weather) -> str:
@@ -87,7 +106,9 @@ def _weather_in_words(weather: Weather) -> str:
     effects = [f"friction {weather.road_friction:g}"] if weather.road_friction != 1 else []
     effects += [f"water {weather.water:g} mm"] if weather.water else []
     effects += [f"visibility {weather.visibility:g}"] if weather.visibility != 1 else []
-    effects += [f"recognition {weather.recognition_delay:g} s later"] if weather.recognition_delay else []
+    effects += (
+        [f"recognition {weather.recognition_delay:g} s later"] if weather.recognition_delay else []
+    )
     name = weather.name.replace("_", " ")
     details = f" ({', '.join(effects)})" if effects else ""
     return f"road {name}{details}, by {weather.light}"

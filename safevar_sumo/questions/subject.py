@@ -45,23 +45,26 @@ class Results:
 
     @cached_property
     def original(self) -> JsonObject:
-        """The original vehicle's outcome, metrics and objectives as plain values, None where undefined."""
+        """The original vehicle's outcome, metrics and objectives as plain values, None where
+        undefined.
+        """
         return JsonObject(read_manifest(self.directory)["original"])
 
     @property
     def solutions(self) -> pd.DataFrame:
         """One row per solution of every finished run.
 
-        Columns: algorithm, run (absent from imported results), the characteristics in their table units, f_safe [m or
-        -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN where undefined), outcome.
+        Columns: algorithm, run (absent from imported results), the characteristics in their table
+        units, f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics in their units (NaN
+        where undefined), outcome.
         """
         return self.case.solutions
 
     @property
     def evaluations(self) -> pd.DataFrame:
-        """One row per simulated setting of every run, in the order of the run's requests; same columns as
-        `solutions`. If the study searches its scenario, `feasible` is true where the original vehicle is safe in the
-        same encounter: only these count.
+        """One row per simulated setting of every run, in the order of the run's requests; same
+        columns as `solutions`. If the study searches its scenario, `feasible` is true where the
+        original vehicle is safe in the same encounter: only these count.
         """
         return self.case.evaluations
 
@@ -75,8 +78,8 @@ class Results:
 
     def __repr__(self) -> str:
         return (
-            f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs, {len(self.solutions)} "
-            "solutions>"
+            f"<Results of {self.case.name} in {self.directory}: {len(self.finished)} runs,"
+            f" {len(self.solutions)} solutions>"
         )
 
 
@@ -108,14 +111,14 @@ def study_or_case(
     Warns
     -----
     UserWarning
-        If a directory of results has the name of the study; with `as_it_is_now`, for each input that has changed
-        since the results were computed.
+        If a directory of results has the name of the study; with `as_it_is_now`, for each input
+        that has changed since the results were computed.
 
     Raises
     ------
     InputError
-        If `source` is no study and no results, if an input of the results has changed, or if `as_it_is_now` is set for
-        a study.
+        If `source` is no study and no results, if an input of the results has changed, or if
+        `as_it_is_now` is set for a study.
     """
     if isinstance(source, str | Path):
         # `os.path` accepts any text, unlike paths.
@@ -124,7 +127,9 @@ def study_or_case(
         is_study = str(source) in names
         if results_only and not is_directory and (is_study or os.path.isfile(source)):
             raise InputError(
-                source, "is a study and has no solutions", "a directory that the command `study` has written"
+                source,
+                "is a study and has no solutions",
+                "a directory that the command `study` has written",
             )
         if results_only or (is_directory and not is_study):
             source = load(source)
@@ -134,8 +139,8 @@ def study_or_case(
             raise InputError(
                 source,
                 f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",
-                "the path of a study file (TOML), a directory that the command `study` has written, or "
-                f"{one_of(names)}",
+                "the path of a study file (TOML), a directory that the command `study` has"
+                f" written, or {one_of(names)}",
             )
     if isinstance(source, Results):
         for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
@@ -143,7 +148,9 @@ def study_or_case(
         return source.case
     if as_it_is_now:
         raise InputError(
-            "as_it_is_now", "a study is simulated as it is now anyway", "results, which keep the study that they had"
+            "as_it_is_now",
+            "a study is simulated as it is now anyway",
+            "results, which keep the study that they had",
         )
     return load_study(source)
 
@@ -169,7 +176,8 @@ def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
 
 
 def case_at(case: Case, point: str) -> Case:
-    """Results at one point of the study's matrix: their solutions and the original vehicle, simulated again there.
+    """Results at one point of the study's matrix: their solutions and the original vehicle,
+    simulated again there.
 
     Raises
     ------
@@ -185,7 +193,8 @@ def case_at(case: Case, point: str) -> Case:
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
-    """Changes of the inputs since the results were computed; empty for imported results, which record no inputs.
+    """Changes of the inputs since the results were computed; empty for imported results, which
+    record no inputs.
 
     Raises
     ------
@@ -207,6 +216,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
         raise InputError(
             directory / MANIFEST,
             f"{named}: new simulations would not match these results",
-            "the inputs of that time; questions simulate with the present ones, and warn, by `as_it_is_now=True`",
+            "the inputs of that time; questions simulate with the present ones, and warn, by"
+            " `as_it_is_now=True`",
         )
     return [f"{difference}; simulated as it is now" for difference in changes]

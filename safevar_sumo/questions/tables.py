@@ -1,4 +1,6 @@
-"""The tables of answers: frames with units and meanings, and how readers see them as text, HTML and LaTeX."""
+"""The tables of answers: frames with units and meanings, and how readers see them as text, HTML and
+LaTeX.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ LOW = "_low"
 HIGH = "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
 LONG_TEXT = 60
-"""Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room [characters]."""
+"""Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room
+[characters].
+"""
 LEAST_TEXT = 36
 LATEX_PREAMBLE = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
@@ -27,7 +31,9 @@ FIT_BEGIN = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}
 LATEX_CODES = str.maketrans(
     {
         **{character: "\\" + character for character in "{}$&#%_"},
-        **{character: f"{{{character}}}" for character in "[]*"},  # LaTeX reads these as arguments of the line before
+        **{
+            character: f"{{{character}}}" for character in "[]*"
+        },  # LaTeX reads these as arguments of the line before
         "\\": r"\textbackslash{}",
         "^": r"\textasciicircum{}",
         "~": r"\textasciitilde{}",
@@ -36,8 +42,8 @@ LATEX_CODES = str.maketrans(
 
 
 class Column(NamedTuple):
-    """A column of a table: its unit, its meaning, how its numbers are written for readers, whether readers see it or
-    JSON and CSV alone have it, and its heading, by default its name.
+    """A column of a table: its unit, its meaning, how its numbers are written for readers, whether
+    readers see it or JSON and CSV alone have it, and its heading, by default its name.
     """
 
     unit: str
@@ -52,9 +58,9 @@ Columns = dict[str, Column | str]
 
 
 class Wide(NamedTuple):
-    """How readers see a long table: one for each column of `values`, or pair of columns that hold the ends of an
-    interval, in which a row stands for each combination of `labels` and a column for each value of `by`,
-    which stands in its `head`.
+    """How readers see a long table: one for each column of `values`, or pair of columns that hold
+    the ends of an interval, in which a row stands for each combination of `labels` and a column for
+    each value of `by`, which stands in its `head`.
     """
 
     labels: Sequence[str]
@@ -71,12 +77,16 @@ def tabulate(
     wide: Wide | None = None,
     words: Mapping[str, str] | None = None,
 ) -> pd.DataFrame:
-    """A table of an answer: a frame whose `attrs` hold its title and its columns' units and meanings.
+    """A table of an answer: a frame whose `attrs` hold its title and its columns' units and
+    meanings.
 
-    A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name the ends, too.
-    Readers see the `words` in place of the texts that are their keys.
+    A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name
+    the ends, too. Readers see the `words` in place of the texts that are their keys.
     """
-    named = {name: Column("", column) if isinstance(column, str) else column for name, column in columns.items()}
+    named = {
+        name: Column("", column) if isinstance(column, str) else column
+        for name, column in columns.items()
+    }
     frame = pd.DataFrame(rows, columns=[*named])
     frame.attrs = {"title": title, "columns": named, "wide": wide, "words": words or {}}
     return frame
@@ -115,7 +125,10 @@ def text_of(value: Any, number_format: str = ".4g") -> str:
     if isinstance(value, float):
         return f"{value:{number_format}}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {text_of(inner, number_format)}" for name, inner in value.items()) or "-"
+        return (
+            ", ".join(f"{name} {text_of(inner, number_format)}" for name, inner in value.items())
+            or "-"
+        )
     if isinstance(value, list):
         is_interval = len(value) == 2 and not isinstance(value[0], dict)
         separator = " to " if is_interval else "; "
@@ -129,7 +142,9 @@ def csv_cell(value: Any) -> Any:
 
 
 def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The tables that readers see in place of a frame, by name: itself, or those that `Wide` describes."""
+    """The tables that readers see in place of a frame, by name: itself, or those that `Wide`
+    describes.
+    """
     wide = frame.attrs.get("wide")
     columns = columns_of(frame)
     if wide is None or frame.empty:
@@ -149,12 +164,18 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         for labels, group in frame.groupby([*wide.labels], sort=False):
             by_head = group.set_index(wide.by)[of_value].reindex(heads)
             rows.append((*labels, *by_head.to_numpy().ravel()))
-        heading = title if len(wide.values) == 1 else f"{title}: {_meaning_of([columns[end] for end in of_value])}"
+        heading = (
+            title
+            if len(wide.values) == 1
+            else f"{title}: {_meaning_of([columns[end] for end in of_value])}"
+        )
         yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
 
 
 def _meaning_of(ends: Sequence[Column]) -> str:
-    """What a column means, or a pair of them that differ in the first word: `lowest and highest value`."""
+    """What a column means, or a pair of them that differ in the first word: `lowest and highest
+    value`.
+    """
     firsts = [column.meaning.partition(" ")[0] for column in ends]
     return f"{' and '.join(firsts)} {ends[0].meaning.partition(' ')[2]}"
 
@@ -174,7 +195,9 @@ class _ReaderColumn(NamedTuple):
 
 
 def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
-    """The columns of a table for readers: an interval stands behind its value unless that is exact, or alone."""
+    """The columns of a table for readers: an interval stands behind its value unless that is exact,
+    or alone.
+    """
     columns = columns_of(frame)
     words = frame.attrs.get("words", {})
     for name in map(str, frame):
@@ -198,10 +221,15 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
             else:
                 is_exact = frame[ends[0]] == frame[ends[1]]
                 behind = zip(texts, intervals, is_exact, strict=True)
-                texts = [text if exact or text == "-" else f"{text} ({interval})" for text, interval, exact in behind]
+                texts = [
+                    text if exact or text == "-" else f"{text} ({interval})"
+                    for text, interval, exact in behind
+                ]
         unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
         is_number = pd.api.types.is_numeric_dtype(frame[name])
-        yield _ReaderColumn(f"{column.head or base.replace('_', ' ')}{unit}", column.meaning, texts, is_number)
+        yield _ReaderColumn(
+            f"{column.head or base.replace('_', ' ')}{unit}", column.meaning, texts, is_number
+        )
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
@@ -214,8 +242,8 @@ def _interval_text(low: Any, high: Any, number_format: str) -> str:
 
 
 def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | str]:
-    """The table; columns that do not fit stand in further tables, in which the first columns of text are repeated, and
-    long texts in lines of their own.
+    """The table; columns that do not fit stand in further tables, in which the first columns of
+    text are repeated, and long texts in lines of their own.
     """
     every = list(reader_columns(frame))
     long = [column for column in every if column.is_long]
@@ -233,28 +261,38 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         labels = labels[:1]
     blocks = [[*labels]]
     for column in columns[len(labels) :]:
-        if len(blocks[-1]) > len(labels) and 1 + sum(map(_least_width, [*blocks[-1], column])) > width:
+        if (
+            len(blocks[-1]) > len(labels)
+            and 1 + sum(map(_least_width, [*blocks[-1], column])) > width
+        ):
             blocks.append([*labels])
         blocks[-1].append(column)
     bars = [bar.blocks for bar in frame.attrs.get("bars", ())]
     if bars and columns:
         yield WholeTable(
-            frame.attrs["title"], [(labels[0].head, False, labels[0].texts), (LEGEND["text"], False, bars)]
+            frame.attrs["title"],
+            [(labels[0].head, False, labels[0].texts), (LEGEND["text"], False, bars)],
         )
     for number, block in enumerate(filter(None, blocks)):
         title = "" if number or bars else frame.attrs.get("title", "")
         yield WholeTable(title, [(column.head, column.is_number, column.texts) for column in block])
     for column in long:
-        yield from (f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True))
+        yield from (
+            f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True)
+        )
 
 
 def _least_width(column: _ReaderColumn) -> int:
     """The width of a column whose words are whole, with a line beside it [characters]."""
-    return 1 + max(len(word) for text in (column.head, *column.texts) for word in text.split() or [""])
+    return 1 + max(
+        len(word) for text in (column.head, *column.texts) for word in text.split() or [""]
+    )
 
 
 def html_table(frame: pd.DataFrame) -> str:
-    """A table with a caption, in which a screen reader finds the headings; texts have the class `label`."""
+    """A table with a caption, in which a screen reader finds the headings; texts have the class
+    `label`.
+    """
     columns = list(reader_columns(frame))
     classes = ["" if column.is_number else ' class="label"' for column in columns]
     heads = "".join(
@@ -263,27 +301,47 @@ def html_table(frame: pd.DataFrame) -> str:
     )
     names = [f' data-head="{escape(column.head)}"' for column in columns]
     rows = [
-        "".join(f"<td{css}{name}>{escape(cell)}</td>" for css, name, cell in zip(classes, names, cells, strict=True))
+        "".join(
+            f"<td{css}{name}>{escape(cell)}</td>"
+            for css, name, cell in zip(classes, names, cells, strict=True)
+        )
         for cells in zip(*(column.texts for column in columns), strict=True)
     ]
     title = escape(frame.attrs.get("title", ""))
     if bars := frame.attrs.get("bars"):
         heads = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
-        rows = [f'<td class="label" data-head="range">{bar.svg}</td>{row}' for bar, row in zip(bars, rows, strict=True)]
+        rows = [
+            f'<td class="label" data-head="range">{bar.svg}</td>{row}'
+            for bar, row in zip(bars, rows, strict=True)
+        ]
     body = "\n".join(f"<tr>{row}</tr>" for row in rows)
     legend = f" <small>({LEGEND['html']})</small>" if bars else ""
-    table = f"<table><caption>{title}{legend}</caption><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table>"
-    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>' if body else ""
+    table = (
+        f"<table><caption>{title}{legend}</caption><thead><tr>{heads}</tr></thead>"
+        f"<tbody>\n{body}\n</tbody></table>"
+    )
+    return (
+        f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>'
+        if body
+        else ""
+    )
 
 
 def latex_table(label: str, frame: pd.DataFrame) -> str:
     """A booktabs table that fits into the line."""
     readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
-    style = readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)
-    kinds = ("r" if column.is_number else "p{6cm}" if column.is_long else "l" for column in reader_columns(frame))
+    style = (
+        readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)
+    )
+    kinds = (
+        "r" if column.is_number else "p{6cm}" if column.is_long else "l"
+        for column in reader_columns(frame)
+    )
     alignment = "".join(kinds)
     caption = _escaped_for_latex(frame.attrs.get("title", ""))
-    table = style.to_latex(hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp")
+    table = style.to_latex(
+        hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp"
+    )
     return table.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(
         r"\end{tabular}", r"\end{tabular}}"
     )
@@ -297,5 +355,7 @@ def latex_notes(frame: pd.DataFrame) -> str:
 
 def _escaped_for_latex(text: object) -> str:
     """Plain text as LaTeX, with superscripts and minus signs."""
-    escaped = re.sub(r"\\textasciicircum\{\}(-?\d+)", r"\\textsuperscript{\1}", str(text).translate(LATEX_CODES))
+    escaped = re.sub(
+        r"\\textasciicircum\{\}(-?\d+)", r"\\textsuperscript{\1}", str(text).translate(LATEX_CODES)
+    )
     return re.sub(r"(?<![\w)-])-(?=\.?\d)", r"\\textminus{}", escaped)

@@ -1,4 +1,6 @@
-"""How the characteristics of real vehicles vary, by a study's `[variation]` and `[[correlations]]`."""
+"""How the characteristics of real vehicles vary, by a study's `[variation]` and
+`[[correlations]]`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from safevar_sumo.vehicles.region import REJECTIONS
 
 
 class VariationModel:
-    """The random variation of a study's characteristics, by its `[variation]` and `[[correlations]]`.
+    """The random variation of a study's characteristics, by its `[variation]` and
+    `[[correlations]]`.
 
     Raises
     ------
@@ -36,7 +39,9 @@ class VariationModel:
         with about(study.source):
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
-        distributions = [study.variation.get(name, Uniform()) for name in self.characteristics.names]
+        distributions = [
+            study.variation.get(name, Uniform()) for name in self.characteristics.names
+        ]
         self._source = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
         self.is_correlated = bool(study.correlations)
@@ -48,16 +53,27 @@ class VariationModel:
         try:
             self._factor = np.linalg.cholesky(correlations)
         except np.linalg.LinAlgError:
-            pairs = ", ".join(f"{' and '.join(pair.between)} {pair.value:g}" for pair in study.correlations)
+            pairs = ", ".join(
+                f"{' and '.join(pair.between)} {pair.value:g}" for pair in study.correlations
+            )
             problem = f"correlations contradict each other: {pairs}"
             raise InputError(study.source, problem, "a positive definite matrix") from None
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at N independent points of the unit cube, shape (N, n), correlated by a Gaussian copula."""
+        """Settings at N independent points of the unit cube, shape (N, n), correlated by a Gaussian
+        copula.
+        """
         if self.is_correlated:
-            probabilities = scipy.stats.norm.cdf(scipy.stats.norm.ppf(probabilities) @ self._factor.T)
-        columns = [quantile(column) for quantile, column in zip(self._quantiles, probabilities.T, strict=True)]
-        return np.clip(np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper)
+            probabilities = scipy.stats.norm.cdf(
+                scipy.stats.norm.ppf(probabilities) @ self._factor.T
+            )
+        columns = [
+            quantile(column)
+            for quantile, column in zip(self._quantiles, probabilities.T, strict=True)
+        ]
+        return np.clip(
+            np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper
+        )
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Random vehicles that satisfy the constraints, shape (number, n)."""
@@ -67,7 +83,8 @@ class VariationModel:
         if len(settings) < number:
             raise InputError(
                 self._source,
-                f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints: {self.region}",
+                f"fewer than 1 in {REJECTIONS} random vehicles satisfy the constraints:"
+                f" {self.region}",
                 "a [variation] and [[constraints]] that agree",
             )
         return settings
@@ -95,7 +112,9 @@ def _quantile_function(
         case Normal():
             mean = stated.get("mean", original)
             deviation = stated["deviation"]
-            normal = scipy.stats.truncnorm((low - mean) / deviation, (high - mean) / deviation, mean, deviation)
+            normal = scipy.stats.truncnorm(
+                (low - mean) / deviation, (high - mean) / deviation, mean, deviation
+            )
             return lambda p: normal.ppf(p)
         case Lognormal():
             mean = np.log(stated.get("median", original))

@@ -29,7 +29,9 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
 
     The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.
     """
-    verb = "collides" if outcome == Outcome.COLLISION else OUTCOME_VERBS.get(Outcome(outcome), outcome)
+    verb = (
+        "collides" if outcome == Outcome.COLLISION else OUTCOME_VERBS.get(Outcome(outcome), outcome)
+    )
     if safety_degree is None or math.isnan(safety_degree):
         return verb
     if outcome == Outcome.COLLISION:
@@ -40,8 +42,9 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
 def change_texts(
     characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
 ) -> list[str]:
-    """The values that differ from the original values, in the order of the study, such as `mass 2404 -> 2600 kg (+8.2
-    %)`, without a share of an original that is 0. Values that `are_printed` have their digits already.
+    """The values that differ from the original values, in the order of the study, such as `mass
+    2404 -> 2600 kg (+8.2 %)`, without a share of an original that is 0. Values that `are_printed`
+    have their digits already.
     """
     texts = []
     for item in characteristics:
@@ -58,13 +61,18 @@ def list_of_changes(
     characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
 ) -> str:
     """The values that differ from the original values in one line, as in `change_texts`."""
-    return ", ".join(change_texts(characteristics, values, are_printed=are_printed)) or "no change at all"
+    return (
+        ", ".join(change_texts(characteristics, values, are_printed=are_printed))
+        or "no change at all"
+    )
 
 
 def encounter_in_words(
     characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
 ) -> str:
-    """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`; empty without any."""
+    """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`;
+    empty without any.
+    """
     texts = {
         item: f"{values[item.name]:.10g}" if are_printed else item.text(values[item.name])
         for item in characteristics.scenario
@@ -74,8 +82,12 @@ def encounter_in_words(
 
 
 def question_command(question: str, subject: str, point: str = "") -> str:
-    """The command that asks a question about results or a study; `point` may name a point of the study's matrix."""
-    return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (f" --point {quote(point)}" if point else "")
+    """The command that asks a question about results or a study; `point` may name a point of the
+    study's matrix.
+    """
+    return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (
+        f" --point {quote(point)}" if point else ""
+    )
 
 
 def join_phrases(phrases: Iterable[str]) -> str:
@@ -94,7 +106,9 @@ MAX_POINTS_NAMED = 6
 
 
 def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed 60, clear.`"""
+    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed
+    60, clear.`
+    """
     rest = len(failing_points) - MAX_POINTS_NAMED
     names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
     return f"Fails at {len(failing_points)} of {point_count} points{names and f': {names}'}."
@@ -111,12 +125,14 @@ def share_in_words(share: float) -> str:
 
 def two_decimals(value: float | None) -> str:
     """A value with two decimals, never `-0.00`; `-` if undefined."""
-    return "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0
+    return (
+        "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"
+    )  # -0.0 + 0.0 is 0.0
 
 
 def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
-    """What a vehicle of a study that searches its scenario meets, and how many encounters do not count, in a sentence;
-    empty for any other study.
+    """What a vehicle of a study that searches its scenario meets, and how many encounters do not
+    count, in a sentence; empty for any other study.
     """
     if not study.scenario.search:
         return []
@@ -130,15 +146,24 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
 
 
 def demanded_in_words(study: Study) -> list[str]:
-    """What the original vehicle must keep in a searched encounter, in a sentence; empty for any other study."""
+    """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
+    other study.
+    """
     margin = f"at least {study.scenario.margin:g} m, scenario.margin, between bodies"
-    return [f"The original is safe in an encounter where it keeps {margin}."] if study.scenario.search else []
+    return (
+        [f"The original is safe in an encounter where it keeps {margin}."]
+        if study.scenario.search
+        else []
+    )
 
 
 def constraints_in_words(study: Study) -> list[str]:
     """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
     characteristics = study.vehicle.characteristics
     conditions = "; ".join(
-        f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}" for constraint in study.constraints
+        f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
+        for constraint in study.constraints
     )
-    return [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
+    return (
+        [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
+    )

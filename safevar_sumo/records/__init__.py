@@ -1,4 +1,6 @@
-"""Records that pass between the stages: observations and commands of an ADS, traces of runs, evaluations."""
+"""Records that pass between the stages: observations and commands of an ADS, traces of runs,
+evaluations.
+"""
 
 from safevar_sumo.records.driving import (
     ALL_TRUE as ALL_TRUE,

@@ -1,4 +1,6 @@
-"""What a vehicle sees and does, and what a simulation leaves: outcomes, traces, geometry of encounters, contacts."""
+"""What a vehicle sees and does, and what a simulation leaves: outcomes, traces, geometry of
+encounters, contacts.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int_]
 Quantity = Any
-"""A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N encounters."""
+"""A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N
+encounters.
+"""
 JsonObject = dict[str, Any]
 """An object of JSON, or a table of TOML: plain values by key."""
 
@@ -28,9 +32,13 @@ GRAVITY = 9.81
 TIME_ROUNDING = 1e-9
 """Difference below which two sums of time steps count as the same time [s]."""
 TOUCH_OVERLAP = 2e-3
-"""Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a millimetre [m]."""
+"""Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a
+millimetre [m].
+"""
 LEAST_CLOSING_SPEED = 1e-3
-"""Least closing speed that a collision counts with [m/s]: also one with a faster body is worse than any distance."""
+"""Least closing speed that a collision counts with [m/s]: also one with a faster body is worse than
+any distance.
+"""
 LENGTH_DECIMALS = 9
 """Decimals to which differences of distances are rounded: 4.7 m, not 4.699999999999996 m."""
 TIME_DECIMALS = 9
@@ -46,7 +54,9 @@ for _constant in (ZERO, ALL_TRUE, UNDEFINED):
 
 
 def finite_or_none(value: float) -> float | None:
-    """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes None."""
+    """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes
+    None.
+    """
     return float(value) if np.isfinite(value) else None
 
 
@@ -54,11 +64,12 @@ class Observation(NamedTuple):
     """Sensor values of N vehicles; every array has shape (N,).
 
     `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
-    while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of the
-    vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out of sight [m].
-    `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the obstacle's own speed along the vehicle's
-    path [m/s], `obstacle_width` its extent across the lane [m], 0 where the scenario does not state it; `obstacle` is
-    the number of the body that it is, of several; `throttle` and `brake` are the pedals' positions [-].
+    while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of
+    the vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out
+    of sight [m]. `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the
+    obstacle's own speed along the vehicle's path [m/s], `obstacle_width` its extent across the lane
+    [m], 0 where the scenario does not state it; `obstacle` is the number of the body that it is, of
+    several; `throttle` and `brake` are the pedals' positions [-].
     """
 
     time: float
@@ -85,8 +96,9 @@ class Command(NamedTuple):
 class PedalTables(NamedTuple):
     """The effect of the original vehicle's pedals on a dry road, at `speeds` [m/s].
 
-    `full_throttle` is the acceleration at full throttle, `coasting` the deceleration without pedals [m/s^2]; `braking`
-    is the deceleration that the brake adds per unit of pedal, far from the limit of the tyres [m/s^2].
+    `full_throttle` is the acceleration at full throttle, `coasting` the deceleration without pedals
+    [m/s^2]; `braking` is the deceleration that the brake adds per unit of pedal, far from the limit
+    of the tyres [m/s^2].
     """
 
     speeds: FloatArray
@@ -98,9 +110,9 @@ class PedalTables(NamedTuple):
 class Nominal(NamedTuple):
     """The original vehicle on a dry road: all that an ADS knows of the vehicle.
 
-    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type; `actuator_lag` [s] is the
-    time constant with which its wheels follow the pedals. `tables` drives the vehicle on its
-    first call, and returns `speeds`, `full_throttle`, `coasting` and `braking`.
+    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type;
+    `actuator_lag` [s] is the time constant with which its wheels follow the pedals. `tables` drives
+    the vehicle on its first call, and returns `speeds`, `full_throttle`, `coasting` and `braking`.
     """
 
     mass: float
@@ -157,13 +169,15 @@ class Encounter(NamedTuple):
 class Trace:
     """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
 
-    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with the rest of the
-    batch.
+    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with
+    the rest of the batch.
 
-    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m, all speeds in m/s.
+    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m,
+      all speeds in m/s.
     - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
-    - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its length where the scenario
-      states it [m], `obstacle_width` its extent across the lane, 0 where the scenario does not state it [m].
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its
+      length where the scenario states it [m], `obstacle_width` its extent across the lane, 0 where
+      the scenario does not state it [m].
     - `visible`: nothing hides the obstacle.
     """
 
@@ -189,16 +203,22 @@ class Trace:
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
-        return replace(self, **{name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2})
+        return replace(
+            self,
+            **{
+                name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2
+            },
+        )
 
 
 class Contact(NamedTuple):
     """The position of the first contact on the outline of each of N vehicles, shape (N,).
 
-    `side` is front, left, right or rear; empty without a contact. `place` is the position of the obstacle's middle, 0
-    to 100; NaN without a contact. At the front or rear it is in % of the vehicle's width, from the side on which
-    `lateral` is negative; at the left or right in % of its length, from the front. `speed` is the obstacle's along the
-    vehicle's lane at that sample [m/s]; 0 without a contact.
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the
+    obstacle's middle, 0 to 100; NaN without a contact. At the front or rear it is in % of the
+    vehicle's width, from the side on which `lateral` is negative; at the left or right in % of its
+    length, from the front. `speed` is the obstacle's along the vehicle's lane at that sample [m/s];
+    0 without a contact.
     """
 
     side: npt.NDArray[np.str_]
@@ -214,14 +234,14 @@ for _array in NO_CONTACT:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationRuns:
-    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`, `collision_speed` is NaN without
-    a collision [m/s].
+    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`,
+    `collision_speed` is NaN without a collision [m/s].
 
     `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
-    `test_speed_error` is the largest deviation from the test's speed before the driving system acted, NaN if no speed
-    is prescribed [m/s]; `acted_early` the time at which the system acted while the motion of others still depended on
-    the vehicle, NaN otherwise [s]; `warning_ttc` the time to collision at which the system first warned its driver,
-    NaN if it never did [s].
+    `test_speed_error` is the largest deviation from the test's speed before the driving system
+    acted, NaN if no speed is prescribed [m/s]; `acted_early` the time at which the system acted
+    while the motion of others still depended on the vehicle, NaN otherwise [s]; `warning_ttc` the
+    time to collision at which the system first warned its driver, NaN if it never did [s].
     """
 
     trace: Trace
@@ -248,7 +268,9 @@ class SimulationRuns:
         """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
         _, distance, closing_speed, _ = self.encounter
         is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
-        return np.divide(distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted)
+        return np.divide(
+            distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted
+        )
 
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:
         """The runs of some of the vehicles."""
@@ -268,7 +290,9 @@ class SimulationRuns:
         )
 
     def nearest(self, vehicle: int) -> int | None:
-        """The sample of a vehicle's impact or, without a collision, of its smallest separation in conflict, if any."""
+        """The sample of a vehicle's impact or, without a collision, of its smallest separation in
+        conflict, if any.
+        """
         active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
             return int(np.flatnonzero(active)[-1])
@@ -279,31 +303,33 @@ class SimulationRuns:
 
     @property
     def middles_apart(self) -> float:
-        """How far the middles of bodies that touch are apart [m], in a scenario that states the obstacle's length; else
-        0.
+        """How far the middles of bodies that touch are apart [m], in a scenario that states the
+        obstacle's length; else 0.
         """
         length = float(np.max(self.trace.obstacle_length))
         return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS) if length else 0.0
 
     @property
     def closing_speed(self) -> FloatArray:
-        """Severity of a collision: `collision_speed` minus the struck body's speed along the lane at that sample [m/s],
-        shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
+        """Severity of a collision: `collision_speed` minus the struck body's speed along the lane
+        at that sample [m/s], shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
         """
         return np.maximum(self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED)
 
     @property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's path at the moment of contact, as rated by
-        Euro NCAP [m/s], shape (N,); NaN without a collision.
+        """Speed of a collision relative to the obstacle along the vehicle's path at the moment of
+        contact, as rated by Euro NCAP [m/s], shape (N,); NaN without a collision.
 
-        A gap d that closes within a time step, from the relative speed v at the relative acceleration a, closes at
-        sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of the step counts: `collision_speed` minus the
-        obstacle's speed.
+        A gap d that closes within a time step, from the relative speed v at the relative
+        acceleration a, closes at sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of
+        the step counts: `collision_speed` minus the obstacle's speed.
         """
         trace = self.trace
         vehicles = np.arange(len(self.collision_speed))
-        last_sample = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)  # the last active one
+        last_sample = (
+            len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
+        )  # the last active one
         sample_before = np.maximum(last_sample - 1, 0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
         speed = trace.speed - obstacle_speed
@@ -311,11 +337,22 @@ class SimulationRuns:
         speed_after = speed[last_sample, vehicles]
         gap_before = trace.gap[sample_before, vehicles]
         gap_after = trace.gap[last_sample, vehicles]
-        gap_closes = (gap_before > -TOUCH_OVERLAP) & np.isfinite(gap_before) & (gap_after <= 0) & (speed_before > 0)
+        gap_closes = (
+            (gap_before > -TOUCH_OVERLAP)
+            & np.isfinite(gap_before)
+            & (gap_after <= 0)
+            & (speed_before > 0)
+        )
         distance = np.where(gap_closes, np.maximum(gap_before, 0.0), 0.0)
-        squared_speed = speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
+        squared_speed = (
+            speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
+        )
         min_speed = np.minimum(speed_before, speed_after)
         max_speed = np.maximum(speed_before, speed_after)
-        at_contact = np.minimum(np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed)
+        at_contact = np.minimum(
+            np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed
+        )
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
-        return np.asarray(np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step))
+        return np.asarray(
+            np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
+        )

@@ -23,8 +23,9 @@ ROUNDING = 1e-9
 class CellResults(NamedTuple):
     """Results of M vehicles in every cell of a rating, shape (M, number of cells).
 
-    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time to collision at the
-    warning [s], NaN without one; `valid` is false where the test could not be driven.
+    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time
+    to collision at the warning [s], NaN without one; `valid` is false where the test could not be
+    driven.
     """
 
     impact: FloatArray
@@ -39,11 +40,12 @@ class CellResults(NamedTuple):
 class Evaluations:
     """M evaluated settings with their outcomes, metrics and objectives.
 
-    `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays have shape (M,).
-    `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics; an undefined value is NaN.
-    `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a count. `reasons` says, by the bytes of a
-    setting, why the setting could not be simulated. `cells` are a rating's results, None without a rating.
-    `worst_points` are the numbers of the points at which the settings were worst, None without a matrix.
+    `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays
+    have shape (M,). `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics;
+    an undefined value is NaN. `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a
+    count. `reasons` says, by the bytes of a setting, why the setting could not be simulated.
+    `cells` are a rating's results, None without a rating. `worst_points` are the numbers of the
+    points at which the settings were worst, None without a matrix.
     """
 
     settings: FloatArray
@@ -67,7 +69,9 @@ class Evaluations:
     @property
     def points(self) -> npt.NDArray[np.intp]:
         """`worst_points`; without a matrix the only point, 0."""
-        return np.zeros(len(self), dtype=np.intp) if self.worst_points is None else self.worst_points
+        return (
+            np.zeros(len(self), dtype=np.intp) if self.worst_points is None else self.worst_points
+        )
 
     @property
     def results(self) -> Results:
@@ -75,14 +79,17 @@ class Evaluations:
         return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
 
     def gaps(self, contact: float) -> FloatArray:
-        """Least distances between bodies during the encounter [m], shape (M,); 0 on a collision, NaN where undefined.
+        """Least distances between bodies during the encounter [m], shape (M,); 0 on a collision,
+        NaN where undefined.
 
         Bodies touch at a safety degree of `contact` [m].
         """
         return np.where(self.collided, 0.0, self.f_safe - contact)
 
     def column(self, name: str) -> FloatArray:
-        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is NaN everywhere."""
+        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is
+        NaN everywhere.
+        """
         if name in ("f_safe", "f_diff", "f_num_diff"):
             return np.asarray(getattr(self, name))
         return self.metrics.get(name, np.full(len(self), np.nan))
@@ -93,8 +100,12 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the setting can be scored: it is feasible, the test was valid, and the simulator reported no error."""
-        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST.value) & ~self.infeasible)
+        """Where the setting can be scored: it is feasible, the test was valid, and the simulator
+        reported no error.
+        """
+        return np.asarray(
+            ~self.failed & (self.outcome != Outcome.INVALID_TEST.value) & ~self.infeasible
+        )
 
     @property
     def infeasible(self) -> BoolArray:
@@ -135,17 +146,23 @@ class Evaluations:
 
     @classmethod
     def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
-        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its rows.
+        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its
+        rows.
 
-        There are `cells` only if all batches have them; the worst point of a batch without `worst_points` is the first.
+        There are `cells` only if all batches have them; the worst point of a batch without
+        `worst_points` is the first.
         """
-        columns = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS}
+        columns = {
+            name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS
+        }
         reasons = dict[bytes, str]()
         names = dict[str, None]()
         for batch in batches:
             reasons |= batch.reasons
             names |= dict.fromkeys(batch.metrics)
-        metrics = {name: np.concatenate([batch.column(name) for batch in batches]) for name in names}
+        metrics = {
+            name: np.concatenate([batch.column(name) for batch in batches]) for name in names
+        }
         cells = [batch.cells for batch in batches if batch.cells is not None]
         all_cells = None
         if len(cells) == len(batches):
@@ -153,11 +170,17 @@ class Evaluations:
         worst_points = None
         if any(batch.worst_points is not None for batch in batches):
             worst_points = np.concatenate([batch.points for batch in batches])
-        return cls(**columns, metrics=metrics, reasons=reasons, cells=all_cells, worst_points=worst_points)
+        return cls(
+            **columns, metrics=metrics, reasons=reasons, cells=all_cells, worst_points=worst_points
+        )
 
 
-def differences(outputs: Results, others: Results, tolerance: float = 0.0) -> Iterator[tuple[int, str]]:
-    """Yield, for each result that differs, the first row where it does, and both values in words."""
+def differences(
+    outputs: Results, others: Results, tolerance: float = 0.0
+) -> Iterator[tuple[int, str]]:
+    """Yield, for each result that differs, the first row where it does, and both values in
+    words.
+    """
     for name, values in outputs.items():
         is_same = values == others[name]
         if values.dtype.kind == "f":

@@ -1,4 +1,6 @@
-"""Agreement of simulated settings with published rows: rank correlation, error, bias and collisions."""
+"""Agreement of simulated settings with published rows: rank correlation, error, bias and
+collisions.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 COLUMNS: Columns = {
-    "metric": "safety metric; TET and TIT of the settings that collide neither here nor in the reference",
+    "metric": (
+        "safety metric; TET and TIT of the settings that collide neither here nor in the reference"
+    ),
     "unit": "unit of the metric and of its errors",
     "spearman": Column("-", "Spearman's rank correlation", ".3f"),
     "mean_absolute_error": Column("as in column unit", "mean of |here - reference|", ".3f"),
@@ -41,7 +45,9 @@ SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_len
 
 
 @question
-@contents("rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS)
+@contents(
+    "rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS
+)
 def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> Answer:
     """Compare a study with settings and metrics in the published package's CSV format, row by row.
 
@@ -56,17 +62,22 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
     data = read_reference(reference, evaluator.characteristics)
     here = evaluator.evaluate(data.settings, "settings", ignore_constraints=True)
     if not here.valid.any():
-        raise SimulationError(f"study {study.name!r} cannot be simulated with any row of {reference}")
+        raise SimulationError(
+            f"study {study.name!r} cannot be simulated with any row of {reference}"
+        )
     data = data.take(here.valid)
     here = here.take(here.valid)
     numbers = count_collisions(data, here)
     table = measure_agreement(data, here)
-    measures = table.loc[table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]]
+    measures = table.loc[
+        table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]
+    ]
     order, error, bias = map(two_decimals, measures.to_numpy(float)[0])
     verdict = (
-        f"Over {numbers['rows']} vehicles the safety degree has a rank correlation of {order} with the reference, a "
-        f"mean error of {error} m and a bias of {bias} m; of {numbers['collisions_reference']} collisions in the "
-        f"reference {numbers['collisions_both']} happen here."
+        f"Over {numbers['rows']} vehicles the safety degree has a rank correlation of {order} with"
+        f" the reference, a mean error of {error} m and a bias of {bias} m; of"
+        f" {numbers['collisions_reference']} collisions in the reference"
+        f" {numbers['collisions_both']} happen here."
     )
     return Answer(
         question="validate",
@@ -89,7 +100,9 @@ def _draw(title: str, reference: ReferenceData, here: Evaluations, answer: Answe
         label = f"{METRICS[name].title} [{as_formula(METRICS[name].unit)}]"
         axis.scatter(there, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
         defined, _ = defined_pairs(there, simulated)
-        origin = float(defined[0]) if defined.size else 0.0  # in the values' range, so that the axes keep theirs
+        origin = (
+            float(defined[0]) if defined.size else 0.0
+        )  # in the values' range, so that the axes keep theirs
         axis.axline((origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--")
         axis.set_title(f"rho = {two_decimals(order)}", fontsize=FONT_SIZE)
         axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
@@ -137,8 +150,14 @@ def shipped_agreement(study: Study) -> pd.DataFrame:
     """
     frame = pd.read_csv(SHIPPED_AGREEMENT)
     keys = {
-        name: evaluation_keys(tables_of(load_study(name))) for name in frame["study"].unique() if name in study_names()
+        name: evaluation_keys(tables_of(load_study(name)))
+        for name in frame["study"].unique()
+        if name in study_names()
     }
     own_keys = evaluation_keys(tables_of(study))
-    same = [name for name, keys in keys.items() if all(keys.get(key) == own_keys.get(key) for key in SIMULATION_KEYS)]
+    same = [
+        name
+        for name, keys in keys.items()
+        if all(keys.get(key) == own_keys.get(key) for key in SIMULATION_KEYS)
+    ]
     return frame[frame["study"].isin(same)]

@@ -1,7 +1,8 @@
-"""The CSV format of the published package: settings before the filter, with measurements in the reference simulators.
+"""The CSV format of the published package: settings before the filter, with measurements in the
+reference simulators.
 
-A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`, `TIT`, `TET` and,
-in most files, `Dece`. There is no run column.
+A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`,
+`TIT`, `TET` and, in most files, `Dece`. There is no run column.
 """
 
 from __future__ import annotations
@@ -23,17 +24,29 @@ from safevar_sumo.study import SAFETY_DEGREE, StudyLike, load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
-RANGES = {SAFETY_DEGREE: (-300.0, 1e4), "tet": (0.0, 1e4), "tit": (0.0, 1e5), "ave_dece": (-300.0, 300.0)}
-"""Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign."""
+RANGES = {
+    SAFETY_DEGREE: (-300.0, 1e4),
+    "tet": (0.0, 1e4),
+    "tit": (0.0, 1e5),
+    "ave_dece": (-300.0, 300.0),
+}
+"""Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign.
+"""
 OPTIONAL_METRIC = "ave_dece"
 FIRST_ROW = 2
 """Number of the row after the header in the file, as errors count."""
-ALIASES = {"dampratezeroce": "dampratezerotce", "dampratezerocd": "dampratezerotcd", "wheelradius": "radius"}
-"""Names of characteristics in the files of the published package -> names in its paper; in lower case, without
-underscores."""
+ALIASES = {
+    "dampratezeroce": "dampratezerotce",
+    "dampratezerocd": "dampratezerotcd",
+    "wheelradius": "radius",
+}
+"""Names of characteristics in the files of the published package -> names in its paper; in lower
+case, without underscores.
+"""
 SHARE_DECIMALS = 3
-"""Decimals to which the published package rounds a change's share of the domain before it compares the share with
-beta."""
+"""Decimals to which the published package rounds a change's share of the domain before it compares
+the share with beta.
+"""
 ROUNDING_ERROR = 1e-12
 """Largest rounding error of such a share."""
 
@@ -44,10 +57,11 @@ class ReferenceData(NamedTuple):
     Attributes
     ----------
     settings
-        M settings of n characteristics after the filter of the published package; shape (M, n), units of the study's
-        table.
+        M settings of n characteristics after the filter of the published package; shape (M, n),
+        units of the study's table.
     metrics
-        Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a column.
+        Name -> values, shape (M,). TET and TIT of a collision are NaN, and so are metrics without a
+        column.
     """
 
     settings: FloatArray
@@ -60,21 +74,25 @@ class ReferenceData(NamedTuple):
     def take(self, rows: BoolArray) -> ReferenceData:
         """The data in the rows of a mask."""
         return self._replace(
-            settings=self.settings[rows], metrics={name: values[rows] for name, values in self.metrics.items()}
+            settings=self.settings[rows],
+            metrics={name: values[rows] for name, values in self.metrics.items()},
         )
 
 
 def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
-    """Read a file of the published package; rows with values outside the domains are left out, with a warning.
+    """Read a file of the published package; rows with values outside the domains are left out, with
+    a warning.
 
     Raises
     ------
     InputError
-        With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell without a number in
-        range.
+        With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell
+        without a number in range.
     """
     try:
-        lines = pd.read_csv(path, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig")
+        lines = pd.read_csv(
+            path, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
+        )
         if not isinstance(lines.index, pd.RangeIndex):
             raise ValueError("rows have more values than the header has columns")
         table = lines.rename(columns=str.strip).dropna(how="all")
@@ -86,34 +104,53 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         ) from None
     by_plain_name = {_plain_name(str(column)): str(column) for column in table}
     columns = {name: by_plain_name.get(_plain_name(name), name) for name in characteristics.names}
-    columns |= {name: column for name, column in COLUMNS.items() if name != OPTIONAL_METRIC or column in table}
+    columns |= {
+        name: column
+        for name, column in COLUMNS.items()
+        if name != OPTIONAL_METRIC or column in table
+    }
     missing_columns = [column for column in columns.values() if column not in table]
     if missing_columns or table.empty:
-        problem = f"lacks the columns {', '.join(missing_columns)}" if missing_columns else "has no rows"
+        problem = (
+            f"lacks the columns {', '.join(missing_columns)}" if missing_columns else "has no rows"
+        )
         raise InputError(path, problem, "the format of the published package")
     counts = Counter(_plain_name(str(column)) for column in table)
-    if doubled := ", ".join(column for column in columns.values() if counts[_plain_name(column)] > 1):
+    if doubled := ", ".join(
+        column for column in columns.values() if counts[_plain_name(column)] > 1
+    ):
         raise InputError(path, f"has more than one column for {doubled}", "each column once")
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
         for name, column in columns.items()
     }
     settings = np.stack([numbers[name] for name in characteristics.names], axis=1)
-    is_in_domain = np.all((settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1)
+    is_in_domain = np.all(
+        (settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1
+    )
     if not is_in_domain.any():
         raise InputError(
-            path, "has no row whose values are all in the domains of the study", "a file of this study's vehicle"
+            path,
+            "has no row whose values are all in the domains of the study",
+            "a file of this study's vehicle",
         )
     if skipped := np.count_nonzero(~is_in_domain):
         warn(f"{path}: {skipped} rows with values outside the domains are left out")
-    metrics = {name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS}
+    metrics = {
+        name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS
+    }
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
-    metrics |= {name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name]) for name in ("tet", "tit")}
+    metrics |= {
+        name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name])
+        for name in ("tet", "tit")
+    }
     return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics)
 
 
 def _plain_name(name: str) -> str:
-    key = name.removesuffix(".1").replace("_", "").lower()  # pandas calls a second column of a name NAME.1
+    key = (
+        name.removesuffix(".1").replace("_", "").lower()
+    )  # pandas calls a second column of a name NAME.1
     return ALIASES.get(key, key)
 
 
@@ -128,16 +165,22 @@ def _parse_numbers(path: Path, column: pd.Series[str], lowest: float, highest: f
 
 
 def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
-    """The published package's filter: it keeps a change if its share of the domain, rounded to three decimals, is at
-    least beta.
+    """The published package's filter: it keeps a change if its share of the domain, rounded to
+    three decimals, is at least beta.
     """
     width = characteristics.upper - characteristics.lower
     share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
-    return np.where(share >= characteristics.threshold / width - ROUNDING_ERROR, settings, characteristics.original)
+    return np.where(
+        share >= characteristics.threshold / width - ROUNDING_ERROR,
+        settings,
+        characteristics.original,
+    )
 
 
 def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> Evaluations:
-    """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method section 3)."""
+    """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method
+    section 3).
+    """
     return Evaluations(
         settings=data.settings,
         outcome=np.where(data.collided, str(Outcome.COLLISION), UNKNOWN),
@@ -157,7 +200,8 @@ def import_published(
     safe_fuzzer: str | Path | None = None,
     original: Annotated[Mapping[str, float] | tuple[str, ...], "METRIC=NUMBER"] = (),
 ) -> Results:
-    """Import published CSV solutions of a study as a results directory, in place of an earlier import.
+    """Import published CSV solutions of a study as a results directory, in place of an earlier
+    import.
 
     Parameters
     ----------
@@ -170,13 +214,14 @@ def import_published(
     safe_fuzzer
         File with the solutions of SafeFuzzer.
     original
-        A metric of the original vehicle, such as sd=2.7, tet, tit or ave_dece; may be repeated. By default those
-        published for the study.
+        A metric of the original vehicle, such as sd=2.7, tet, tit or ave_dece; may be repeated. By
+        default those published for the study.
 
     Raises
     ------
     InputError
-        If the study or a file cannot be used, no file is given, or the original vehicle's safety degree is unknown.
+        If the study or a file cannot be used, no file is given, or the original vehicle's safety
+        degree is unknown.
     """
     loaded_study = load_study(study)
     directory = Path(out)
@@ -184,7 +229,9 @@ def import_published(
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
-    metrics = {name: {**loaded_study.published, **_read_metrics(original)}.get(name) for name in METRICS}
+    metrics = {
+        name: {**loaded_study.published, **_read_metrics(original)}.get(name) for name in METRICS
+    }
     if metrics[SAFETY_DEGREE] is None:
         problem = "the study has no published values of the original vehicle"
         raise InputError(study, problem, "them as `original`, at least the safety degree")
@@ -199,11 +246,19 @@ def import_published(
 
 
 def _read_metrics(original: Mapping[str, float] | Sequence[str]) -> dict[str, float]:
-    """Metrics by name, of which the form METRIC=NUMBER also knows the titles; raises InputError if a number is none, or
-    outside its range.
+    """Metrics by name, of which the form METRIC=NUMBER also knows the titles; raises InputError if
+    a number is none, or outside its range.
     """
-    texts = [f"{name}={value}" for name, value in original.items()] if isinstance(original, Mapping) else original
-    names = {word: metric.name for metric in METRICS.values() for word in (metric.name, metric.title.lower())}
+    texts = (
+        [f"{name}={value}" for name, value in original.items()]
+        if isinstance(original, Mapping)
+        else original
+    )
+    names = {
+        word: metric.name
+        for metric in METRICS.values()
+        for word in (metric.name, metric.title.lower())
+    }
     metrics = {}
     for text in texts:
         word, _, number = text.partition("=")

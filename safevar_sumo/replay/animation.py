@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
 
 WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
-"""Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels per inch]."""
+"""Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels
+per inch].
+"""
 GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
 TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
 PERSON_COLOUR, BRAKE_COLOUR = "#1d2329", "#e60000"
@@ -42,7 +44,8 @@ DECIMALS = 2
 
 
 def animate(comparison: Comparison, path: Path) -> None:
-    """Write a comparison as an animation in the format of the file's ending; the same comparison gives the same bytes.
+    """Write a comparison as an animation in the format of the file's ending; the same comparison
+    gives the same bytes.
 
     Raises
     ------
@@ -68,8 +71,13 @@ def _write_gif(scene: FlatScene, path: Path) -> None:
     stride = max(1, round(SECONDS_PER_FRAME / scene.step))
     last = scene.sample_count - 1
     while True:
-        samples = [*range(0, last, stride), *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step)))]
-        animation = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
+        samples = [
+            *range(0, last, stride),
+            *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step))),
+        ]
+        animation = FuncAnimation(
+            figure, show, samples, init_func=lambda: [], cache_frame_data=False
+        )
         animation.save(path, PillowWriter(fps=round(1 / (stride * scene.step))))
         if path.stat().st_size <= MAX_GIF_SIZE or stride > last:
             return
@@ -77,7 +85,9 @@ def _write_gif(scene: FlatScene, path: Path) -> None:
 
 
 def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
-    """Draw a scene as a figure outside any window; also returns the function that shows a sample in it."""
+    """Draw a scene as a figure outside any window; also returns the function that shows a sample in
+    it.
+    """
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
@@ -113,7 +123,9 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
             pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
             for patch in [*patches, *lights]:
                 patch.set_transform(pose + axis.transData)
-                is_shown = np.isfinite(body.x[sample]) and (patch not in lights or scene.brakes(body, sample))
+                is_shown = np.isfinite(body.x[sample]) and (
+                    patch not in lights or scene.brakes(body, sample)
+                )
                 patch.set_visible(bool(is_shown))
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
@@ -148,33 +160,67 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
 
 
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
-    """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle, is at the origin."""
+    """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle,
+    is at the origin.
+    """
     from matplotlib.patches import Circle, Rectangle
 
     length = body.length
     width = body.width
     if body.is_person:
         return [
-            axis.add_patch(Circle((0, 0), max(length, width) / 2, facecolor=PERSON_COLOUR, edgecolor="white", zorder=3))
+            axis.add_patch(
+                Circle(
+                    (0, 0),
+                    max(length, width) / 2,
+                    facecolor=PERSON_COLOUR,
+                    edgecolor="white",
+                    zorder=3,
+                )
+            )
         ], []
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     is_beneath = body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1
 
     def draw(
-        x: float, y: float, length: float, width: float, zorder: float = 3, linewidth: float = 0.0, **style: Any
+        x: float,
+        y: float,
+        length: float,
+        width: float,
+        zorder: float = 3,
+        linewidth: float = 0.0,
+        **style: Any,
     ) -> Patch:
-        return axis.add_patch(Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style))
+        return axis.add_patch(
+            Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style)
+        )
 
     if is_beneath:  # an outline: it is not on the road with the other
-        style: dict[str, Any] = {"color": colour, "fill": False, "linewidth": 2.0, "linestyle": "--"}
+        style: dict[str, Any] = {
+            "color": colour,
+            "fill": False,
+            "linewidth": 2.0,
+            "linestyle": "--",
+        }
         return [draw(-length, -width / 2, length, width, zorder=4, **style)], []
     patches = [
         draw(-length, -width / 2, length, width, color=colour, alpha=0.9),
         draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, color="white", alpha=0.56),
-        draw(-length, -width / 2, length, width, zorder=4 - body.row, linewidth=1.5, color=colour, fill=False),
+        draw(
+            -length,
+            -width / 2,
+            length,
+            width,
+            zorder=4 - body.row,
+            linewidth=1.5,
+            color=colour,
+            fill=False,
+        ),
     ]
     sides = (-width / 2, 0.2 * width) if body.is_vut else ()
-    return patches, [draw(-length, side, 0.28, 0.3 * width, zorder=4, color=BRAKE_COLOUR) for side in sides]
+    return patches, [
+        draw(-length, side, 0.28, 0.3 * width, zorder=4, color=BRAKE_COLOUR) for side in sides
+    ]
 
 
 @cache
@@ -182,11 +228,16 @@ def player_files() -> dict[str, str]:
     """The style sheet and the script of the player, to include in a page."""
     from markupsafe import Markup
 
-    return {name: Markup((PLAYER_FOLDER / f"player.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
+    return {
+        name: Markup((PLAYER_FOLDER / f"player.{name}").read_text(encoding="utf-8"))
+        for name in ("css", "js")
+    }
 
 
 def template_environment(*folders: Path) -> Environment:
-    """The jinja2 environment for templates in these folders and for the player; it escapes all values."""
+    """The jinja2 environment for templates in these folders and for the player; it escapes all
+    values.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(
@@ -203,7 +254,10 @@ def animation_page(scene: FlatScene) -> str:
     template = template_environment().get_template("animation.html.j2")
     comparison = scene.comparison
     return template.render(
-        title=comparison.title, changes=comparison.changes, data=player_data(scene), **player_files()
+        title=comparison.title,
+        changes=comparison.changes,
+        data=player_data(scene),
+        **player_files(),
     )
 
 
@@ -218,7 +272,9 @@ def player_data(scene: FlatScene) -> JsonObject:
         samples = slice(0, end + 1)
         ending = "is nearest" if np.isnan(comparison.runs.collision_speed[row]) else "collides"
         moments = ((f"{name} brakes", braking_start), (f"{name} {ending}", nearest))
-        jumps += [{"name": words, "sample": sample} for words, sample in moments if sample is not None]
+        jumps += [
+            {"name": words, "sample": sample} for words, sample in moments if sample is not None
+        ]
         drives.append(
             {
                 "name": name,
@@ -230,7 +286,9 @@ def player_data(scene: FlatScene) -> JsonObject:
                 "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
             }
         )
-    vehicles = " and ".join(f"the {drive['name']} vehicle, which {drive['verdict']}" for drive in drives)
+    vehicles = " and ".join(
+        f"the {drive['name']} vehicle, which {drive['verdict']}" for drive in drives
+    )
     return {
         "description": f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}",
         "moments": sorted(jumps, key=lambda jump: jump["sample"]),
@@ -263,7 +321,9 @@ def player_data(scene: FlatScene) -> JsonObject:
 
 
 def _body_data(body: FlatBody) -> JsonObject:
-    degrees = -np.rad2deg(np.unwrap(body.heading) if np.isfinite(body.heading).all() else body.heading)
+    degrees = -np.rad2deg(
+        np.unwrap(body.heading) if np.isfinite(body.heading).all() else body.heading
+    )
     return {
         "name": body.name,
         "person": body.is_person,
@@ -279,10 +339,14 @@ def _body_data(body: FlatBody) -> JsonObject:
 def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:
     """Rounded numbers for JSON; null for an undefined number."""
     # + 0.0 turns -0.0 into 0.0
-    return [round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()]
+    return [
+        round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()
+    ]
 
 
-def _rounded_or_constant(values: FloatArray, decimals: int = DECIMALS) -> list[float | None] | float | None:
+def _rounded_or_constant(
+    values: FloatArray, decimals: int = DECIMALS
+) -> list[float | None] | float | None:
     """Rounded numbers, or a single number if all are equal."""
     numbers = _rounded_list(values, decimals)
     return numbers[0] if len(set(numbers)) == 1 else numbers

@@ -1,4 +1,6 @@
-"""A changed vehicle beside the original, seen from above: when each begins to brake, is nearest and ends."""
+"""A changed vehicle beside the original, seen from above: when each begins to brake, is nearest and
+ends.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ from safevar_sumo.sumo.verification import drive_again
 
 
 class LaneLine(NamedTuple):
-    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; or the outline of an area, and 0.
+    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; or the outline of
+    an area, and 0.
 
     `kind` is road, path (only for persons), crossing or area (for persons, between paths).
     """
@@ -62,10 +65,12 @@ COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is changed).
+    """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is
+    changed).
 
-    `title` is the study's title and the name of `point`, at which `system` drove; `evaluations` and `runs` have one row
-    for each vehicle. `objectives` are metrics that the study optimises besides the paper's metrics.
+    `title` is the study's title and the name of `point`, at which `system` drove; `evaluations` and
+    `runs` have one row for each vehicle. `objectives` are metrics that the study optimises besides
+    the paper's metrics.
     """
 
     title: str
@@ -111,7 +116,12 @@ class Comparison:
         samples = count()
         length = len(self.runs.trace.time)
         settings = self.evaluations.settings
-        drive_again(self.system, settings, self.runs, lambda world: world.film(tracks, next(samples), length))
+        drive_again(
+            self.system,
+            settings,
+            self.runs,
+            lambda world: world.film(tracks, next(samples), length),
+        )
         return dict(sorted(tracks.items()))
 
     def name(self, row: int) -> str:
@@ -133,19 +143,28 @@ class Comparison:
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
-        values = [(metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives]
+        values = [
+            (metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives
+        ]
         texts = (
-            f"{metric.title} {value:.1f}{unit_text(metric.unit)}" for metric, value in values if np.isfinite(value)
+            f"{metric.title} {value:.1f}{unit_text(metric.unit)}"
+            for metric, value in values
+            if np.isfinite(value)
         )
         return ", ".join([ending, *texts])
 
 
 def comparison_of(simulation: Simulation) -> Comparison:
-    """What a simulation and that of the original vehicle beside it look like, at the same point of a matrix."""
+    """What a simulation and that of the original vehicle beside it look like, at the same point of
+    a matrix.
+    """
     pair = simulation.pair
     scoring = simulation.scoring
     title = simulation.study.title
-    objectives = {objective.name for objective in scoring.objectives} - {*METRICS, RATING_POINTS.name}
+    objectives = {objective.name for objective in scoring.objectives} - {
+        *METRICS,
+        RATING_POINTS.name,
+    }
     return Comparison(
         title=f"{title} ({pair.point.name})" if pair.point.name else title,
         system=pair.system,
@@ -163,17 +182,22 @@ def read_road(network: Network) -> tuple[LaneLine, ...]:
     for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
         for lane in edge.iter("lane"):
             # a point is x,y or x,y,z
-            line = [[float(number) for number in point.split(",")[:2]] for point in lane.attrib["shape"].split()]
+            line = [
+                [float(number) for number in point.split(",")[:2]]
+                for point in lane.attrib["shape"].split()
+            ]
             kind = {"walkingarea": "area", "crossing": "crossing"}.get(edge.get("function", ""))
             for_persons = lane.get("allow", "").split() == ["pedestrian"]
             width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
-            lanes.append(LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width))
+            lanes.append(
+                LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width)
+            )
     return tuple(lanes)
 
 
 def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
-    """Runs with the pedals of the sample before an impact also at the impact, where a command has no effect any
-    more.
+    """Runs with the pedals of the sample before an impact also at the impact, where a command has
+    no effect any more.
     """
     trace = runs.trace
     pedals = np.stack([trace.throttle, trace.brake])
@@ -184,12 +208,14 @@ def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both values; rating points are
-    left out, as the replay of one cell has none.
+    """List where the replay of a solution differs from its row of solutions.csv, with both values;
+    rating points are left out, as the replay of one cell has none.
     """
     differences = []
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
-        differences.append(f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now")
+        differences.append(
+            f"the outcome was {recorded['outcome']} and is {replayed.outcome[0]} now"
+        )
     for name, values in replayed.metrics.items():
         stored = recorded.get(name, values[0])
         if name != RATING_POINTS.name and not np.array_equal(stored, values[0], equal_nan=True):

@@ -1,4 +1,6 @@
-"""A solution's simulation as files for other simulators: OpenSCENARIO XML and OpenDRIVE, or a script for CARLA."""
+"""A solution's simulation as files for other simulators: OpenSCENARIO XML and OpenDRIVE, or a
+script for CARLA.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +38,18 @@ CARLA_PHYSICS = {
     "mass": "mass",
     "dragCoeff": "drag_coefficient",
 }
-"""Attributes of CARLA's `VehiclePhysicsControl`, by the characteristic with the same meaning and unit."""
+"""Attributes of CARLA's `VehiclePhysicsControl`, by the characteristic with the same meaning and
+unit.
+"""
 CARLA_WHEELS = {
     "tireFric": "tire_friction",
     "dampRate": "damping_rate",
     "radius": "radius",
     "maxBrakeTorque": "max_brake_torque",
 }
-"""Attributes of each `WheelPhysicsControl`, by characteristic; CARLA's radius is in cm, as the characteristic is."""
+"""Attributes of each `WheelPhysicsControl`, by characteristic; CARLA's radius is in cm, as the
+characteristic is.
+"""
 EGO = "Ego"
 """Name of the vehicle under test in OpenSCENARIO."""
 WHEELBASE = 0.58
@@ -57,14 +63,14 @@ DROPPED_ATTRIBUTES = {
     "cornerLocal": ("id",),
     "header": ("date",),
 }
-"""Attributes, by element, that netconvert writes into OpenDRIVE 1.4 although only later versions have them; and the
-time of the conversion.
+"""Attributes, by element, that netconvert writes into OpenDRIVE 1.4 although only later versions
+have them; and the time of the conversion.
 """
 
 
 class Poses(NamedTuple):
-    """Samples of an actor on the road, shape (T,): time [s], middle x and y [m], and heading counter-clockwise from x
-    [rad].
+    """Samples of an actor on the road, shape (T,): time [s], middle x and y [m], and heading
+    counter-clockwise from x [rad].
     """
 
     name: str
@@ -83,21 +89,25 @@ class Poses(NamedTuple):
 
     @property
     def to_axle(self) -> float:
-        """Distance of the rear axle behind the middle [m]; OpenSCENARIO places a vehicle by this axle, a person by its
-        middle.
+        """Distance of the rear axle behind the middle [m]; OpenSCENARIO places a vehicle by this
+        axle, a person by its middle.
         """
         return 0.0 if self.kind == "pedestrian" else self.length * WHEELBASE / 2
 
     def places(self, behind: float = 0.0) -> list[tuple[float, float, float, float]]:
-        """Time [s], x, y [m] and heading [rad] of the point that is `behind` the middle by so much [m]."""
+        """Time [s], x, y [m] and heading [rad] of the point that is `behind` the middle by so much
+        [m].
+        """
         x = self.x - behind * np.cos(self.heading)
         y = self.y - behind * np.sin(self.heading)
-        return list(zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True))
+        return list(
+            zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True)
+        )
 
 
 def poses_of(comparison: Comparison) -> list[Poses]:
-    """All actors of the changed vehicle's run, or of the original's if nothing is changed, until its end; the vehicle
-    under test is the first.
+    """All actors of the changed vehicle's run, or of the original's if nothing is changed, until
+    its end; the vehicle under test is the first.
     """
     row = comparison.rows[-1]
     actors = []
@@ -142,7 +152,10 @@ def open_drive(network: Network) -> str:
     for element in root.iter():
         for name in DROPPED_ATTRIBUTES.get(element.tag, ()):
             element.attrib.pop(name, None)
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+    return (
+        '<?xml version="1.0"'
+        f' encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+    )
 
 
 def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
@@ -156,20 +169,29 @@ def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
     names = {**CARLA_PHYSICS, **CARLA_WHEELS}
     if without := [name for name in setting if name not in names]:
         problem = (
-            f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no counterpart in CARLA"
+            f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no"
+            " counterpart in CARLA"
         )
-        raise InputError("", problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`")
+        raise InputError(
+            "", problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`"
+        )
     if missing := [name for name in names if name not in setting]:
-        raise InputError("", f"its vehicle has no {', '.join(missing)}", "the vehicle `carla`, or `to=openscenario`")
+        raise InputError(
+            "",
+            f"its vehicle has no {', '.join(missing)}",
+            "the vehicle `carla`, or `to=openscenario`",
+        )
     return {
         "physics": {attribute: setting[name] for name, attribute in CARLA_PHYSICS.items()},
         "wheels": {attribute: setting[name] for name, attribute in CARLA_WHEELS.items()},
     }
 
 
-def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float]], handle: str) -> JsonObject:
-    """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings counter-clockwise) and
-    pedals.
+def carla_scene(
+    comparison: Comparison, physics: Mapping[str, Mapping[str, float]], handle: str
+) -> JsonObject:
+    """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings
+    counter-clockwise) and pedals.
     """
     row = comparison.rows[-1]
     trace = comparison.runs.trace
@@ -187,10 +209,17 @@ def carla_scene(comparison: Comparison, physics: Mapping[str, Mapping[str, float
         "route": np.stack([vut.x, vut.y], axis=1).tolist(),
         "pedals": [
             {"throttle": throttle, "brake": brake}
-            for throttle, brake in zip(trace.throttle[samples, row], trace.brake[samples, row], strict=True)
+            for throttle, brake in zip(
+                trace.throttle[samples, row], trace.brake[samples, row], strict=True
+            )
         ],
         "actors": [
-            {"name": actor.name, "kind": actor.kind, "length": actor.length, "places": actor.places()}
+            {
+                "name": actor.name,
+                "kind": actor.kind,
+                "length": actor.length,
+                "places": actor.places(),
+            }
             for actor in others
         ],
     }
@@ -205,7 +234,8 @@ def export(
     point: PointName = None,
     as_it_is_now: bool = False,
 ) -> str:
-    """Write a solution's simulation for CARLA (a script and the vehicle's values), or as OpenSCENARIO and OpenDRIVE.
+    """Write a solution's simulation for CARLA (a script and the vehicle's values), or as
+    OpenSCENARIO and OpenDRIVE.
 
     Parameters
     ----------
@@ -218,7 +248,8 @@ def export(
     point
         Only this point of the study's matrix.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and say so.
+        If results were computed with other files or versions, simulate with the present ones and
+        say so.
     """
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
@@ -230,17 +261,27 @@ def export(
     values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
-    comparison = comparison_of(simulate_with_original(target.study, system, setting, filtered=False))
+    comparison = comparison_of(
+        simulate_with_original(target.study, system, setting, filtered=False)
+    )
     write_files(comparison, to, out, solution, physics)
     if to == "openscenario" and comparison.runs.trace.speed[0, -1] <= 0:
-        return f"{to}: {out}\nnote: Ego starts from standstill, so no study can name {out / SCENARIO}"
+        return (
+            f"{to}: {out}\nnote: Ego starts from standstill, so no study can name {out / SCENARIO}"
+        )
     return f"{to}: {out}"
 
 
 def write_files(
-    comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, Mapping[str, float]]
+    comparison: Comparison,
+    to: str,
+    out: Path,
+    handle: str,
+    physics: Mapping[str, Mapping[str, float]],
 ) -> None:
-    """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or "openscenario"."""
+    """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
+    "openscenario".
+    """
     files = {ROAD: open_drive(comparison.network)}
     if to == "carla":
         scene = carla_scene(comparison, physics, handle)

@@ -1,4 +1,6 @@
-"""The original and a changed vehicle in one figure: speed, gap, pedals and time to collision over time."""
+"""The original and a changed vehicle in one figure: speed, gap, pedals and time to collision over
+time.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]):
+    with matplotlib.style.context(
+        ["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]
+    ):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
     runs = comparison.runs
@@ -70,35 +74,62 @@ def draw_comparison(comparison: Comparison) -> Figure:
     pedal_axis.set(ylim=(-1.08, 1.08), xlabel="time [s]")
     pedal_axis.set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
     ttc_axis.set(ylim=(0, None), xlim=(None, _end_time(comparison) * 1.25), xlabel="time [s]")
-    ttc_axis.axhline(comparison.system.metrics_table.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":")
+    ttc_axis.axhline(
+        comparison.system.metrics_table.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":"
+    )
     figure.suptitle(_heading(comparison).replace("$", r"\$"), fontsize=FONT_SIZE + 1)
     _draw_legend(figure, comparison, divergence_time)
     return figure
 
 
 def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int) -> None:
-    """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are larger, to show behind
-    the changed vehicle's.
+    """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are
+    larger, to show behind the changed vehicle's.
     """
     trace = comparison.runs.trace
     start, nearest, end = comparison.moments[row]
     impact_speed = float(comparison.runs.collision_speed[row])
     has_impact = not np.isnan(impact_speed)
 
-    def draw(axis: Axes, sample: int, value: float, mark: str, text: str = "", **place: Any) -> None:
+    def draw(
+        axis: Axes, sample: int, value: float, mark: str, text: str = "", **place: Any
+    ) -> None:
         point = (trace.time[sample], value)
         colour = COLOURS[row]
         size = 12 - 4 * row + 2 * (mark == IMPACT_MARK)
-        axis.plot(*point, mark, color=colour, markersize=size, linestyle="", zorder=6 + row, markeredgecolor="white")
+        axis.plot(
+            *point,
+            mark,
+            color=colour,
+            markersize=size,
+            linestyle="",
+            zorder=6 + row,
+            markeredgecolor="white",
+        )
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
         axis.annotate(
-            text, point, textcoords="offset points", color=colour, fontweight="bold", bbox=box, zorder=5, **place
+            text,
+            point,
+            textcoords="offset points",
+            color=colour,
+            fontweight="bold",
+            bbox=box,
+            zorder=5,
+            **place,
         )
 
     if start is not None:
         draw(speed_axis, start, trace.speed[start, row], BRAKING_MARK, xytext=(0, 0))
     if has_impact:
-        draw(speed_axis, end, impact_speed, IMPACT_MARK, f"{impact_speed:.1f} m/s", xytext=(3, 7), ha="left")
+        draw(
+            speed_axis,
+            end,
+            impact_speed,
+            IMPACT_MARK,
+            f"{impact_speed:.1f} m/s",
+            xytext=(3, 7),
+            ha="left",
+        )
     if nearest is not None and np.isfinite(gap := trace.gap[nearest, row]):
         is_largest = np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
         mark, text = (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
@@ -108,7 +139,9 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
 def _end_time(comparison: Comparison) -> float:
     """The later of the times at which the vehicles are nearest and at rest [s]."""
     runs = comparison.runs
-    last_moving = np.flatnonzero((runs.trace.active & (runs.trace.speed > STANDSTILL)).any(axis=1)).max(initial=0)
+    last_moving = np.flatnonzero(
+        (runs.trace.active & (runs.trace.speed > STANDSTILL)).any(axis=1)
+    ).max(initial=0)
     last_sample = max(last_moving, *(moments.nearest or 0 for moments in comparison.moments))
     return float(runs.trace.time[min(last_sample + 1, len(runs.trace.time) - 1)])
 
@@ -118,24 +151,32 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     from matplotlib.lines import Line2D
 
     entries: JsonObject = {
-        f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {"color": COLOURS[row], "linestyle": LINES[row]}
+        f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {
+            "color": COLOURS[row],
+            "linestyle": LINES[row],
+        }
         for row in comparison.rows
     }
     marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
     if np.isfinite(comparison.runs.collision_speed).any():
         marks["impact"] = IMPACT_MARK
-    entries |= {label: {"marker": mark, "linestyle": "", "markersize": 7} for label, mark in marks.items()}
+    entries |= {
+        label: {"marker": mark, "linestyle": "", "markersize": 7} for label, mark in marks.items()
+    }
     if divergence_time is not None:
         entries["speeds diverge (by 0.1 m/s)"] = {"linestyle": "-.", "linewidth": 0.9}
     threshold = f"TTC* = {comparison.system.metrics_table.ttc_threshold:g} s: critical below"
     entries[threshold] = {"color": "0.4", "linestyle": ":", "linewidth": 0.9}
-    handles = [Line2D([], [], label=label, **{"color": "0.35", **style}) for label, style in entries.items()]
+    handles = [
+        Line2D([], [], label=label, **{"color": "0.35", **style})
+        for label, style in entries.items()
+    ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
 def find_divergence(runs: SimulationRuns) -> int | None:
-    """The first sample at which the speeds of the original and the changed vehicle have diverged; None if they never
-    do, or if nothing is changed.
+    """The first sample at which the speeds of the original and the changed vehicle have diverged;
+    None if they never do, or if nothing is changed.
     """
     trace = runs.trace
     have_diverged = trace.active.all(axis=1) & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE)

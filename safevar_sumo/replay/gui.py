@@ -1,4 +1,6 @@
-"""A comparison in sumo-gui: SUMO drives both vehicles again, each on its own copy of the road, one upon the other."""
+"""A comparison in sumo-gui: SUMO drives both vehicles again, each on its own copy of the road, one
+upon the other.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,11 @@ VIEW_SETTINGS = """<viewsettings>
 
 
 def show_in_gui(
-    comparison: Comparison, *, slower: float = 1.0, rest: float = PAUSE, pictures: Path | None = None
+    comparison: Comparison,
+    *,
+    slower: float = 1.0,
+    rest: float = PAUSE,
+    pictures: Path | None = None,
 ) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 
@@ -64,7 +70,9 @@ def show_in_gui(
     """
     runs = comparison.runs
     samples = count()
-    pauses = {moments.nearest for moments in comparison.moments} | {max(moments.end for moments in comparison.moments)}
+    pauses = {moments.nearest for moments in comparison.moments} | {
+        max(moments.end for moments in comparison.moments)
+    }
     start = 0.0
 
     def watch(world: SumoWorld) -> None:
@@ -73,9 +81,13 @@ def show_in_gui(
         if sample == 0:  # to open the window took a while
             start = time.monotonic()
             for row in comparison.rows:
-                world.api.vehicle.setColor(copied_id(row, VUT), (*bytes.fromhex(COLOURS[row][1:]), 255))
+                world.api.vehicle.setColor(
+                    copied_id(row, VUT), (*bytes.fromhex(COLOURS[row][1:]), 255)
+                )
         _look_at(world)
-        if pictures is not None and sample + 1 in pauses:  # sumo-gui takes it at the end of its next step
+        if (
+            pictures is not None and sample + 1 in pauses
+        ):  # sumo-gui takes it at the end of its next step
             world.api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample + 1:04d}.png"))
         if sample in pauses:
             time.sleep(rest)
@@ -99,6 +111,13 @@ def _open_view(options: Sequence[str]) -> Iterator[Api]:
     with temporary_folder() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
-        view = ["--gui-settings-file", str(settings_file), "--start", "--quit-on-end", "--window-size", "1200,700"]
+        view = [
+            "--gui-settings-file",
+            str(settings_file),
+            "--start",
+            "--quit-on-end",
+            "--window-size",
+            "1200,700",
+        ]
         with open_window([*options, *view]) as api:
             yield api

@@ -1,4 +1,6 @@
-"""A comparison as a flat scene in metres, turned so that the vehicle under test starts towards the right."""
+"""A comparison as a flat scene in metres, turned so that the vehicle under test starts towards the
+right.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ MARGIN = 4.0
 MIN_HEIGHT = 11.0
 """Smallest height of a view [m]."""
 MAX_LENGTH = 75.0
-"""Length up to which a scene is shown whole; in a longer scene the camera follows the vehicles [m]."""
+"""Length up to which a scene is shown whole; in a longer scene the camera follows the vehicles [m].
+"""
 CAMERA_LENGTH = 48.0
 """Length of road that a following camera shows [m]."""
 CAMERA_LEAD = 0.45
@@ -37,8 +40,8 @@ LANE_KINDS = ("area", "path", "road", "crossing")
 
 
 class FlatBody(NamedTuple):
-    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m], heading [rad from x];
-    shape (T,).
+    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m],
+    heading [rad from x]; shape (T,).
     """
 
     name: str
@@ -56,8 +59,9 @@ class FlatBody(NamedTuple):
 class FlatScene:
     """A comparison laid out for drawing; `sample_count` samples, `step` seconds apart.
 
-    The lanes and bodies are in the order in which they are drawn. The part of the road that is shown has its left end
-    at `left_ends`, shape (T,), its lower end at `bottom`, and the size `width` by `height` [m].
+    The lanes and bodies are in the order in which they are drawn. The part of the road that is
+    shown has its left end at `left_ends`, shape (T,), its lower end at `bottom`, and the size
+    `width` by `height` [m].
     """
 
     comparison: Comparison
@@ -72,36 +76,50 @@ class FlatScene:
 
     @property
     def key_sample(self) -> int:
-        """The sample that a still picture shows: the moment at which the changed vehicle, or else the original, is
-        nearest.
+        """The sample that a still picture shows: the moment at which the changed vehicle, or else
+        the original, is nearest.
         """
         return self.comparison.moments[-1].decided
 
     def brakes(self, body: FlatBody, sample: int) -> bool:
-        """Whether an actor is the vehicle under test and brakes; after the end of its run, whether it braked then."""
+        """Whether an actor is the vehicle under test and brakes; after the end of its run, whether
+        it braked then.
+        """
         last_sample = self.comparison.moments[body.row].end
-        return body.is_vut and bool(self.comparison.runs.trace.brake[min(sample, last_sample), body.row] > 0)
+        return body.is_vut and bool(
+            self.comparison.runs.trace.brake[min(sample, last_sample), body.row] > 0
+        )
 
     def reading(self, row: int, sample: int) -> str:
-        """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run ends."""
+        """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its
+        run ends.
+        """
         trace = self.comparison.runs.trace
         moments = self.comparison.moments[row]
         shown = min(sample, moments.end)
         ending = "brakes" if trace.brake[shown, row] > 0 else ""
         if sample >= moments.decided:
             ending = self.comparison.verdict(row)
-        gap = f"gap {max(trace.gap[shown, row], 0):.1f} m" if np.isfinite(trace.gap[shown, row]) else ""
+        gap = (
+            f"gap {max(trace.gap[shown, row], 0):.1f} m"
+            if np.isfinite(trace.gap[shown, row])
+            else ""
+        )
         return f"{trace.speed[shown, row]:4.1f} m/s  {gap:10}  {ending}"
 
     @property
     def all_marks(self) -> list[int]:
         """The marks that ever come into view, by their distance from the start [m]."""
         first = math.floor(self.left_ends.min() / MARK_DISTANCE) * MARK_DISTANCE
-        return list(range(first, int(self.left_ends.max() + self.width) + MARK_DISTANCE, MARK_DISTANCE))
+        return list(
+            range(first, int(self.left_ends.max() + self.width) + MARK_DISTANCE, MARK_DISTANCE)
+        )
 
 
 def lay_out_scene(comparison: Comparison) -> FlatScene:
-    """Lay out a comparison for drawing, with the actors that ever come near the vehicle under test."""
+    """Lay out a comparison for drawing, with the actors that ever come near the vehicle under
+    test.
+    """
     vut = comparison.tracks[VUT]
     turn = vut.heading[0, 0]
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -110,20 +128,34 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     bodies = []
     for name, track in comparison.tracks.items():
         for row, moments in enumerate(comparison.moments):
-            samples = np.minimum(np.arange(sample_count), moments.end)  # then the actor stays in place
+            samples = np.minimum(
+                np.arange(sample_count), moments.end
+            )  # then the actor stays in place
             track_x = track.x[samples, row]
             track_y = track.y[samples, row]
             distance = np.hypot(track_x - vut.x[samples, row], track_y - vut.y[samples, row])
             if np.any(distance < MAX_DISTANCE + track.length):
                 x, y = rotation @ (np.stack([track_x, track_y]) - start[:, np.newaxis])
                 heading = track.heading[samples, row] - turn
-                body = FlatBody(name, row, name == VUT, track.is_person, track.length, track.width, x, y, heading)
+                body = FlatBody(
+                    name,
+                    row,
+                    name == VUT,
+                    track.is_person,
+                    track.length,
+                    track.width,
+                    x,
+                    y,
+                    heading,
+                )
                 bodies.append(body)
     lanes = (lane._replace(line=(lane.line - start) @ rotation.T) for lane in comparison.road)
     road = sorted(lanes, key=lambda lane: LANE_KINDS.index(lane.kind))
     view = _choose_view(bodies, sample_count)
     bodies.sort(key=lambda body: (body.is_vut, body.row))
-    return FlatScene(comparison, comparison.runs.trace.step, sample_count, tuple(road), tuple(bodies), *view)
+    return FlatScene(
+        comparison, comparison.runs.trace.step, sample_count, tuple(road), tuple(bodies), *view
+    )
 
 
 class _View(NamedTuple):
@@ -139,7 +171,9 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> _View:
     """The whole road or, in a long scene, what a camera that follows the vehicles shows."""
     x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
     is_vut = np.array([body.is_vut for body in bodies])
-    length, half_width = np.array([(body.length, body.width / 2) for body in bodies]).T[:, :, np.newaxis]
+    length, half_width = np.array([(body.length, body.width / 2) for body in bodies]).T[
+        :, :, np.newaxis
+    ]
     left_end = float(np.nanmin(x - length)) - MARGIN / 2
     right_end = float(np.nanmax(x + np.where(is_vut[:, np.newaxis], 0, length))) + MARGIN
     bottom = float(np.nanmin(y - half_width)) - MARGIN / 2
@@ -149,7 +183,9 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> _View:
     width = right_end - left_end
     if width > MAX_LENGTH:
         width = CAMERA_LENGTH
-        left_ends = np.clip(x[is_vut].mean(axis=0) - width * CAMERA_LEAD, left_end, max(left_end, right_end - width))
+        left_ends = np.clip(
+            x[is_vut].mean(axis=0) - width * CAMERA_LEAD, left_end, max(left_end, right_end - width)
+        )
     return _View(left_ends, bottom - padding, width, height + 2 * padding)
 
 
@@ -161,7 +197,9 @@ def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArra
 
 
 def lane_outlines(lane: LaneLine, width: float) -> Iterator[FloatArray]:
-    """Polygons that show a lane, shape (P, 2) each: an area, the stripes of a crossing, or strips of this width [m]."""
+    """Polygons that show a lane, shape (P, 2) each: an area, the stripes of a crossing, or strips
+    of this width [m].
+    """
     if lane.kind == "area":
         yield lane.line
         return

@@ -1,4 +1,6 @@
-"""The command `simulate`: one setting of a study beside the original vehicle, or a sweep over many."""
+"""The command `simulate`: one setting of a study beside the original vehicle, or a sweep over
+many.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ POINTS: Columns = {
     SAFETY_DEGREE: Column("m", "safety degree; minus a collision's closing speed in m/s", ".2f"),
     "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
     STOPPING_DISTANCE.name: Column("m", "distance from the first brake force to standstill", ".1f"),
-    "test_speed_error": Column("km/h", "deviation from the test speed before the driving system acts", "+.1f"),
+    "test_speed_error": Column(
+        "km/h", "deviation from the test speed before the driving system acts", "+.1f"
+    ),
     "warning_ttc": Column("s", "time to collision at the first warning", is_shown=False),
     "side": Column("", "side of the vehicle that touches", is_shown=False),
     "place": Column("%", "position of the contact along that side", is_shown=False),
@@ -72,14 +76,25 @@ SPREAD: Columns = {
 }
 
 
-OUTCOME_NAMES = ("outcome", "collision", "collision_speed", "gap", ORIGINAL_DEGREE, "f_safe", "f_diff", "f_num_diff")
+OUTCOME_NAMES = (
+    "outcome",
+    "collision",
+    "collision_speed",
+    "gap",
+    ORIGINAL_DEGREE,
+    "f_safe",
+    "f_diff",
+    "f_num_diff",
+)
 """What every study says of a simulation besides its metrics."""
 NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
 """Why a setting of a study that searches its scenario is in no result."""
 
 
 class Target(NamedTuple):
-    """What is simulated: a study, and its name in errors; of a solution also its handle and its row of the results."""
+    """What is simulated: a study, and its name in errors; of a solution also its handle and its row
+    of the results.
+    """
 
     study: Study
     source: str
@@ -120,7 +135,8 @@ def simulate(
     point: PointName = None,
     as_it_is_now: bool = False,
 ) -> Answer:
-    """Simulate a study once, or a solution of results with the study as recorded there, beside the original vehicle.
+    """Simulate a study once, or a solution of results with the study as recorded there, beside the
+    original vehicle.
 
     Parameters
     ----------
@@ -133,7 +149,8 @@ def simulate(
     smallest
         Replay the unsafe solution with the smallest changes.
     set
-        A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it for others.
+        A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it
+        for others.
     no_filter
         Keep changes that are smaller than the filter's thresholds.
     beyond
@@ -143,7 +160,8 @@ def simulate(
     animate
         Animate both simulations, seen from above, in this gif or html file.
     gui
-        Show both simulations in sumo-gui, one upon the other: the original blue, the changed one orange.
+        Show both simulations in sumo-gui, one upon the other: the original blue, the changed one
+        orange.
     slower
         How many times slower than real time sumo-gui plays.
     spread
@@ -151,7 +169,8 @@ def simulate(
     point
         Only this point of the study's matrix.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and say so.
+        If results were computed with other files or versions, simulate with the present ones and
+        say so.
     """
     choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
     chosen = [name for name, given in choices.items() if given]
@@ -171,7 +190,9 @@ def simulate(
     is_sweep = any(len(options) > 1 for options in values.values())
     if is_sweep:
         if trace or animate or gui or spread:
-            expected = "one value for each characteristic with --trace, --animate, --gui or --spread"
+            expected = (
+                "one value for each characteristic with --trace, --animate, --gui or --spread"
+            )
             raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
         return _sweep(target.study, system, requested, list(values), filtered)
     simulation = simulate_with_original(target.study, system, requested[0], filtered=filtered)
@@ -190,13 +211,15 @@ def simulate(
 
 
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
-    """A setting beside the original: its values, outcome, metrics and objectives, and the points of a matrix."""
+    """A setting beside the original: its values, outcome, metrics and objectives, and the points of
+    a matrix.
+    """
     study = target.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks(system)
     remarks.extend(
-        f"{name} = {value:g} differs from the original by less than the filter threshold and was reset to "
-        f"{simulation.setting[name]:g}; --no-filter keeps it."
+        f"{name} = {value:g} differs from the original by less than the filter threshold and was"
+        f" reset to {simulation.setting[name]:g}; --no-filter keeps it."
         for name, value in simulation.reset_values.items()
     )
     remarks += _acted_early(system, setting)
@@ -204,19 +227,29 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     simulated = simulation.numbers
     units = {"outcome": "", **simulation.units}
     results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
-    tables = {"characteristics": _characteristics(simulation), "results": tabulate("Results", RESULTS, results)}
+    tables = {
+        "characteristics": _characteristics(simulation),
+        "results": tabulate("Results", RESULTS, results),
+    }
     verdict = [simulation.no_verdict, *_verdict(simulation)]
     if system.rater is not None:
-        verdict.append(f"The command `rating` simulates all {len(system.matrix)} cells and variations.")
+        verdict.append(
+            f"The command `rating` simulates all {len(system.matrix)} cells and variations."
+        )
     elif system.matrix:
         records = map(point_record, simulate_all_points(system, setting[np.newaxis]))
-        points = [{**row, **row.get("contact", {})} for row in records]  # side and place are columns
+        points = [
+            {**row, **row.get("contact", {})} for row in records
+        ]  # side and place are columns
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
         failing = [row["point"] for row in points if row["outcome"] == Outcome.COLLISION]
         verdict.append(points_in_words(failing, len(points)))
     if with_spread:
         remarks += remarks_on_sets(study)
-        vehicles = {"simulated": setting, "original": system.characteristics.with_original_vehicle(setting)}
+        vehicles = {
+            "simulated": setting,
+            "original": system.characteristics.with_original_vehicle(setting),
+        }
         bands = compute_model_spreads(study, np.stack([*vehicles.values()]))
         rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
@@ -232,21 +265,25 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
 
 
 def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
-    """Points at which the driving system acts while others still move by a vehicle that keeps its speed."""
+    """Points at which the driving system acts while others still move by a vehicle that keeps its
+    speed.
+    """
     if any(np.any(point.scenario.depends_until > 0) for point in system.points):
         for result in simulate_all_points(system, setting[np.newaxis]):
             (acted,) = result.runs.acted_early
             if np.isfinite(acted):  # NaN: it never did
                 at = f"{result.point.name}: " if result.point.name else ""
                 yield (
-                    f"{at}invalid test: {result.point.scenario.dependence}, and the driving system acts at "
-                    f"{acted:.1f} s: other simulators would show another encounter."
+                    f"{at}invalid test: {result.point.scenario.dependence}, and the driving system"
+                    f" acts at {acted:.1f} s: other simulators would show another encounter."
                 )
 
 
-def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_now: bool, point: str | None) -> Target:
-    """The study by name or path, or that of a results directory, at a point or as a whole, with the solution that is
-    named or chosen.
+def load_target(
+    source: str, solution: str | None, chosen: list[str], as_it_is_now: bool, point: str | None
+) -> Target:
+    """The study by name or path, or that of a results directory, at a point or as a whole, with the
+    solution that is named or chosen.
 
     Raises
     ------
@@ -255,7 +292,9 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
     """
     wanted = [*chosen, *([] if solution is None else [f"solution {solution}"])]
     if len(wanted) > 1:
-        raise InputError("solution", f"{' and '.join(wanted)} both choose a solution", "one of them")
+        raise InputError(
+            "solution", f"{' and '.join(wanted)} both choose a solution", "one of them"
+        )
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=bool(wanted))
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
@@ -266,14 +305,18 @@ def load_target(source: str, solution: str | None, chosen: list[str], as_it_is_n
     subject.require_solutions()
     with about(source):
         handle = (
-            choose_handle(subject.solutions, subject.unsafe, chosen[0]) if chosen else SolutionId.parse(str(solution))
+            choose_handle(subject.solutions, subject.unsafe, chosen[0])
+            if chosen
+            else SolutionId.parse(str(solution))
         )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
     return Target(study, source, handle, {str(name): value for name, value in row.items()})
 
 
 def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:
-    """M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in turn."""
+    """M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in
+    turn.
+    """
     combinations = list(product(*values.values()))
     settings = np.tile(base, (len(combinations), 1))
     settings[:, [system.characteristics.names.index(name) for name in values]] = combinations
@@ -286,35 +329,56 @@ def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation
         warn(f"{target.handle} of {target.source}: {difference}; {why}")
 
 
-def _sweep(study: Study, system: System, requested: FloatArray, names: list[str], filtered: bool) -> Answer:
+def _sweep(
+    study: Study, system: System, requested: FloatArray, names: list[str], filtered: bool
+) -> Answer:
     """A row for each setting of a sweep."""
     characteristics = system.characteristics
     settings = characteristics.filter(requested) if filtered else requested
-    evaluations = evaluate_settings(study, np.concatenate([characteristics.original[np.newaxis], settings]))
+    evaluations = evaluate_settings(
+        study, np.concatenate([characteristics.original[np.newaxis], settings])
+    )
     contact = system.contact
     no_verdict = why_no_verdict(system)
     frame = pd.DataFrame(settings, columns=list(characteristics.names))[names]
-    columns = {item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names}
+    columns = {
+        item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names
+    }
     columns["outcome"] = Column("", "how the simulation ends")
     metrics = {metric.name: metric for metric in system.measuring.scoring.metrics}
     for name in evaluations.metrics:
-        columns[name] = Column(metrics[name].unit, metrics[name].title, ".3f") if name in metrics else Column("", name)
+        columns[name] = (
+            Column(metrics[name].unit, metrics[name].title, ".3f")
+            if name in metrics
+            else Column("", name)
+        )
     columns["gap"] = Column("m", "least distance between bodies", ".3f", is_shown=bool(contact))
-    values = {"outcome": evaluations.outcome, **evaluations.metrics, "gap": evaluations.gaps(contact)}
+    values = {
+        "outcome": evaluations.outcome,
+        **evaluations.metrics,
+        "gap": evaluations.gaps(contact),
+    }
     frame = frame.assign(**{name: column[1:] for name, column in values.items()})
     collisions = int(evaluations.collided[1:].sum())
     resets = np.count_nonzero((settings != requested).any(axis=1))
     remarks = [*_remarks(system), degree_note(contact)]
     if resets:
-        remarks.append(f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter keeps them.")
+        remarks.append(
+            f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter"
+            " keeps them."
+        )
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     where = " in the original encounter" if study.scenario.search else ""
-    original = f"The original vehicle{where}: {evaluations.outcome[0]}, safety degree {evaluations.f_safe[0]:.2f}."
+    original = (
+        f"The original vehicle{where}: {evaluations.outcome[0]}, safety degree"
+        f" {evaluations.f_safe[0]:.2f}."
+    )
+    counts = f"{collisions} of {number_of(len(frame), 'setting')} collide."
     return Answer(
         question="simulate",
         study=study,
-        verdict=f"{no_verdict} {collisions} of {number_of(len(frame), 'setting')} collide. {original}".strip(),
+        verdict=f"{no_verdict} {counts} {original}".strip(),
         numbers={"driven": not no_verdict, "settings": len(frame), "collisions": collisions},
         tables={"sweep": tabulate(study.title, columns, frame), "remarks": _remark_table(remarks)},
     )
@@ -326,7 +390,10 @@ def _remark_table(remarks: list[str]) -> pd.DataFrame:
 
 def _characteristics(simulation: Simulation) -> pd.DataFrame:
     pairs = zip(CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True)
-    rows = ((item.name, item.unit, item.original, value, value != item.original, item.words) for item, value in pairs)
+    rows = (
+        (item.name, item.unit, item.original, value, value != item.original, item.words)
+        for item, value in pairs
+    )
     return tabulate(simulation.study.title, CHARACTERISTICS, rows)
 
 
@@ -337,7 +404,9 @@ def _verdict(simulation: Simulation) -> list[str]:
     where = f"At {name} the" if name else "The" if least is None else "In this encounter the"
     verdict = [f"{where} original vehicle {simulation.original.verdict}."]
     if simulation.setting != simulation.original.setting:
-        verdict.append(f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}.")
+        verdict.append(
+            f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}."
+        )
     if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
         verdict.append(f"Here {NOT_SAFE}: at least {least:.2f} m.")
     return verdict
@@ -354,9 +423,16 @@ def _safety_comparison(simulation: Simulation) -> str:
         return "whether that is less safe cannot be decided"
     if degree == original:
         return "as safe as the original"
-    gaps = "" if simulation.gap == degree else f", gap {simulation.gap:.2f} against {simulation.original.gap:.2f} m"
+    gaps = (
+        ""
+        if simulation.gap == degree
+        else f", gap {simulation.gap:.2f} against {simulation.original.gap:.2f} m"
+    )
     change = "less safe" if degree < original else "safer"
-    return f"{change} than the original, SD {degree:.2f} against {original:.2f}{gaps if degree > 0 else ''}"
+    return (
+        f"{change} than the original, SD {degree:.2f} against"
+        f" {original:.2f}{gaps if degree > 0 else ''}"
+    )
 
 
 def _remarks(system: System) -> list[str]:

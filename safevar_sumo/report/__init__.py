@@ -1,4 +1,6 @@
-"""Make a page about the findings of studies. The package is callable: `safevar_sumo.report(...)`."""
+"""Make a page about the findings of studies. The package is callable:
+`safevar_sumo.report(...)`.
+"""
 
 from __future__ import annotations
 

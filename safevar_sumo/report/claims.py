@@ -43,10 +43,20 @@ STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
 """Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
 SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
-MALFORMED = (LookupError, ValueError, TypeError, AttributeError, RecursionError, csv.Error, msgspec.MsgspecError)
+MALFORMED = (
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    csv.Error,
+    msgspec.MsgspecError,
+)
 """What reading a damaged file raises."""
 SURPLUS = 10
-"""How many times the evaluations that its runs may have a study can claim to be compared; one with more is damaged."""
+"""How many times the evaluations that its runs may have a study can claim to be compared; one with
+more is damaged.
+"""
 CONTEXT, SHOWN = 40, 200
 """Characters of a long line that are shown before the first one that differs, and in all."""
 
@@ -75,7 +85,12 @@ class Packed:
     """
 
     def __init__(
-        self, packed: PackedStudy, files: dict[str, bytes], places: Sequence[str], jobs: int | None, progress: Progress
+        self,
+        packed: PackedStudy,
+        files: dict[str, bytes],
+        places: Sequence[str],
+        jobs: int | None,
+        progress: Progress,
     ) -> None:
         self.packed = packed
         self.files = files
@@ -87,15 +102,23 @@ class Packed:
             study = convert_table(self.manifest["study"], Study, "study")
         study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
-        scoring = msgspec.convert(self.manifest["scoring"], Scoring) if "scoring" in self.manifest else None
+        scoring = (
+            msgspec.convert(self.manifest["scoring"], Scoring)
+            if "scoring" in self.manifest
+            else None
+        )
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
         outcomes = packed.outcomes
         codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
-        evaluations = pd.DataFrame({"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))})
+        evaluations = pd.DataFrame(
+            {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
+        )
         original = self.manifest["original"]
         scoring = scoring or PUBLISHED_SCORING
-        self.case = build_case(study, original, solutions, evaluations, packed.runs, scoring=scoring)
+        self.case = build_case(
+            study, original, solutions, evaluations, packed.runs, scoring=scoring
+        )
         self._directory = Path("results", study.name)
         self._answers: dict[str, Answer] = {}
 
@@ -108,14 +131,19 @@ class Packed:
         if not set(runs) <= set(all_runs(study)) or len(runs) > len({*runs}):
             raise ValueError(f"the study has no such runs: {runs[:3]}")
         if (total := sum(outcomes.values())) > SURPLUS * len(runs) * study.search.evaluations:
-            raise ValueError(f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have")
+            raise ValueError(
+                f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
+            )
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
 
     def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
         """Refuse a table of solutions with columns or rows that are missing, new or there twice."""
-        expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {"collision", "collision_speed"}
+        expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {
+            "collision",
+            "collision_speed",
+        }
         if wrong := expected ^ {*solutions}:  # pandas calls a second column x "x.1"
             raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
         if count_solutions(solutions, self.packed.runs) != self.packed.solutions:
@@ -131,7 +159,9 @@ class Packed:
         if text not in self._answers:
             add_import_folders(self._places)
             case = self.shown if has_criterion(text, self.packed.unsafe) else self.case
-            self._answers[text] = answer_to(text, [case], [self._directory], None, self._jobs, self._progress)
+            self._answers[text] = answer_to(
+                text, [case], [self._directory], None, self._jobs, self._progress
+            )
         return self._answers[text]
 
     def _answer_json(self, text: str) -> bytes:
@@ -140,7 +170,9 @@ class Packed:
     def page(self) -> bytes:
         answers = [self.answer(text) for text in self.packed.questions]
         versions = self.manifest["versions"]
-        study = ReportedStudy(directory=self._directory, case=self.shown, versions=versions, answers=answers)
+        study = ReportedStudy(
+            directory=self._directory, case=self.shown, versions=versions, answers=answers
+        )
         return make_page([study], progress=self._progress).encode()
 
     def study_file(self) -> bytes:
@@ -148,7 +180,9 @@ class Packed:
         with temporary_folder() as folder:
             path = Path(folder, f"{self.case.study.name}.toml")
             write_study(path, self.case.study, "The study as it was run, with all that it extends.")
-            return path.read_bytes().partition(b"\n")[2]  # without the path of the schema on this machine
+            return path.read_bytes().partition(b"\n")[
+                2
+            ]  # without the path of the schema on this machine
 
     @cached_property
     def simulated(self) -> tuple[bytes, bytes]:
@@ -156,7 +190,9 @@ class Packed:
         names = self.case.characteristics.names
         solutions = self.case.solutions
         settings = self.case.settings
-        evaluations = evaluate_settings(self.case.study, settings, jobs=self._jobs, progress=self._progress)
+        evaluations = evaluate_settings(
+            self.case.study, settings, jobs=self._jobs, progress=self._progress
+        )
         frame = evaluations_frame(names, [(("", 0), evaluations.take(range(1, len(settings))))])
         frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
         return json_bytes(record(evaluations, row=0)), csv_of(in_order(frame, names))
@@ -167,42 +203,64 @@ class Packed:
         with temporary_folder() as folder:
             study = self.case.study
             runs = self.packed.runs
-            results = run(study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs)
+            results = run(
+                study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs
+            )
             return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 
     def claims(self, folder: Path, search: bool) -> Iterator[Claim]:
-        """What the pack claims, and the functions that compute it again; the manifest is in `folder`."""
+        """What the pack claims, and the functions that compute it again; the manifest is in
+        `folder`.
+        """
         solutions = self.files[SOLUTIONS]
-        yield Claim("inputs", b"", lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode())
+        yield Claim(
+            "inputs",
+            b"",
+            lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode(),
+        )
         yield Claim("study", self.files[STUDY], self.study_file)
-        yield Claim("original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0])
+        yield Claim(
+            "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
+        )
         yield Claim("solutions", solutions, lambda: self.simulated[1])
         for text, answer in zip(self.packed.questions, json_of(self.files[ANSWERS]), strict=True):
             yield Claim(f"answer {text}", json_bytes(answer), partial(self._answer_json, text))
         yield Claim("report", self.files[PAGE], self.page)
         if search:
-            yield Claim("search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0])
+            yield Claim(
+                "search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0]
+            )
             yield Claim("search: solutions", solutions, lambda: self.searched[1])
 
     @property
     def code(self) -> list[str]:
-        """The user code that would run: files of the pack, and what the study and the questions name.
+        """The user code that would run: files of the pack, and what the study and the questions
+        name.
 
-        Networks count, since SUMO's options beside them may name files to write; scenes of OpenSCENARIO do not.
+        Networks count, since SUMO's options beside them may name files to write; scenes of
+        OpenSCENARIO do not.
         """
         study = self.case.study
         prefix = f"{CODE}/"
         names = [name for name in self.files if not name.endswith((".xosc", ".xodr"))]
         files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
-        named = [name for name in (*study.search.algorithms, *self.packed.questions) if ":" in name.partition(" ")[0]]
+        named = [
+            name
+            for name in (*study.search.algorithms, *self.packed.questions)
+            if ":" in name.partition(" ")[0]
+        ]
         return [*files, *user_code_names(study), *named]
 
 
 def read_table(content: bytes) -> pd.DataFrame:
-    """Read a table of solutions to the last bit; raises ValueError or KeyError if a cell is no number."""
+    """Read a table of solutions to the last bit; raises ValueError or KeyError if a cell is no
+    number.
+    """
     frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
     numbers = [name for name in frame if name not in ("algorithm", "outcome")]
-    frame = frame.replace({name: {"": "nan"} for name in numbers}).astype(dict.fromkeys(numbers, float))
+    frame = frame.replace({name: {"": "nan"} for name in numbers}).astype(
+        dict.fromkeys(numbers, float)
+    )
     return frame.astype({"run": int, "f_num_diff": int})
 
 
@@ -232,11 +290,16 @@ def count_outcomes(case: Case) -> dict[str, int]:
     """The number of evaluations of all finished runs, by outcome."""
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
     outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
-    return {str(outcome): int(count) for outcome, count in outcomes.value_counts(sort=False).sort_index().items()}
+    return {
+        str(outcome): int(count)
+        for outcome, count in outcomes.value_counts(sort=False).sort_index().items()
+    }
 
 
 def count_solutions(solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]) -> list[int]:
-    """The numbers of solutions of each run, of all, and of different ones: a run may return a setting twice."""
+    """The numbers of solutions of each run, of all, and of different ones: a run may return a
+    setting twice.
+    """
     counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
     return [*(counts[run] for run in runs), len(solutions), len(solutions.drop_duplicates())]
 
@@ -252,8 +315,12 @@ def compare(study: str, claim: Claim) -> tuple[str, ...]:
     lines = claim.packed.decode().splitlines(keepends=True)
     lines_here = here.decode().splitlines(keepends=True)
     pairs = zip_longest(lines, lines_here, fillvalue="nothing")
-    first, second = next((_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1)
-    same = next(index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1)
+    first, second = next(
+        (_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1
+    )
+    same = next(
+        index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1
+    )
     start = max(same - CONTEXT, 0) if max(len(first), len(second)) > SHOWN else 0
     return study, claim.name, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN]
 

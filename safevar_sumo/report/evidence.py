@@ -1,5 +1,5 @@
-"""Evidence that anybody can compute again: `evidence` packs results with their page and answers; `verify` computes
-everything anew from the pack alone, in a fresh folder, and compares.
+"""Evidence that anybody can compute again: `evidence` packs results with their page and answers;
+`verify` computes everything anew from the pack alone, in a fresh folder, and compares.
 """
 
 from __future__ import annotations
@@ -42,7 +42,15 @@ from safevar_sumo.report.claims import (
     json_of,
     packed_answer,
 )
-from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedStudy, digest_of, digests_of, read_pack, write_pack
+from safevar_sumo.report.pack import (
+    DESCRIPTION,
+    PACK,
+    PackedStudy,
+    digest_of,
+    digests_of,
+    read_pack,
+    write_pack,
+)
 from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, read_manifest
 from safevar_sumo.study import Study
@@ -58,7 +66,8 @@ def evidence(
     jobs: Jobs = None,
     progress: bool | Progress = False,
 ) -> str:
-    """Pack results with their study, page and answers, so that anybody can compute every number again.
+    """Pack results with their study, page and answers, so that anybody can compute every number
+    again.
 
     Parameters
     ----------
@@ -67,14 +76,16 @@ def evidence(
     out
         The pack to write.
     ask
-        Ask this question instead of the usual ones, with its options, such as "risk --samples 4000"; may be repeated.
+        Ask this question instead of the usual ones, with its options, such as "risk --samples
+        4000"; may be repeated.
     unsafe
-        What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a metric such as
-        "drac > 6".
+        What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a
+        metric such as "drac > 6".
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its total.
+        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        total.
 
     Returns
     -------
@@ -84,7 +95,8 @@ def evidence(
     Raises
     ------
     InputError
-        If a directory holds no results of a study, its inputs have changed since, or there is no such question.
+        If a directory holds no results of a study, its inputs have changed since, or there is no
+        such question.
     """
     out = Path(out)
     check_writable(out, "out", (".zip",))
@@ -100,13 +112,20 @@ def evidence(
 
 
 def _pack_study(
-    number: int, directory: Path, ask: Sequence[str], unsafe: str | None, jobs: int | None, progress: Progress
+    number: int,
+    directory: Path,
+    ask: Sequence[str],
+    unsafe: str | None,
+    jobs: int | None,
+    progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
     if not case.has_runs:
-        raise InputError(directory, "holds imported solutions, which have no identity", "results of `study`")
+        raise InputError(
+            directory, "holds imported solutions, which have no identity", "results of `study`"
+        )
     study = case.study
     manifest = read_manifest(directory)
     manifest.pop("folders", None)  # of this machine
@@ -120,21 +139,27 @@ def _pack_study(
     )
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
-    packed = Packed(described, files, study.origin.places, jobs, partial(show_within, progress, study.name))
+    packed = Packed(
+        described, files, study.origin.places, jobs, partial(show_within, progress, study.name)
+    )
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
 
 
-def _files_of_user(study: Study, named: Mapping[str, str], questions: Sequence[str]) -> dict[str, bytes]:
-    """The user's files that the results depend on, the files of the user's questions, and the views of networks,
-    without which SUMO does not start, by their names in a pack.
+def _files_of_user(
+    study: Study, named: Mapping[str, str], questions: Sequence[str]
+) -> dict[str, bytes]:
+    """The user's files that the results depend on, the files of the user's questions, and the views
+    of networks, without which SUMO does not start, by their names in a pack.
     """
     places = study.origin.places
     names = [name for name in named if not is_shipped(name)]
     for name in names:
         if Path(name).is_absolute():
             raise InputError(
-                name, "lies outside the study's folders, so that no pack can hold it", "a copy beside the study"
+                name,
+                "lies outside the study's folders, so that no pack can hold it",
+                "a copy beside the study",
             )
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
         view = options_of(Path(file_by_name(name, places))).get("gui-settings-file", "")
@@ -172,7 +197,8 @@ def verify(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its total.
+        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        total.
 
     Raises
     ------
@@ -183,28 +209,38 @@ def verify(
     description, files = read_pack(path)
     with temporary_folder() as folder, open_progress(progress) as show:
         studies = {
-            Path(folder, str(number)): _unpack(path, described, files, Path(folder, str(number)), jobs, show)
+            Path(folder, str(number)): _unpack(
+                path, described, files, Path(folder, str(number)), jobs, show
+            )
             for number, described in enumerate(description.studies)
         }
-        known = {f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files}
+        known = {
+            f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files
+        }
         if unknown := files.keys() - known:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
         if not run_code and (code := [name for packed in studies.values() for name in packed.code]):
             problem = f"`verify` would run code of the pack: {', '.join(code)}"
             raise InputError(path, problem, "`run_code=True`, if you trust it")
         names = ", ".join(packed.case.study.name for packed in studies.values())
-        of_files = Claim("files", json_bytes(description.files), lambda: json_bytes(digests_of(files)))
+        of_files = Claim(
+            "files", json_bytes(description.files), lambda: json_bytes(digests_of(files))
+        )
         rows = [compare(names, of_files)]
         for place, packed in studies.items():
             with only_from(str(place / CODE)):
-                rows += [compare(packed.case.study.name, claim) for claim in packed.claims(place, search)]
+                rows += [
+                    compare(packed.case.study.name, claim) for claim in packed.claims(place, search)
+                ]
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
-        verdict=f"{counts[SAME]} of {number_of(len(claims), 'claim')} are the same, {counts[DIFFERS]} differ, "
-        f"{counts[CANNOT]} cannot be run.",
+        verdict=(
+            f"{counts[SAME]} of {number_of(len(claims), 'claim')} are the same, {counts[DIFFERS]}"
+            f" differ, {counts[CANNOT]} cannot be run."
+        ),
         numbers={
             "passed": counts[SAME] == len(claims),
             "sha256": digest_of(path),
@@ -216,7 +252,12 @@ def verify(
 
 
 def _unpack(
-    path: Path, described: PackedStudy, files: Mapping[str, bytes], folder: Path, jobs: int | None, progress: Progress
+    path: Path,
+    described: PackedStudy,
+    files: Mapping[str, bytes],
+    folder: Path,
+    jobs: int | None,
+    progress: Progress,
 ) -> Packed:
     """One study of a pack; its manifest and the user's files are written to a folder.
 
@@ -226,11 +267,17 @@ def _unpack(
         If it is damaged.
     """
     prefix = f"{described.folder}/"
-    own_files = {name.removeprefix(prefix): content for name, content in files.items() if name.startswith(prefix)}
+    own_files = {
+        name.removeprefix(prefix): content
+        for name, content in files.items()
+        if name.startswith(prefix)
+    }
     code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
     try:
         if wrong := FILES ^ (own_files.keys() - code.keys()):
-            raise ValueError(f"{min(wrong)} {'belongs to no claim' if min(wrong) in own_files else 'is missing'}")
+            raise ValueError(
+                f"{min(wrong)} {'belongs to no claim' if min(wrong) in own_files else 'is missing'}"
+            )
         (folder / CODE).mkdir(parents=True)
         for name in (MANIFEST, *code):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -244,4 +291,6 @@ def _unpack(
                 raise ValueError(f"{name}, on which the results depend, is not in the pack")
         return Packed(described, own_files, [str(folder / CODE)] if code else [], jobs, progress)
     except (*MALFORMED, InputError) as error:
-        raise InputError(path, f"{described.folder} is damaged: {describe_error(error)}", PACK) from None
+        raise InputError(
+            path, f"{described.folder} is damaged: {describe_error(error)}", PACK
+        ) from None

@@ -32,9 +32,9 @@ PACK = "a file that the command `evidence` has written, unchanged"
 
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
-    """One results directory in a pack: its folder there, the questions that its answers answer, as typed, its finished
-    runs, the number of their evaluations by outcome, the numbers of solutions of each run, of all and of
-    different ones, and what is unsafe, if it was stated.
+    """One results directory in a pack: its folder there, the questions that its answers answer, as
+    typed, its finished runs, the number of their evaluations by outcome, the numbers of solutions
+    of each run, of all and of different ones, and what is unsafe, if it was stated.
     """
 
     folder: str
@@ -84,8 +84,8 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     Raises
     ------
     InputError
-        If the file is no pack, damaged, too large, written by another version, or holds paths that leave it or other
-        files than its description names.
+        If the file is no pack, damaged, too large, written by another version, or holds paths that
+        leave it or other files than its description names.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -110,11 +110,20 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     except (msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
     for name in sorted(files.keys() ^ described.files.keys()):
-        _refuse(path, f"{name} {f'is not named in {DESCRIPTION}' if name in files else 'is missing'}")
+        _refuse(
+            path, f"{name} {f'is not named in {DESCRIPTION}' if name in files else 'is missing'}"
+        )
     here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
-    other = [f"{name} {described.versions.get(name)}" for name in here if described.versions.get(name) != here[name]]
+    other = [
+        f"{name} {described.versions.get(name)}"
+        for name in here
+        if described.versions.get(name) != here[name]
+    ]
     if other:
-        expected = f"a pack of this version: {', '.join(f'{name} {number}' for name, number in here.items())}"
+        expected = (
+            "a pack of this version:"
+            f" {', '.join(f'{name} {number}' for name, number in here.items())}"
+        )
         raise InputError(path, f"was made with {', '.join(other)}", expected)
     return described, files
 
@@ -125,15 +134,23 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     for entry in entries:
         name = entry.filename
         path_of_entry = PurePosixPath(name)
-        is_inside = name == str(path_of_entry) and not path_of_entry.is_absolute() and ".." not in path_of_entry.parts
-        if not is_inside or "\\" in name or ":" in name:  # "a//b" is no path inside either: joined, it is "/b"
+        is_inside = (
+            name == str(path_of_entry)
+            and not path_of_entry.is_absolute()
+            and ".." not in path_of_entry.parts
+        )
+        if (
+            not is_inside or "\\" in name or ":" in name
+        ):  # "a//b" is no path inside either: joined, it is "/b"
             _refuse(path, f"the path {name!r} leaves the pack")
         if stat.S_ISLNK(entry.external_attr >> UNIX_MODE_SHIFT):
             _refuse(path, f"{name!r} is a symbolic link")
     if len(names) > MAX_FILES or len(names) != len(set(names)):
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
     if (size := sum(entry.file_size for entry in entries)) > MAX_BYTES:
-        _refuse(path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed")
+        _refuse(
+            path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed"
+        )
 
 
 def _refuse(path: Path, problem: str) -> NoReturn:

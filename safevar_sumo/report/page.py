@@ -1,4 +1,6 @@
-"""The page about results: for each study first what decides, then replays, then each answer, folded."""
+"""The page about results: for each study first what decides, then replays, then each answer,
+folded.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,13 @@ from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Criterion, Jobs, has_criterion, parse_question, with_criterion
+from safevar_sumo.questions.ask import (
+    Criterion,
+    Jobs,
+    has_criterion,
+    parse_question,
+    with_criterion,
+)
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.research_questions.answer import answer_questions
@@ -37,8 +45,15 @@ from safevar_sumo.terminal import Progress, open_progress, show_no_progress, sho
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-USUAL_QUESTIONS = ("tolerance", "explain --limit 30000", "risk --samples 4000", "rules --samples 4000")
-"""Questions of a page, the one whose verdict decides first; with smaller samples than those of the commands."""
+USUAL_QUESTIONS = (
+    "tolerance",
+    "explain --limit 30000",
+    "risk --samples 4000",
+    "rules --samples 4000",
+)
+"""Questions of a page, the one whose verdict decides first; with smaller samples than those of the
+commands.
+"""
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
 """Coordinates with more decimals than a screen can show."""
@@ -57,7 +72,8 @@ def report(
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
 ) -> Path:
-    """Write one page about results that opens offline: what decides, replays, answers, trust, and commands.
+    """Write one page about results that opens offline: what decides, replays, answers, trust, and
+    commands.
 
     The same results give the same page.
 
@@ -68,20 +84,23 @@ def report(
     out
         File to write the page to.
     ask
-        Ask this question instead of the usual ones, with its options, such as "risk --samples 4000"; may be repeated.
-        The verdict of the first question leads the page.
+        Ask this question instead of the usual ones, with its options, such as "risk --samples
+        4000"; may be repeated. The verdict of the first question leads the page.
     paper
         With the research questions of the paper, as tables and figures.
     unsafe
-        What is unsafe, on the whole page: a collision, a safety degree below X, or a metric such as "drac > 6".
+        What is unsafe, on the whole page: a collision, a safety degree below X, or a metric such as
+        "drac > 6".
     point
         Only this point of the study's matrix.
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its total.
+        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        total.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and say so.
+        If results were computed with other files or versions, simulate with the present ones and
+        say so.
 
     Returns
     -------
@@ -91,24 +110,31 @@ def report(
     Warns
     -----
     UserWarning
-        If a simulation differs from the results; with `as_it_is_now`, for each change of a file or version.
+        If a simulation differs from the results; with `as_it_is_now`, for each change of a file or
+        version.
 
     Raises
     ------
     InputError
-        If a directory holds no results, there is no such question or point, or the file cannot be written.
+        If a directory holds no results, there is no such question or point, or the file cannot be
+        written.
     """
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
     if paper and point is not None:
-        raise InputError("point", "the research questions are about whole studies", "no `paper`, or no `point`")
-    paths = [Path(check_text("results", getattr(source, "directory", source))) for source in results]
+        raise InputError(
+            "point", "the research questions are about whole studies", "no `paper`, or no `point`"
+        )
+    paths = [
+        Path(check_text("results", getattr(source, "directory", source))) for source in results
+    ]
     cases = load_cases(paths)
     usual_joint = ["compare"] if len(cases) == 2 else []
     joint = [text for text in ask or usual_joint if parse_question(text)[0].others]
     alone = [text for text in ask if text not in joint]
     later_changes = [
-        changes_since(path, case, as_it_is_now=as_it_is_now) for path, case in zip(paths, cases, strict=True)
+        changes_since(path, case, as_it_is_now=as_it_is_now)
+        for path, case in zip(paths, cases, strict=True)
     ]
     for path, changes in zip(paths, later_changes, strict=True):
         for change in changes:
@@ -121,10 +147,14 @@ def report(
     total = sum(map(len, asked)) + len(joint)
 
     def next_answer(text: str, chosen: slice) -> Answer:
-        """The answer to the next question, about these of the results; progress shows its own number."""
+        """The answer to the next question, about these of the results; progress shows its own
+        number.
+        """
         question = with_criterion(text, unsafe)
         subjects = by_criterion if has_criterion(question, unsafe) else at_point
-        show_part = partial(show_within, show, f"question {next(numbers)} of {total}, {question.split()[0]}")
+        show_part = partial(
+            show_within, show, f"question {next(numbers)} of {total}, {question.split()[0]}"
+        )
         return answer_question(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
     with open_progress(progress) as show:
@@ -143,7 +173,9 @@ def report(
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)
-            command = " ".join([PROGRAM_COMMAND, "tables", *(shlex.quote(str(path)) for path in paths)])
+            command = " ".join(
+                [PROGRAM_COMMAND, "tables", *(shlex.quote(str(path)) for path in paths)]
+            )
             try:
                 pictures = [_picture(figure) for figure in draw_figures(cases).values()]
                 shared.append(replace(answer_questions(cases), command=command))
@@ -155,8 +187,9 @@ def report(
 
 
 def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = None) -> list[str]:
-    """The questions of a page about results; that of a rated study is about its points, with the variant that loses
-    some by the fewest changes. Where the study has speeds, the second asks the limits up to some of them.
+    """The questions of a page about results; that of a rated study is about its points, with the
+    variant that loses some by the fewest changes. Where the study has speeds, the second asks the
+    limits up to some of them.
     """
     if is_rated(case.study) and point is None:
         any_unsafe = case.unsafe.rows(case.solutions).any()
@@ -166,7 +199,9 @@ def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = No
     questions = [first]
     speeds = usual_values(case.study, SPEED_DIMENSION) if point is None and unsafe is None else []
     if speeds:
-        questions.append(f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}")
+        questions.append(
+            f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}"
+        )
     questions += later
     if case.study.repair.promise or case.study.limits:
         questions.append("repair")
@@ -217,7 +252,9 @@ def make_page(
 ) -> str:
     """The page about studies, with answers and pictures about all of them."""
     of_studies = chain(*map(commands, studies))
-    of_shared = [(f"The answer {answer.question}", answer.command) for answer in shared if answer.command]
+    of_shared = [
+        (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
+    ]
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
     page = template.render(
         title=f"Safety report: {', '.join(study.case.name for study in studies)}",
@@ -233,14 +270,16 @@ def make_page(
 
 
 def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonObject:
-    """One study for the template. On its front stand all verdicts, the first of them with its first table; answers to
-    the same question follow it with theirs.
+    """One study for the template. On its front stand all verdicts, the first of them with its first
+    table; answers to the same question follow it with theirs.
     """
     anchor = f"study-{number}"
     answers = study.answers
     trusted = trust(study)
     sections = list(_sections(anchor, [*answers, tested(study), trusted]))
-    leading = [*takewhile(lambda answer: answer.question == answers[0].question, answers)] or [trusted]
+    leading = [*takewhile(lambda answer: answer.question == answers[0].question, answers)] or [
+        trusted
+    ]
     return {
         "name": study.case.name,
         "title": study.case.study.title,
@@ -262,8 +301,8 @@ def _on_front(answer: Answer) -> Markup:
 
 
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
-    """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it has one. The second
-    answer to a question has the title of its first table as heading.
+    """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it
+    has one. The second answer to a question has the title of its first table as heading.
     """
     names = set[str]()
     for number, answer in enumerate(answers, 1):
@@ -285,16 +324,26 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
 
 
 def _picture(figure: Figure) -> JsonObject:
-    """A figure for the page: Matplotlib's SVG in a link that holds it; equal figures give equal bytes."""
+    """A figure for the page: Matplotlib's SVG in a link that holds it; equal figures give equal
+    bytes.
+    """
     import matplotlib
 
     axis = figure.axes[0]
     buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = TAG.sub(lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode())  # texts keep their digits
-    words = f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over {axis.get_xlabel() or 'characteristics'}"
-    return {"alt": words.replace("\n", " "), "source": "data:image/svg+xml," + quote(svg, safe=" =:/;,()'!?@&+$*")}
+    svg = TAG.sub(
+        lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode()
+    )  # texts keep their digits
+    words = (
+        f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over"
+        f" {axis.get_xlabel() or 'characteristics'}"
+    )
+    return {
+        "alt": words.replace("\n", " "),
+        "source": "data:image/svg+xml," + quote(svg, safe=" =:/;,()'!?@&+$*"),
+    }
 
 
 def _web_file(name: str) -> Markup:

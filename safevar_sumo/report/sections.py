@@ -1,4 +1,6 @@
-"""What stands on a page beside the answers: what was tested, how far to trust it, replays, and commands."""
+"""What stands on a page beside the answers: what was tested, how far to trust it, replays, and
+commands.
+"""
 
 from __future__ import annotations
 
@@ -37,25 +39,37 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES
 
-FIRST_CHOICES = {"fewest": "fewest changes", "smallest": "smallest changes", "most_severe": "most severe"}
+FIRST_CHOICES = {
+    "fewest": "fewest changes",
+    "smallest": "smallest changes",
+    "most_severe": "most severe",
+}
 """Choices that select the solutions to replay, as the flags of `simulate` do, in words."""
 MAX_CAUSES = 6
 """Maximum number of replays of settings that answers name by their changes."""
 CHANGES, ENCOUNTER = "changes", "encounter"
-"""A table's column of settings to replay: values by characteristic, all others as in the original vehicle; and, in a
-study that searches its scenario, the column of their encounters.
+"""A table's column of settings to replay: values by characteristic, all others as in the original
+vehicle; and, in a study that searches its scenario, the column of their encounters.
 """
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
-    Outcome.INVALID_TEST: "left the tolerance of a test's speed before the driving system acted: they are neither "
-    "failures nor successes",
+    Outcome.INVALID_TEST: (
+        "left the tolerance of a test's speed before the driving system acted: they are neither "
+        "failures nor successes"
+    ),
 }
 """Outcomes of settings about which nothing is known."""
 GENERAL_LIMITS = (
     "A search that finds no failure proves nothing about the settings that it did not try.",
-    "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no suspension, no wind, "
-    "no sensor noise, no traffic beyond the scenario's own, unless the study says otherwise.",
-    "Driving system and vehicle are models: how far they agree with published data is told where there is any.",
+    (
+        "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no"
+        " suspension, no wind, no sensor noise, no traffic beyond the scenario's own, unless the"
+        " study says otherwise."
+    ),
+    (
+        "Driving system and vehicle are models: how far they agree with published data is told"
+        " where there is any."
+    ),
 )
 CHARACTERISTICS = {
     "characteristic": Column("", "characteristic of the vehicle, or of its encounter"),
@@ -80,7 +94,11 @@ SPREAD = {
     "vehicle": Column("", "the original, or a solution"),
     **with_interval(
         SAFETY_DEGREE,
-        Column("m or -m/s", "here, with 90 % of sets and repeats, and the error on the rows of the fit", ".2f"),
+        Column(
+            "m or -m/s",
+            "here, with 90 % of sets and repeats, and the error on the rows of the fit",
+            ".2f",
+        ),
     ),
     "sets": Column("", "vehicle models that fit the published data about as well"),
     "collisions": Column("", "sets with which it collides"),
@@ -126,7 +144,9 @@ class ReportedStudy:
 
     @cached_property
     def choices(self) -> dict[str, str]:
-        """The handles of the solutions that `FIRST_CHOICES` select, and why; if none is unsafe, of the most severe."""
+        """The handles of the solutions that `FIRST_CHOICES` select, and why; if none is unsafe, of
+        the most severe.
+        """
         solutions = self.case.solutions
         chosen = dict[str, list[str]]()
         names = [] if solutions.empty else list(FIRST_CHOICES)
@@ -138,7 +158,9 @@ class ReportedStudy:
     @cached_property
     def chosen_solutions(self) -> pd.DataFrame:
         """The rows of these solutions."""
-        solutions = self.case.solutions.set_index(pd.Index(map(str, handles_of(self.case.solutions))))
+        solutions = self.case.solutions.set_index(
+            pd.Index(map(str, handles_of(self.case.solutions)))
+        )
         return solutions.loc[list(self.choices)]
 
     @property
@@ -164,7 +186,11 @@ def tested(study: ReportedStudy) -> Answer:
         for item in case.characteristics
     ]
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
-    sentences = [f"{'. '.join(models)}; {_conditions(study)}.", *counted_in_words(case.study), _search(study)]
+    sentences = [
+        f"{'. '.join(models)}; {_conditions(study)}.",
+        *counted_in_words(case.study),
+        _search(study),
+    ]
     return Answer(
         question="what was tested",
         study=case.study,
@@ -178,10 +204,12 @@ def tested(study: ReportedStudy) -> Answer:
 
 
 def facts(study: ReportedStudy) -> list[tuple[str, str]]:
-    """What a signature under the page is about, each with its name: the results, how they were computed, and of the
-    first answer the scope, the fits and the attack.
+    """What a signature under the page is about, each with its name: the results, how they were
+    computed, and of the first answer the scope, the fits and the attack.
     """
-    numbers = {name: value for answer in study.answers[:1] for name, value in answer.numbers.items()}
+    numbers = {
+        name: value for answer in study.answers[:1] for name, value in answer.numbers.items()
+    }
     rows = [
         ("Results", f"{study.directory.name}, seed {study.case.study.search.seed}"),
         ("Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())),
@@ -189,15 +217,27 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
     if numbers.get("fits_tried"):
         rows.append(("Fits", f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"))
     if numbers.get("attacked") and numbers.get("at_most") is not None:
-        uncertainty = f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
-        rows.append(("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}"))
+        uncertainty = (
+            f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
+        )
+        rows.append(
+            ("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}")
+        )
     tables = study.answers[0].tables if numbers else {}
     if "uncertainty" in tables:
-        rows.append(("Limits alone", f"one fit at scanned points, then all: {_moved_limits(tables['uncertainty'])}"))
+        rows.append(
+            (
+                "Limits alone",
+                f"one fit at scanned points, then all: {_moved_limits(tables['uncertainty'])}",
+            )
+        )
     if "fits" in tables and numbers.get("margin"):
         corners = tables["fits"].loc[tables["fits"]["specified"] == "kept", "corners"].dropna()
         if len(corners):
-            text = f"the worst corner of all limits keeps {corners.min():.2f} to {corners.max():.2f} m, fit by fit"
+            text = (
+                f"the worst corner of all limits keeps {corners.min():.2f} to {corners.max():.2f}"
+                " m, fit by fit"
+            )
             rows.append(("Spread", text))
     return rows
 
@@ -205,7 +245,8 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
 def _moved_limits(uncertainty: pd.DataFrame) -> str:
     """The limits alone that moved, before and after: `brakeTorque 0.53 to 0.58`."""
     return "; ".join(
-        f"{row['characteristic']} {row[f'own_fit_{end}']:.10g} to {row[f'alone_{end}']:.10g}{unit_text(row['unit'])}"
+        f"{row['characteristic']} {row[f'own_fit_{end}']:.10g} to"
+        f" {row[f'alone_{end}']:.10g}{unit_text(row['unit'])}"
         for row in uncertainty.to_dict("records")
         for end in ("low", "high")
         if row[f"own_fit_{end}"] != row[f"alone_{end}"]
@@ -213,17 +254,27 @@ def _moved_limits(uncertainty: pd.DataFrame) -> str:
 
 
 def _remarks(texts: Sequence[str]) -> pd.DataFrame:
-    return tabulate("Remarks", {"remark": Column("", "what to bear in mind")}, [(text,) for text in texts])
+    return tabulate(
+        "Remarks", {"remark": Column("", "what to bear in mind")}, [(text,) for text in texts]
+    )
 
 
 def _conditions(study: ReportedStudy) -> str:
     """The weather or, by test, the points of the matrix."""
     points = study.system.matrix
     if study.point:
-        return f"only at the point {study.point} of its matrix, at which all solutions are simulated again"
+        return (
+            f"only at the point {study.point} of its matrix, at which all solutions are simulated"
+            " again"
+        )
     if not points:
-        no_effect = " (no effect on road and sensors; a driving system may have other parameters in it)"
-        return f"weather: {study.case.weather.name}{no_effect if equals_clear(study.case.weather) else ''}"
+        no_effect = (
+            " (no effect on road and sensors; a driving system may have other parameters in it)"
+        )
+        return (
+            "weather:"
+            f" {study.case.weather.name}{no_effect if equals_clear(study.case.weather) else ''}"
+        )
     tests = Counter(f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points)
     described = "; ".join(f"{test}: {number_of(count, 'point')}" for test, count in tests.items())
     return f"every vehicle at all {len(points)} points of a matrix ({described})"
@@ -238,8 +289,9 @@ def _search(study: ReportedStudy) -> str:
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{case.title_of(name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (
-        f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations} simulations each, "
-        f"{len(case.evaluations)} different vehicles in all, from seed {search.seed}, with {versions}."
+        f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations}"
+        f" simulations each, {len(case.evaluations)} different vehicles in all, from seed"
+        f" {search.seed}, with {versions}."
     )
 
 
@@ -249,23 +301,28 @@ def name_and_sentence(models: Mapping[str, type], name: str) -> str:
 
 
 def trust(study: ReportedStudy) -> Answer:
-    """How far the results agree with published data and with other fitted vehicle models, and what they leave out."""
+    """How far the results agree with published data and with other fitted vehicle models, and what
+    they leave out.
+    """
     case = study.case
     tables = dict[str, pd.DataFrame]()
     fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
     verdict = (
-        f"{fitted}simulations of this study were not compared with published ones: whether another simulator or a real "
-        "vehicle behaves in the same way is unknown."
+        f"{fitted}simulations of this study were not compared with published ones: whether another"
+        " simulator or a real vehicle behaves in the same way is unknown."
     )
     agreement = shipped_agreement(case.study)
     if len(agreement):
-        tables["agreement"] = tabulate("Agreement with published data: safety degrees", AGREEMENT, agreement)
+        tables["agreement"] = tabulate(
+            "Agreement with published data: safety degrees", AGREEMENT, agreement
+        )
         lowest = agreement["spearman"].min()
         highest = agreement["spearman"].max()
         verdict = (
-            f"Compared with {number_of(len(agreement), 'file')} of published simulations: the safety degrees have a "
-            f"rank correlation of {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing "
-            "was compared with a real car."
+            f"Compared with {number_of(len(agreement), 'file')} of published simulations: the"
+            " safety degrees have a rank correlation of"
+            f" {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing"
+            " was compared with a real car."
         )
     if case.study.spread:
         settings = np.vstack([case.characteristics.original, study.chosen_settings])
@@ -273,7 +330,9 @@ def trust(study: ReportedStudy) -> Answer:
         degrees = [case.original[SAFETY_DEGREE], *study.chosen_solutions["f_safe"]]
         rows = [
             (name, degree, spread.lower, spread.upper, spread.sets, spread.collisions)
-            for name, degree, spread in zip(["original", *study.choices], degrees, spreads, strict=True)
+            for name, degree, spread in zip(
+                ["original", *study.choices], degrees, spreads, strict=True
+            )
         ]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     published = [
@@ -289,12 +348,14 @@ def trust(study: ReportedStudy) -> Answer:
         if counts[outcome]
     ]
     tables["remarks"] = _remarks([*missing, *GENERAL_LIMITS])
-    return Answer(question="limits and trust", study=case.study, verdict=verdict, numbers={}, tables=tables)
+    return Answer(
+        question="limits and trust", study=case.study, verdict=verdict, numbers={}, tables=tables
+    )
 
 
 def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
-    """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for each set of changed
-    characteristics.
+    """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
+    each set of changed characteristics.
     """
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
@@ -303,7 +364,9 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     changes: dict[tuple[str, ...], tuple[Mapping[str, float], Mapping[str, float]]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
-            for row, encounter in zip(frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False):
+            for row, encounter in zip(
+                frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False
+            ):
                 changes.setdefault(tuple(sorted(row)), (row, encounter))
     causes = [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]
     for row, encounter in causes:
@@ -312,7 +375,9 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))
-        comparison = comparison_of(simulate_with_original(study.case.study, study.system, setting, filtered=False))
+        comparison = comparison_of(
+            simulate_with_original(study.case.study, study.system, setting, filtered=False)
+        )
         last = comparison.rows[-1]
         differences = []
         if name in study.choices:
@@ -323,13 +388,18 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         yield {
             "title": f"{name}{reason}: {comparison.verdict(last)}",
             "point": comparison.point.name,
-            "changes": change_texts(characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True))),
+            "changes": change_texts(
+                characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True))
+            ),
             "differences": differences,
             "player": player_data(lay_out_scene(comparison)),
         }
     if different:
         why = why_different(is_imported=not study.case.has_runs)
-        warn(f"{study.directory}: simulated again with different results: {', '.join(different)}; {why}")
+        warn(
+            f"{study.directory}: simulated again with different results: {', '.join(different)};"
+            f" {why}"
+        )
 
 
 def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
@@ -338,8 +408,14 @@ def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
     flag = " --as-it-is-now" if study.later_changes else ""
     if study.case.has_runs:
         out = json.dumps(f"{directory}-again")
-        script = f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out}, progress=True)"
-        what = f"The study {study.case.study.name}, as its manifest.json records it, into another directory"
+        script = (
+            f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out},"
+            " progress=True)"
+        )
+        what = (
+            f"The study {study.case.study.name}, as its manifest.json records it, into another"
+            " directory"
+        )
         yield what, f"python -c {shlex.quote(script)}"
     for answer in study.answers:
         if answer.command:

@@ -1,10 +1,12 @@
-"""The journal of one run: a file of JSON lines, one for each evaluated batch, written before the search continues.
+"""The journal of one run: a file of JSON lines, one for each evaluated batch, written before the
+search continues.
 
-The first line names the study, the run and the characteristics. A batch is a table: a list for each column of
-`solutions.csv`, the number of each evaluation in its run, the collision's speed and the reason of a failure; an
-undefined value is null. The last line of a finished run lists its solutions. Each line after the first ends with a
-checksum of the journal up to there. What follows the first line that cannot be read, or that the checksum contradicts,
-was lost with a process, a disk or a power supply, or was altered, and is simulated again.
+The first line names the study, the run and the characteristics. A batch is a table: a list for each
+column of `solutions.csv`, the number of each evaluation in its run, the collision's speed and the
+reason of a failure; an undefined value is null. The last line of a finished run lists its
+solutions. Each line after the first ends with a checksum of the journal up to there. What follows
+the first line that cannot be read, or that the checksum contradicts, was lost with a process, a
+disk or a power supply, or was altered, and is simulated again.
 """
 
 from __future__ import annotations
@@ -33,14 +35,20 @@ PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = "evaluation", "outcome", "reason", "solutions", "crc32"
+POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = (
+    "evaluation",
+    "outcome",
+    "reason",
+    "solutions",
+    "crc32",
+)
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
 def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonObject:
-    """The first line of a journal: what it belongs to, the digest of a study's identity and the name of a run; and the
-    characteristics.
+    """The first line of a journal: what it belongs to, the digest of a study's identity and the
+    name of a run; and the characteristics.
     """
     return {"format": FORMAT, "study": study, "run": run, "characteristics": list(characteristics)}
 
@@ -59,7 +67,8 @@ class JournalContent(NamedTuple):
     size
         Size of the lines that were read [bytes].
     checksum
-        The CRC-32 of these lines without their checksums and ends; None in a journal of the format without checksums.
+        The CRC-32 of these lines without their checksums and ends; None in a journal of the format
+        without checksums.
     """
 
     positions: list[int]
@@ -74,7 +83,8 @@ class JournalContent(NamedTuple):
         return self.evaluations.take([row_of[position] for position in positions])
 
     def requested_within(self, budget: int) -> tuple[list[int], Evaluations]:
-        """Positions and evaluations that a run with this budget requested, in the order of its requests.
+        """Positions and evaluations that a run with this budget requested, in the order of its
+        requests.
 
         A journal may hold more: those of a search with a larger budget.
         """
@@ -90,7 +100,8 @@ class Journal:
     path
         The file, made if it does not exist.
     head
-        The owner of the journal, as `journal_head` names it. A journal without evaluations passes to the owner.
+        The owner of the journal, as `journal_head` names it. A journal without evaluations passes
+        to the owner.
     stated
         The format of the journals, if the manifest says so.
     retry_failed
@@ -109,14 +120,18 @@ class Journal:
         If another live process works on the run, or the file cannot be locked or written.
     """
 
-    def __init__(self, path: Path, head: JsonObject, stated: int | None = None, *, retry_failed: bool = False) -> None:
+    def __init__(
+        self, path: Path, head: JsonObject, stated: int | None = None, *, retry_failed: bool = False
+    ) -> None:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = _open_and_lock(path)
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
-                self.content = _read(self._file.read(), path, head, stated, until_failure=retry_failed)
+                self.content = _read(
+                    self._file.read(), path, head, stated, until_failure=retry_failed
+                )
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
             if not self.content.size:
@@ -132,7 +147,9 @@ class Journal:
         self._add(_batch_line(positions, evaluations, self._characteristics))
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
-        """Add the result, the positions of the solutions and the allowed number of evaluations; sync all."""
+        """Add the result, the positions of the solutions and the allowed number of evaluations;
+        sync all.
+        """
         self._add({SOLUTIONS: list(positions), "budget": budget})
         with disk_errors(self.path, "written"):
             os.fsync(self._file.fileno())
@@ -178,7 +195,9 @@ class _Progress(msgspec.Struct):
 
 
 class JournalReader:
-    """Follows how many evaluations a run has asked for, in the journal that another process writes."""
+    """Follows how many evaluations a run has asked for, in the journal that another process
+    writes.
+    """
 
     def __init__(self, path: Path, budget: int) -> None:
         self._path = path
@@ -187,13 +206,17 @@ class JournalReader:
         self.is_finished = False
 
     def asked(self) -> int:
-        """Number of evaluations that the run has asked for; a finished one, all that it was allowed."""
+        """Number of evaluations that the run has asked for; a finished one, all that it was
+        allowed.
+        """
         with suppress(FileNotFoundError), open(self._path, "rb") as file:
             file.seek(self._end)
             for text in file:
                 try:
                     progress = msgspec.json.decode(text, type=_Progress)
-                except msgspec.DecodeError:  # another process is writing this line, or has truncated the file
+                except (
+                    msgspec.DecodeError
+                ):  # another process is writing this line, or has truncated the file
                     break
                 self._end += len(text)
                 if progress.evaluation:
@@ -213,14 +236,17 @@ def _open_and_lock(path: Path) -> IO[bytes]:
         except portalocker.AlreadyLocked:
             raise SafevarError(f"{path}: another process works on this run") from None
         except portalocker.LockException as error:
-            raise SafevarError(f"{path}: cannot be locked: {error}; results need a disk that locks files") from None
+            raise SafevarError(
+                f"{path}: cannot be locked: {error}; results need a disk that locks files"
+            ) from None
 
 
 def _read(
     data: bytes, path: Path, head: JsonObject, stated: int | None, *, until_failure: bool = False
 ) -> JournalContent:
-    """The contents of a journal; with `until_failure`, without the first batch that failed and all that came after
-    it. A first line with another format than the manifest has `stated` is not believed, and so is nothing after it.
+    """The contents of a journal; with `until_failure`, without the first batch that failed and all
+    that came after it. A first line with another format than the manifest has `stated` is not
+    believed, and so is nothing after it.
     """
     positions = list[int]()
     batches = []
@@ -254,11 +280,14 @@ def _read(
         size += len(text)
         checksum = checksum_of_line
     empty = Evaluations.none(len(head["characteristics"]), METRICS)
-    return JournalContent(positions, Evaluations.concatenate(batches or [empty]), results, size, checksum)
+    return JournalContent(
+        positions, Evaluations.concatenate(batches or [empty]), results, size, checksum
+    )
 
 
 def _checked(text: bytes, checksum: int | None) -> tuple[JsonObject, int | None]:
-    """A line after the first, and the checksum of the journal up to it; empty if the line is torn, damaged or altered.
+    """A line after the first, and the checksum of the journal up to it; empty if the line is torn,
+    damaged or altered.
 
     `checksum` is that of the lines before, None in a journal of the format without.
     """
@@ -278,7 +307,9 @@ def _decoded(text: bytes) -> JsonObject:
         return {}
 
 
-def _batch_line(positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]) -> JsonObject:
+def _batch_line(
+    positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]
+) -> JsonObject:
     """A batch of evaluations as a table."""
     line = {
         POSITION: list(positions),
@@ -294,11 +325,15 @@ def _batch_line(positions: Sequence[int], evaluations: Evaluations, characterist
 
 
 def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:
-    """The batch of evaluations in a line; raises an error if its columns are wrong or have different lengths."""
+    """The batch of evaluations in a line; raises an error if its columns are wrong or have
+    different lengths.
+    """
     if len({len(values) for values in line.values()}) > 1:
         raise ValueError
     columns = {
-        name: np.array(values, dtype=float) for name, values in line.items() if name not in (POSITION, OUTCOME, REASON)
+        name: np.array(values, dtype=float)
+        for name, values in line.items()
+        if name not in (POSITION, OUTCOME, REASON)
     }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
     reasons = line.get(REASON, [None] * len(settings))
@@ -310,5 +345,9 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         f_diff=f_diff,
         f_num_diff=f_num_diff,
         metrics=columns,
-        reasons={setting.tobytes(): reason for setting, reason in zip(settings, reasons, strict=True) if reason},
+        reasons={
+            setting.tobytes(): reason
+            for setting, reason in zip(settings, reasons, strict=True)
+            if reason
+        },
     )

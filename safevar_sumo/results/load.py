@@ -1,5 +1,5 @@
-"""Reads results without SUMO, as tidy frames; and finds single solutions, by their handles or by a choice such as the
-most severe one.
+"""Reads results without SUMO, as tidy frames; and finds single solutions, by their handles or by a
+choice such as the most severe one.
 """
 
 from __future__ import annotations
@@ -16,7 +16,13 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
-from safevar_sumo.results.manifest import JOURNALS, identity_digest, journal_file, read_manifest, run_name
+from safevar_sumo.results.manifest import (
+    JOURNALS,
+    identity_digest,
+    journal_file,
+    read_manifest,
+    run_name,
+)
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -25,7 +31,9 @@ if TYPE_CHECKING:
 
 
 class Failure(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run, position in the run from 0, and why."""
+    """A setting that could not be simulated: its algorithm, run, position in the run from 0, and
+    why.
+    """
 
     algorithm: str
     run: int
@@ -36,14 +44,18 @@ class Failure(NamedTuple):
         return f"{self.algorithm}:{self.run}, evaluation {self.position}: {self.reason}"
 
 
-def failures_of(key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations) -> list[Failure]:
+def failures_of(
+    key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations
+) -> list[Failure]:
     """The settings of a run that could not be simulated."""
     rows = np.flatnonzero(evaluations.failed).tolist()
     return [Failure(*key, positions[row], evaluations.reason(row)) for row in rows]
 
 
 def failure_lines(failures: Sequence[Failure]) -> list[str]:
-    """A line for each distinct reason: the first failure with this reason, and the number of further failures."""
+    """A line for each distinct reason: the first failure with this reason, and the number of
+    further failures.
+    """
     failures_by_reason: dict[str, list[Failure]] = {}
     for failure in failures:
         failures_by_reason.setdefault(failure.reason, []).append(failure)
@@ -62,10 +74,11 @@ class StoredResults(NamedTuple):
         The study as run, versions, seed, the original vehicle's evaluation.
     evaluations
         One row per simulated setting of every run, in the order of the first requests; columns of
-        `safevar_sumo.results.evaluations_frame`, and `evaluation`, the position in that order from 0.
+        `safevar_sumo.results.evaluations_frame`, and `evaluation`, the position in that order from
+        0.
     solutions
-        One row per solution of every finished run; the same columns except `evaluation`. Imported solutions belong to
-        no run.
+        One row per solution of every finished run; the same columns except `evaluation`. Imported
+        solutions belong to no run.
     finished
         Algorithm and number of every finished run.
     failures
@@ -108,21 +121,34 @@ def load_runs(directory: str | Path) -> StoredResults:
         path = journal_file(folder, name)
         if not path.exists():
             continue
-        content = read_journal(path, journal_head(digest, name, characteristics), manifest.get(JOURNALS))
+        content = read_journal(
+            path, journal_head(digest, name, characteristics), manifest.get(JOURNALS)
+        )
         has_checksums &= content.checksum is not None
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
         failures += failures_of((algorithm, run), positions, evaluations)
         if budget in content.results:
-            solutions_of_runs.append(((algorithm, run), content.take_positions(content.results[budget])))
+            solutions_of_runs.append(
+                ((algorithm, run), content.take_positions(content.results[budget]))
+            )
     if not has_checksums:
-        warn(f"{folder}: has journals of an earlier version, without checksums: altered lines go unnoticed")
+        warn(
+            f"{folder}: has journals of an earlier version, without checksums: altered lines go"
+            " unnoticed"
+        )
     frame = evaluations_frame(characteristics, evaluations_of_runs)
-    frame.insert(2, "evaluation", all_positions)  # behind algorithm and run; rows are in the order of their runs
+    frame.insert(
+        2, "evaluation", all_positions
+    )  # behind algorithm and run; rows are in the order of their runs
     solutions = solutions_frame(characteristics, solutions_of_runs)
     return StoredResults(
-        manifest, frame, solutions, tuple(run_key for run_key, _ in solutions_of_runs), tuple(failures)
+        manifest,
+        frame,
+        solutions,
+        tuple(run_key for run_key, _ in solutions_of_runs),
+        tuple(failures),
     )
 
 
@@ -132,7 +158,8 @@ MAX_EXAMPLES = 6
 
 
 class SolutionId(NamedTuple):
-    """The handle of a solution: the `row`-th of its run's solutions in the order of solutions.csv, from 0.
+    """The handle of a solution: the `row`-th of its run's solutions in the order of solutions.csv,
+    from 0.
 
     Imported solutions belong to no run; their run number is 0.
     """
@@ -160,7 +187,9 @@ class SolutionId(NamedTuple):
 
 
 def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
-    """The handle of every row of `solutions`, a frame of solutions from `safevar_sumo.results.load_runs`."""
+    """The handle of every row of `solutions`, a frame of solutions from
+    `safevar_sumo.results.load_runs`.
+    """
     import pandas as pd
 
     runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
@@ -182,8 +211,12 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
     all_handles = handles_of(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
-    last_handles = {(other.algorithm, other.run): str(other) for other in all_handles}  # of each run the last
-    expected = f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
+    last_handles = {
+        (other.algorithm, other.run): str(other) for other in all_handles
+    }  # of each run the last
+    expected = (
+        f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
+    )
     raise InputError("solution", f"there is no solution {handle}", expected)
 
 
@@ -196,8 +229,8 @@ CHOICES = {
 
 
 def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> SolutionId:
-    """The handle of the solution that a choice selects: `most_severe` among all solutions, any other choice among the
-    unsafe ones.
+    """The handle of the solution that a choice selects: `most_severe` among all solutions, any
+    other choice among the unsafe ones.
 
     Parameters
     ----------

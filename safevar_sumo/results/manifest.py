@@ -1,5 +1,5 @@
-"""The files of a results directory, and its manifest: the inputs that its results depend on, and their differences from
-other inputs.
+"""The files of a results directory, and its manifest: the inputs that its results depend on, and
+their differences from other inputs.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from safevar_sumo.study.schema import Tables
 FORMAT = 5
 """Version number of the files' format."""
 RESULTS = 10
-"""Version number of the package's results, raised whenever they change (enforced by tests/golden)."""
+"""Version number of the package's results, raised whenever they change (enforced by tests/golden).
+"""
 SIMULATORS = ("libsumo", "eclipse-sumo")
 """Packages on whose versions a single simulation depends."""
 PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
 PYMOO_PACKAGES = ("pymoo", "cma")
-"""Packages on whose versions the searches of pymoo depend, named in the manifest of a study that has some."""
+"""Packages on whose versions the searches of pymoo depend, named in the manifest of a study that
+has some.
+"""
 KEYS_WITHOUT_EFFECT_ON_RESULTS = (
     "title",
     "published",
@@ -45,7 +48,8 @@ KEYS_WITHOUT_EFFECT_ON_RESULTS = (
 )
 """Keys of a study that change no result."""
 KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
-"""Keys of a study's search table that change no evaluation, but decide which evaluations there are."""
+"""Keys of a study's search table that change no evaluation, but decide which evaluations there are.
+"""
 IDENTITY = {
     "study": "the same study and options",
     "files": "the file as it was",
@@ -53,27 +57,37 @@ IDENTITY = {
     "versions": "those versions",
     "platform": "such a machine",
 }
-"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected: another `out` ..., or
-REMEDY".
+"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected:
+another `out` ..., or REMEDY".
 """
 JOURNALS = "journals"
-"""Key of a manifest: the format of the journals; a directory that an earlier version began lacks it."""
+"""Key of a manifest: the format of the journals; a directory that an earlier version began lacks
+it.
+"""
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 FILES = (
     (
         MANIFEST,
-        "the study as it was run, the original vehicle's metrics, versions, digests of files, and folders of your own "
-        "code and files: [what results depend on](results.md)",
+        (
+            "the study as it was run, the original vehicle's metrics, versions, digests of files,"
+            " and folders of your own code and files: [what results depend on](results.md)"
+        ),
         "`study`, `import`",
     ),
-    (SOLUTIONS, "a row for each solution of each finished run", "`study` after its last run, `import`"),
+    (
+        SOLUTIONS,
+        "a row for each solution of each finished run",
+        "`study` after its last run, `import`",
+    ),
     (
         f"{RUNS}/*-*.jsonl",
         "every evaluation of the run ALGORITHM-NN, from which an interrupted study continues",
         "`study` after each batch",
     ),
 )
-"""Every file of a results directory: its name or a pattern of names, its content, and the command that writes it."""
+"""Every file of a results directory: its name or a pattern of names, its content, and the command
+that writes it.
+"""
 
 
 def run_name(algorithm: str, run: int) -> str:
@@ -91,7 +105,9 @@ def journal_file(directory: Path, run: str) -> Path:
     """
     path = directory / RUNS / f"{run}.jsonl"
     if path.exists() and not path.is_file():
-        raise InputError(path, "is no file", "the journal that was there, or no file: the run then begins anew")
+        raise InputError(
+            path, "is no file", "the journal that was there, or no file: the run then begins anew"
+        )
     return path
 
 
@@ -115,7 +131,9 @@ def make_directory(path: Path) -> None:
     except OSError as error:
         is_dangling = path.is_symlink() and not path.exists()
         problem = "it is a link whose target does not exist" if is_dangling else error.strerror
-        raise InputError("out", f"cannot write to {path}: {problem}", "a directory that can be written") from None
+        raise InputError(
+            "out", f"cannot write to {path}: {problem}", "a directory that can be written"
+        ) from None
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -136,11 +154,15 @@ def write_whole(path: Path, text: str) -> None:
 
 @contextmanager
 def disk_errors(path: Path, action: str) -> Iterator[None]:
-    """Turn an error of the operating system into the error that `path` cannot be read, written, opened or removed."""
+    """Turn an error of the operating system into the error that `path` cannot be read, written,
+    opened or removed.
+    """
     try:
         yield
     except OSError as error:
-        raise SafevarError(f"{path}: cannot be {action}: {error.strerror}; earlier data stays valid") from None
+        raise SafevarError(
+            f"{path}: cannot be {action}: {error.strerror}; earlier data stays valid"
+        ) from None
 
 
 def manifest_of(study: Study, identity: Tables) -> JsonObject:
@@ -149,14 +171,17 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     Parameters
     ----------
     identity
-        Inputs of the results besides the study file, by `IDENTITY`; see `safevar_sumo.campaign.identity.identity_of`.
+        Inputs of the results besides the study file, by `IDENTITY`; see
+        `safevar_sumo.campaign.identity.identity_of`.
     """
     has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     return {
         "format": FORMAT,
         "study": tables_of(study),
         **identity,
-        "versions": {name: version(name) for name in (*PACKAGES, *(PYMOO_PACKAGES if has_pymoo else ()))},
+        "versions": {
+            name: version(name) for name in (*PACKAGES, *(PYMOO_PACKAGES if has_pymoo else ()))
+        },
     }
 
 
@@ -169,16 +194,26 @@ def evaluation_keys(tables: Tables) -> JsonObject:
     if "search" in scenario:
         searched["scenario"] = {**scenario, "search": _without_descriptions(scenario["search"])}
     return {
-        **{key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS},
+        **{
+            key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS
+        },
         **searched,
-        "vehicle": {**vehicle, "characteristics": _without_descriptions(vehicle["characteristics"])},
-        "search": {key: value for key, value in search.items() if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS},
+        "vehicle": {
+            **vehicle,
+            "characteristics": _without_descriptions(vehicle["characteristics"]),
+        },
+        "search": {
+            key: value
+            for key, value in search.items()
+            if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS
+        },
     }
 
 
 def _without_descriptions(rows: JsonObject) -> JsonObject:
     return {
-        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS} for name, row in rows.items()
+        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS}
+        for name, row in rows.items()
     }
 
 
@@ -189,17 +224,22 @@ def identity_in(manifest: JsonObject) -> JsonObject:
 
 
 def identity_digest(manifest: JsonObject) -> str:
-    """The digest that identifies a manifest's study in its journals, whether or not it has searches of pymoo."""
+    """The digest that identifies a manifest's study in its journals, whether or not it has searches
+    of pymoo.
+    """
     layers = identity_in(manifest)
-    versions = {name: value for name, value in layers["versions"].items() if name not in PYMOO_PACKAGES}
+    versions = {
+        name: value for name, value in layers["versions"].items() if name not in PYMOO_PACKAGES
+    }
     return sha256(json.dumps({**layers, "versions": versions}, sort_keys=True).encode()).hexdigest()
 
 
 def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of two manifests: of stored results, and of now.
 
-    Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other search libraries,
-    other machines, other versions of this package with the same `RESULTS`, and new keys of a study do not.
+    Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other
+    search libraries, other machines, other versions of this package with the same `RESULTS`, and
+    new keys of a study do not.
     """
     for layer, inputs in identity_in(now).items():
         for key, before, after in changed_values(identity_in(stored)[layer], inputs):
@@ -209,7 +249,11 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
                 change = "is new" if before is None else "has changed since"
                 text = f"{key} no longer exists" if after is None else f"{key} {change}"
             else:
-                name = f"version of {key}" if layer == "versions" else key or "the version of the package's results"
+                name = (
+                    f"version of {key}"
+                    if layer == "versions"
+                    else key or "the version of the package's results"
+                )
                 text = f"{name} was {before!r} and is {after!r} now"
             is_harmless = (
                 layer == "platform"
@@ -220,7 +264,9 @@ def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str,
 
 
 def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
-    """Algorithms, runs and evaluations of a study: they decide which solutions the table of solutions has."""
+    """Algorithms, runs and evaluations of a study: they decide which solutions the table of
+    solutions has.
+    """
     search = manifest["study"]["search"]
     return search["algorithms"], search["runs"], search["evaluations"]
 
@@ -231,7 +277,9 @@ def write_manifest(directory: Path, manifest: JsonObject) -> None:
 
 
 class _Manifest(Struct):
-    """What a reader of a manifest relies on; imported results have neither `files` nor `folders`."""
+    """What a reader of a manifest relies on; imported results have neither `files` nor
+    `folders`.
+    """
 
     study: Study
     versions: dict[str, str]
@@ -255,7 +303,11 @@ def read_manifest(directory: Path) -> JsonObject:
         format_number = manifest.get("format", 1)
     except (FileNotFoundError, NotADirectoryError):
         likely_path = Path("results") / directory.name
-        hint = f"; did you mean {likely_path}?" if likely_path != directory and likely_path.is_dir() else ""
+        hint = (
+            f"; did you mean {likely_path}?"
+            if likely_path != directory and likely_path.is_dir()
+            else ""
+        )
         problem = f"is not a results directory: there is no {MANIFEST}{hint}"
         raise InputError(directory, problem, "a directory written by the command `study`") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -275,17 +327,25 @@ def read_manifest(directory: Path) -> JsonObject:
 
 
 def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
-    """Folders of the user code and files of a directory's study: those of the manifest that exist, then the nearest two
-    folders that contain the directory.
+    """Folders of the user code and files of a directory's study: those of the manifest that exist,
+    then the nearest two folders that contain the directory.
     """
-    folders = [os.path.abspath(directory.resolve() / folder) for folder in manifest.get("folders", ())]
-    return tuple(dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])]))
+    folders = [
+        os.path.abspath(directory.resolve() / folder) for folder in manifest.get("folders", ())
+    ]
+    return tuple(
+        dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])])
+    )
 
 
 def changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0 are different."""
+    """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0
+    are different.
+    """
     if isinstance(first, dict) and isinstance(second, dict):
         for name in sorted({*first, *second}):
-            yield from changed_values(first.get(name), second.get(name), f"{key}.{name}" if key else name)
+            yield from changed_values(
+                first.get(name), second.get(name), f"{key}.{name}" if key else name
+            )
     elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
         yield key, first, second

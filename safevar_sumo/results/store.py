@@ -1,5 +1,5 @@
-"""Writes results directories, of a study or of imported solutions, and makes tables of evaluations and solutions. The
-same study and seed give the same bytes.
+"""Writes results directories, of a study or of imported solutions, and makes tables of evaluations
+and solutions. The same study and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class ResultsDirectory:
     study
         The study as it is run.
     identity
-        Inputs of the study's results besides the study file; see `safevar_sumo.campaign.identity.identity_of`.
+        Inputs of the study's results besides the study file; see
+        `safevar_sumo.campaign.identity.identity_of`.
     scoring
         Metrics and objectives.
 
@@ -66,7 +67,11 @@ class ResultsDirectory:
     """
 
     def __init__(
-        self, path: Path, study: Study, identity: Tables = MappingProxyType({}), scoring: Scoring = PUBLISHED_SCORING
+        self,
+        path: Path,
+        study: Study,
+        identity: Tables = MappingProxyType({}),
+        scoring: Scoring = PUBLISHED_SCORING,
     ) -> None:
         self.path = path
         self._study = study
@@ -80,8 +85,8 @@ class ResultsDirectory:
             self.manifest[JOURNALS] = JOURNAL_FORMAT
 
     def begin(self, original: Evaluations) -> None:
-        """Write the manifest with the original vehicle's evaluation; remove a table of solutions that covers other
-        runs.
+        """Write the manifest with the original vehicle's evaluation; remove a table of solutions
+        that covers other runs.
         """
         earlier_manifest = self._earlier_manifest()  # another study may have begun meanwhile
         manifest = {**self.manifest, "original": record(original, row=0)}
@@ -96,8 +101,8 @@ class ResultsDirectory:
         write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:
-        """Remarks on earlier results: runs of another length, and runs that the study, with runs of these names, no
-        longer has.
+        """Remarks on earlier results: runs of another length, and runs that the study, with runs of
+        these names, no longer has.
         """
         earlier_manifest = self._earlier_manifest()
         remarks = []
@@ -107,16 +112,18 @@ class ResultsDirectory:
         _, _, now = search_extent_of(self.manifest)
         if before != now:
             remarks.append(
-                f"{self.path}: each run had {before} evaluations before and has {now} now: an id such as nsga2:0:0 may "
-                "name another solution than in earlier output and reports"
+                f"{self.path}: each run had {before} evaluations before and has {now} now: an id"
+                " such as nsga2:0:0 may name another solution than in earlier output and reports"
             )
         if left_out := sorted(stored_runs(self.path) - set(names)):
-            remarks.append(f"{self.path}: earlier runs are left out of the results: {', '.join(left_out)}")
+            remarks.append(
+                f"{self.path}: earlier runs are left out of the results: {', '.join(left_out)}"
+            )
         return remarks
 
     def _earlier_manifest(self) -> JsonObject:
-        """The manifest of earlier results in the directory, empty without any; raises an error if they are of another
-        study.
+        """The manifest of earlier results in the directory, empty without any; raises an error if
+        they are of another study.
         """
         if not (self.path / MANIFEST).exists():
             return {}
@@ -125,7 +132,9 @@ class ResultsDirectory:
         if "imported" in stored:
             raise InputError(self.path, f"{problem}: they are imported", "another `out`")
         for layer, text, _ in differences(stored, self.manifest):
-            raise InputError(self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}")
+            raise InputError(
+                self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}"
+            )
         return stored
 
 
@@ -147,14 +156,20 @@ def evaluations_frame(
 ) -> pd.DataFrame:
     """One row per evaluation.
 
-    Columns: algorithm, run, the characteristics' filtered values in the units of the study, f_safe, f_diff [fraction],
-    f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2], further metrics, outcome.
+    Columns: algorithm, run, the characteristics' filtered values in the units of the study, f_safe,
+    f_diff [fraction], f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2],
+    further metrics, outcome.
     """
     import pandas as pd
 
     all_runs = list(runs)
-    metrics = dict.fromkeys([*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)])
-    empty = ("", 0), Evaluations.none(len(characteristics), metrics)  # all columns even without runs
+    metrics = dict.fromkeys(
+        [*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)]
+    )
+    empty = (
+        ("", 0),
+        Evaluations.none(len(characteristics), metrics),
+    )  # all columns even without runs
     return pd.concat(
         [
             pd.DataFrame(
@@ -250,7 +265,9 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
     numbers = dict.fromkeys([*characteristics, "f_safe", "f_diff", *METRICS], float)
     columns = ["algorithm", *characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS, "outcome"]
     try:
-        frame = pd.read_csv(file, keep_default_na=False, na_values=[""], float_precision="round_trip")
+        frame = pd.read_csv(
+            file, keep_default_na=False, na_values=[""], float_precision="round_trip"
+        )
         return frame[columns].astype({**numbers, "f_num_diff": int})
     except (OSError, KeyError, ValueError) as error:
         problem = f"holds no imported solutions: {str(error).splitlines()[0]}"

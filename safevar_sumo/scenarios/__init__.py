@@ -1,4 +1,6 @@
-"""Scenarios and weathers by name, and their words; the weathers are in weather.toml beside this module."""
+"""Scenarios and weathers by name, and their words; the weathers are in weather.toml beside this
+module.
+"""
 
 from collections.abc import Iterable, Mapping
 
@@ -21,7 +23,11 @@ from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
 from safevar_sumo.scenarios.stop import Stop
-from safevar_sumo.scenarios.tracks import Track as Track, TrackScenario as TrackScenario, travelled as travelled
+from safevar_sumo.scenarios.tracks import (
+    Track as Track,
+    TrackScenario as TrackScenario,
+    travelled as travelled,
+)
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
@@ -49,7 +55,9 @@ WEATHER_PARAMETERS = free_parameters(Weather)
 
 
 def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
-    """Parameters of a scenario and its weather that a study may search; none without an encounter."""
+    """Parameters of a scenario and its weather that a study may search; none without an
+    encounter.
+    """
     return {} if scenario.brakes_fully else {**scenario.free(), **WEATHER_PARAMETERS}
 
 
@@ -83,19 +91,25 @@ FROM_CENTRES = " from centre to centre"
 
 
 def distance_in_words(safety_degree: float, contact: float) -> str:
-    """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of `contact` above 0 [m]."""
+    """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of
+    `contact` above 0 [m].
+    """
     gap = f"{FROM_CENTRES} (gap {round(safety_degree - contact, 2) + 0.0:.2f} m)" if contact else ""
     return f"{safety_degree:.2f} m{gap}"
 
 
 def degree_note(contact: float) -> str:
-    """A sentence on the safety degrees of a table; bodies touch at a safety degree of `contact` [m]."""
+    """A sentence on the safety degrees of a table; bodies touch at a safety degree of `contact`
+    [m].
+    """
     from_centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
     return f"SD: least distance in m{from_centres}, or minus the collision's speed in m/s."
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:
-    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has a type."""
+    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has
+    a type.
+    """
     points = tuple(points)
     types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))

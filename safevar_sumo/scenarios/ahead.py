@@ -1,7 +1,7 @@
 """Euro NCAP's tests with a target ahead in the vehicle's lane.
 
-A pedestrian (CPLA) or a cyclist (CBLA) moves along the lane. A car stands (CCRs), is slower (CCRm) or brakes (CCRb); a
-motorcyclist stands (CMRs) or brakes (CMRb).
+A pedestrian (CPLA) or a cyclist (CBLA) moves along the lane. A car stands (CCRs), is slower (CCRm)
+or brakes (CCRb); a motorcyclist stands (CMRs) or brakes (CMRb).
 """
 
 from __future__ import annotations
@@ -28,37 +28,54 @@ from safevar_sumo.scenarios.euro_ncap import (
     SpeedProfile,
     lateral_offset,
 )
-from safevar_sumo.scenarios.tracks import BODIES, KMH, LaneTest, Speed, Track, first_in_strip, travelled
+from safevar_sumo.scenarios.tracks import (
+    BODIES,
+    KMH,
+    LaneTest,
+    Speed,
+    Track,
+    first_in_strip,
+    travelled,
+)
 from safevar_sumo.study import searched
 
 STEADY_SPEED_LIMIT = 80.0
-"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target is 60 km/h slower.
+"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target
+is 60 km/h slower.
 """
 FASTEST_TARGET = 130.0
-"""Highest speed of a target ahead [km/h], that of the vehicle in Euro NCAP's tests and in UN R157."""
+"""Highest speed of a target ahead [km/h], that of the vehicle in Euro NCAP's tests and in UN R157.
+"""
 
 
 BESIDE = (-50.0, -40.0)
-"""Places beside the path where a benign target moves along [% of the vehicle's width from its left corner]."""
+"""Places beside the path where a benign target moves along [% of the vehicle's width from its left
+corner].
+"""
 LANE_WIDTH = 3.5
 """Distance of the next lane [m]."""
 HEADWAYS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
-"""Distances of a car in the next lane at the start, as time headways [s]; every fourth is enough where other scenes
-differ more from each other.
+"""Distances of a car in the next lane at the start, as time headways [s]; every fourth is enough
+where other scenes differ more from each other.
 """
 VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start")
 """The mark of the vehicle's speed, which a study may search."""
 
 
 class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see `ProtocolTest`.
+    """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see
+    `ProtocolTest`.
 
-    The middle of the target's rear is at the impact location. A standing target may be rotated around that point.
+    The middle of the target's rear is at the impact location. A standing target may be rotated
+    around that point.
     """
 
     speed: Annotated[Speed, VEHICLE_SPEED] = 40.0
     impact_location: Annotated[
-        ImpactLocation, searched(0.0, 100.0, "%", "impact location, share of the vehicle's front from its left corner")
+        ImpactLocation,
+        searched(
+            0.0, 100.0, "%", "impact location, share of the vehicle's front from its left corner"
+        ),
     ] = 50.0
 
     @property
@@ -82,7 +99,9 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
         return SAME_DIRECTION
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """The target: a body that the vehicle's path touches first where the gap ends, and then moves ahead."""
+        """The target: a body that the vehicle's path touches first where the gap ends, and then
+        moves ahead.
+        """
         target = self.parameter("target")
         direction = self.direction
         body = BODIES[target]
@@ -94,7 +113,8 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Along(TargetAhead, frozen=True, kw_only=True):
-    """A pedestrian or cyclist moves ahead in the vehicle's lane in its direction, and does not react to it.
+    """A pedestrian or cyclist moves ahead in the vehicle's lane in its direction, and does not
+    react to it.
 
     For other parameters see `LaneTest`.
 
@@ -105,22 +125,27 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     speed
         Speed of the vehicle under test at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the target, from the left corner [% of the width].
+        Point of the vehicle's front that would hit the target, from the left corner [% of the
+        width].
     target, target_speed, acceleration_distance
-        `adult`, `child` or `cyclist`; the target's speed [km/h], and the distance within which the target reaches that
-        speed [m].
+        `adult`, `child` or `cyclist`; the target's speed [km/h], and the distance within which the
+        target reaches that speed [m].
     time_to_impact, time_after
-        Time from the start to the impact if nobody brakes, and time from the impact to the end of the run [s].
+        Time from the start to the impact if nobody brakes, and time from the impact to the end of
+        the run [s].
 
     Notes
     -----
-    By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows that are rated by the
-    warning.
+    By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows
+    that are rated by the warning.
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
     target: Literal["adult", "child", "cyclist"] | None = None
-    target_speed: Annotated[float, Meta(gt=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")] | None = None
+    target_speed: (
+        Annotated[float, Meta(gt=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")]
+        | None
+    ) = None
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
 
@@ -152,7 +177,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def _profile(self) -> SpeedProfile:
-        return SpeedProfile(0.0, self.parameter("target_speed") * KMH, self.parameter("acceleration_distance"))
+        return SpeedProfile(
+            0.0, self.parameter("target_speed") * KMH, self.parameter("acceleration_distance")
+        )
 
 
 class CarToCar(TargetAhead, frozen=True, kw_only=True):
@@ -163,36 +190,47 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     Parameters
     ----------
     test
-        CCRs, CCRm, CCRb, CMRs or CMRb: determines the target, and its speed and headway unless they are set here.
+        CCRs, CCRm, CCRb, CMRs or CMRb: determines the target, and its speed and headway unless they
+        are set here.
     speed, target_speed
         Speeds of the vehicle under test and of the target at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the middle of the target's rear, from the left corner [% of the
-        width].
+        Point of the vehicle's front that would hit the middle of the target's rear, from the left
+        corner [% of the width].
     headway
         Gap at the start divided by the vehicle's speed [s].
     brakes_at, target_deceleration, final_speed
-        Time at which the target of CCRb and CMRb begins to brake, its deceleration, and the speed at which it stops
-        braking [s, m/s^2, km/h].
+        Time at which the target of CCRb and CMRb begins to brake, its deceleration, and the speed
+        at which it stops braking [s, m/s^2, km/h].
     heading
-        Rotation of a standing target around the middle of its rear, counterclockwise seen from above [degrees].
+        Rotation of a standing target around the middle of its rear, counterclockwise seen from
+        above [degrees].
     time_after
         Time from the impact, if nobody brakes, to the end of the run [s].
 
     Notes
     -----
-    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2 m/s^2" is an
-    acceleration, hence a `target_deceleration` of 6; "+0.5s time headway" is a `headway` of 1.5 s; a rotation around
-    the impact point is a `heading`.
+    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2
+    m/s^2" is an acceleration, hence a `target_deceleration` of 6; "+0.5s time headway" is a
+    `headway` of 1.5 s; a rotation around the impact point is a `heading`.
     """
 
     test: Literal["CCRs", "CCRm", "CCRb", "CMRs", "CMRb"] = "CCRs"
     speed: Annotated[Speed, VEHICLE_SPEED] = 50.0
     target_speed: (
-        Annotated[float, Meta(ge=0, le=250), searched(0.0, 130.0, "km/h", "speed of the target at the start")] | None
+        Annotated[
+            float,
+            Meta(ge=0, le=250),
+            searched(0.0, 130.0, "km/h", "speed of the target at the start"),
+        ]
+        | None
     ) = None
     headway: (
-        Annotated[Seconds, searched(0.5, 10.0, "s", "headway, gap at the start divided by the vehicle's speed")] | None
+        Annotated[
+            Seconds,
+            searched(0.5, 10.0, "s", "headway, gap at the start divided by the vehicle's speed"),
+        ]
+        | None
     ) = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
     target_deceleration: Annotated[
@@ -224,7 +262,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     def check(self) -> None:
         """Refuse a leader who is faster than any test's."""
         if self._target_speed > FASTEST_TARGET * KMH:
-            raise InputError("", f"target_speed = {self._target_speed / KMH:g} km/h", f"up to {FASTEST_TARGET:g} km/h")
+            raise InputError(
+                "",
+                f"target_speed = {self._target_speed / KMH:g} km/h",
+                f"up to {FASTEST_TARGET:g} km/h",
+            )
 
     @property
     def direction(self) -> Direction:
@@ -242,7 +284,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     def _target_speed(self) -> Quantity:
         """Speed of the target at the start [m/s]."""
         slower_speed = 20.0 + np.maximum(self.speed - STEADY_SPEED_LIMIT, 0.0)
-        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(self.pre_crash, self.speed)
+        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(
+            self.pre_crash, self.speed
+        )
         return (default if self.target_speed is None else self.target_speed) * KMH
 
     @property
@@ -254,14 +298,16 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         if not self._target_brakes:
             return lambda time: first_speed
         last_speed = np.minimum(first_speed, self.final_speed * KMH)
-        return lambda time: np.maximum(first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed)
+        return lambda time: np.maximum(
+            first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed
+        )
 
     @np.errstate(all="ignore")  # of the speeds that do not count
     def _time_to_impact(self) -> Quantity:
         """Time to the impact if the vehicle does not brake [s].
 
-        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by b per second until
-        it stops braking.
+        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by
+        b per second until it stops braking.
         """
         closing_speed = self.test_speed - self._target_speed
         gap = self.gap
@@ -275,17 +321,28 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         speed_lost = self._target_speed - self.target_speed_at(math.inf)
         closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
         gap_after_braking = gap_at_braking - closed_by_braking
-        after_braking = self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
+        after_braking = (
+            self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
+        )
         root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
         in_braking = self.brakes_at + (root - closing_speed) / b
         braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)
         return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]
 
 
-def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> Iterator[tuple[str, Scenario]]:
-    """Benign scenes of a test in which a car stands in the next lane at these headways [s], each with a description."""
+def next_lane(
+    test: LaneTest, headways: Sequence[float] = HEADWAYS
+) -> Iterator[tuple[str, Scenario]]:
+    """Benign scenes of a test in which a car stands in the next lane at these headways [s], each
+    with a description.
+    """
     width = test.vut_width
     place = 100 * (LANE_WIDTH / width + 0.5)
-    beside = CarToCar(speed=test.speed, vut_length=test.vut_length, vut_width=width, impact_location=place)
+    beside = CarToCar(
+        speed=test.speed, vut_length=test.vut_length, vut_width=width, impact_location=place
+    )
     for headway in headways:
-        yield f"{test.speed:g} km/h, a car in the next lane {headway:g} s ahead", replace(beside, headway=headway)
+        yield (
+            f"{test.speed:g} km/h, a car in the next lane {headway:g} s ahead",
+            replace(beside, headway=headway),
+        )

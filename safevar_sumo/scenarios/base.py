@@ -23,21 +23,23 @@ MAX_GRADE = 30.0
 """Steepest road [%]."""
 Grade = Annotated[float, Meta(ge=-MAX_GRADE, le=MAX_GRADE)]
 XmlChanges = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's root; None removes
-the element.
+"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's
+root; None removes the element.
 """
 
 
 PEDESTRIAN, CROSSING_LANE = "pedestrian", ":crossing_c0_0"
-"""Id of a person who walks across the road, and of the lane that he walks on, in every network with one."""
+"""Id of a person who walks across the road, and of the lane that he walks on, in every network with
+one.
+"""
 
 
 class Scene(NamedTuple):
-    """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the quantities.
+    """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the
+    quantities.
 
-    `over` is true where the encounter has ended for good, `visible` where the obstacle is not occluded. A scenario
-    whose
-    `centre_to_centre` is true states the obstacle's length [m].
+    `over` is true where the encounter has ended for good, `visible` where the obstacle is not
+    occluded. A scenario whose `centre_to_centre` is true states the obstacle's length [m].
     """
 
     gap: FloatArray
@@ -61,12 +63,15 @@ LEGAL_SCENE = {
     "over": TRUTH,
     "visible": TRUTH._replace(scalar=True),
 }
-LEGAL_ENCOUNTER = {**dict.fromkeys(Encounter._fields, Legal(infinite=True, undefined=True)), "in_conflict": TRUTH}
+LEGAL_ENCOUNTER = {
+    **dict.fromkeys(Encounter._fields, Legal(infinite=True, undefined=True)),
+    "in_conflict": TRUTH,
+}
 
 
 def check_encounter(code: UserCode, method: str, encounter: Encounter, trace: Trace) -> Encounter:
-    """Refuse an encounter that is undefined while it counts, or that never has a separation: its metrics would be
-    undefined or infinite.
+    """Refuse an encounter that is undefined while it counts, or that never has a separation: its
+    metrics would be undefined or infinite.
     """
     is_counted = encounter.in_conflict & trace.active
     for name, values in zip(Encounter._fields, encounter, strict=True):
@@ -74,7 +79,9 @@ def check_encounter(code: UserCode, method: str, encounter: Encounter, trace: Tr
             raise code.wrong(method, f"{name} = nan", "numbers wherever in_conflict is true")
     least_separation = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
     if (is_counted.any(axis=0) & (least_separation == np.inf)).any():
-        raise code.wrong(method, "separation = inf", "a finite number at some time that in_conflict is true")
+        raise code.wrong(
+            method, "separation = inf", "a finite number at some time that in_conflict is true"
+        )
     return encounter
 
 
@@ -83,17 +90,26 @@ def check_changes(code: UserCode, method: str, changes: Any, roads: Roads) -> Xm
     if not isinstance(changes, Mapping):
         raise code.wrong(method, quoted(changes), "a mapping from XPaths to attributes")
     return {  # None, which removes an element, stays None
-        path: change and {name: str(value) for name, value in change.items()} for path, change in changes.items()
+        path: change and {name: str(value) for name, value in change.items()}
+        for path, change in changes.items()
     }
 
 
 def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
-    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed, or illegal numbers of
-    `further` fields.
+    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed, or
+    illegal numbers of `further` fields.
     """
     if not isinstance(getattr(scenario, "network", None), str):
-        raise code.wrong("__init__", quoted(scenario), "an object with the attribute network, a folder's name or path")
-    legal = {"duration": Legal(0.0, MAX_DURATION, above=True), "grade": Legal(-MAX_GRADE, MAX_GRADE), **further}
+        raise code.wrong(
+            "__init__",
+            quoted(scenario),
+            "an object with the attribute network, a folder's name or path",
+        )
+    legal = {
+        "duration": Legal(0.0, MAX_DURATION, above=True),
+        "grade": Legal(-MAX_GRADE, MAX_GRADE),
+        **further,
+    }
     if scenario.test_speed is not None:
         legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
     Returned((legal,)).check(code, "__init__", scenario, ())
@@ -106,10 +122,11 @@ ScenarioMemory = Any
 class Layout(NamedTuple):
     """Where the actors of N runs are whose scenarios differ in parameters that a study searches.
 
-    `front` is the position of the vehicle under test on its lane at the start [m], a number or of shape (N,); None if
-    no parameter moves it. `pedestrian` is the id of a person who walks across that lane, "" if no parameter moves one:
-    at T samples, where his recorded way crosses the lane, he is to the `left` of its middle [m], with the `speed`
-    [m/s]; shape (T, N). `backwards` is true where he has turned round.
+    `front` is the position of the vehicle under test on its lane at the start [m], a number or of
+    shape (N,); None if no parameter moves it. `pedestrian` is the id of a person who walks across
+    that lane, "" if no parameter moves one: at T samples, where his recorded way crosses the lane,
+    he is to the `left` of its middle [m], with the `speed` [m/s]; shape (T, N). `backwards` is true
+    where he has turned round.
     """
 
     front: Quantity | None
@@ -134,30 +151,32 @@ class Scenario:
     duration
         Length of a run [s].
     reactive_actors
-        False declares that no actor reacts to the vehicle under test: SUMO can play the scene once for all vehicles.
+        False declares that no actor reacts to the vehicle under test: SUMO can play the scene once
+        for all vehicles.
     grade
-        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add the force of
-        gravity.
+        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add
+        the force of gravity.
     centre_to_centre
         Whether the safety degree is the distance between the centres of two vehicles.
     border
-        The parameter of which smaller values are more dangerous, which says how far a change moves what is avoidable;
-        "" if it has none.
+        The parameter of which smaller values are more dangerous, which says how far a change moves
+        what is avoidable; "" if it has none.
     pre_crash
         The scenario's type in NHTSA's typology; "" if it has none.
     test_speed
-        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves the speed
-        tolerance before the ADS brakes is an invalid test.
+        Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves
+        the speed tolerance before the ADS brakes is an invalid test.
     is_hit_in_front
         Whether only contacts at the vehicle's front are collisions.
     depends_until, dependence
-        Time until which the others move as if the vehicle kept its speed [s], and a sentence on it: a run in which the
-        ADS acts before is an invalid test.
+        Time until which the others move as if the vehicle kept its speed [s], and a sentence on it:
+        a run in which the ADS acts before is an invalid test.
     uneventful
-        Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the ADS;
-        "" if something does, None if only a drive can tell.
+        Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the
+        ADS; "" if something does, None if only a drive can tell.
     is_uneventful
-        In which searched encounters that is so, shape (N,): a run without a collision is an invalid test there.
+        In which searched encounters that is so, shape (N,): a run without a collision is an invalid
+        test there.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -172,7 +191,8 @@ class Scenario:
     centre_to_centre: bool = False
     brakes_fully: bool = False
     border: ClassVar[str] = ""
-    # A scenario may have fields or properties of these names: type checkers see properties. `duration` has no default.
+    # A scenario may have fields or properties of these names: type checkers see properties.
+    # `duration` has no default.
     if TYPE_CHECKING:
 
         @property
@@ -208,7 +228,9 @@ class Scenario:
 
     def at(self, values: Mapping[str, Quantity]) -> Scenario:
         """This scenario at other values of parameters, created anew."""
-        create: Any = msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
+        create: Any = (
+            msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
+        )
         return create(self, **values)  # type: ignore[no-any-return]
 
     def lanes(self, roads: Roads) -> XmlChanges:
@@ -223,14 +245,18 @@ class Scenario:
         """Read the files that parameters name, beside the study; by default there are none."""
 
     def check(self) -> None:
-        """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are not checked."""
+        """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are
+        not checked.
+        """
 
     def remarks(self) -> list[str]:
         """Remarks for the user on the scenario's parameters."""
         return []
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
-        """Scenes like this one in which nobody needs to brake, each with a description; none by default."""
+        """Scenes like this one in which nobody needs to brake, each with a description; none by
+        default.
+        """
         return ()
 
     def obstacle(self) -> str:
@@ -261,16 +287,20 @@ class WorldScenario(Scenario):
         """Prepare a run, before the first step; returns the memory for `observe`."""
 
     @abstractmethod
-    def observe(self, world: World, step: float, memory: ScenarioMemory) -> tuple[Scene, ScenarioMemory]:
-        """The obstacle now, `step` seconds after the last call, and the new memory; may also command the actors."""
+    def observe(
+        self, world: World, step: float, memory: ScenarioMemory
+    ) -> tuple[Scene, ScenarioMemory]:
+        """The obstacle now, `step` seconds after the last call, and the new memory; may also
+        command the actors.
+        """
 
     @abstractmethod
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry that the metrics are computed from."""
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        """Where the actors are at samples `step` seconds apart, if parameters of this scenario are arrays of N values:
-        the same as `actors` and `observe` make SUMO do.
+        """Where the actors are at samples `step` seconds apart, if parameters of this scenario are
+        arrays of N values: the same as `actors` and `observe` make SUMO do.
         """
         raise NotImplementedError
 
@@ -280,7 +310,9 @@ SPEED_DIMENSION = "speed"
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from the study's others."""
+    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
+    the study's others.
+    """
 
     scenario: Scenario
     weather: Weather
@@ -289,8 +321,8 @@ class Point(NamedTuple):
 
 
 class PreCrash(StrEnum):
-    """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for Crash Avoidance
-    Research, 2007).
+    """Pre-crash types by NHTSA's names (Najm, Smith, Yanagisawa: Pre-Crash Scenario Typology for
+    Crash Avoidance Research, 2007).
     """
 
     PEDESTRIAN_AFTER_MANOEUVRE = "pedestrian crash with prior vehicle manoeuvre"

@@ -1,4 +1,6 @@
-"""Euro NCAP's tests with a crossing target: pedestrians, cyclists, and a car or a motorcyclist at a junction."""
+"""Euro NCAP's tests with a crossing target: pedestrians, cyclists, and a car or a motorcyclist at a
+junction.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +32,16 @@ from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize
 from safevar_sumo.study import searched
 
 PARKED_GAP = 1.0
-"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and between the two cars
-[m].
+"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and
+between the two cars [m].
 """
 PARKED_LENGTHS, PARKED_WIDTH = {"parked_small": 4.25, "parked_large": 4.5}, 1.8
-"""Sizes of the parked cars, the nearer one first [m]: the middle of the protocol's ranges, 4.1 to 4.4 and 4.3 to 4.7 m.
+"""Sizes of the parked cars, the nearer one first [m]: the middle of the protocol's ranges, 4.1 to
+4.4 and 4.3 to 4.7 m.
 """
 ROW_LENGTH = 1000.0
-"""Length of the row of parked cars that nobody looks past [m]: of the two that stand there, the rest of the row hides,
-too.
+"""Length of the row of parked cars that nobody looks past [m]: of the two that stand there, the
+rest of the row hides, too.
 """
 TIME_TO_IMPACT = 6.0
 """Time from the start to the impact, unless the target needs longer [s]."""
@@ -49,10 +52,13 @@ STOP_DISTANCE = 5.0
 SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
 """Distances from the vehicle's path at which a benign pedestrian stops [m]."""
 LEADS = (1.5, 2.0)
-"""Times by which a benign pedestrian is at the place of the impact before the vehicle [s]: the path is clear half a
-second later.
+"""Times by which a benign pedestrian is at the place of the impact before the vehicle [s]: the path
+is clear half a second later.
 """
-PRE_CRASH = {TESTS[test].target: TESTS[test].pre_crash for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")}
+PRE_CRASH = {
+    TESTS[test].target: TESTS[test].pre_crash
+    for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")
+}
 """Pre-crash types by target."""
 
 
@@ -98,7 +104,9 @@ class _Start(NamedTuple):
         if lateral_start is None:
             if test.acceleration_distance is not None:
                 raise InputError(
-                    "scenario.parameters", "acceleration_distance: the target starts at its speed", "lateral_start too"
+                    "scenario.parameters",
+                    "acceleration_distance: the target starts at its speed",
+                    "lateral_start too",
                 )
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance = speed * time
@@ -116,69 +124,86 @@ class _Start(NamedTuple):
 
 
 class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A target crosses the lane ahead of the moving vehicle, and is hit at the impact location if nobody brakes.
+    """A target crosses the lane ahead of the moving vehicle, and is hit at the impact location if
+    nobody brakes.
 
     For other parameters see `LaneTest`.
 
     Parameters
     ----------
     test
-        Row of the protocol, the source of parameters that are not set here: CPFA, CPNA, CPNCO (pedestrians), CBFA,
-        CBNA, CBNAO (cyclists), CCCscp or CMCscp (a car or a motorcyclist at a junction).
+        Row of the protocol, the source of parameters that are not set here: CPFA, CPNA, CPNCO
+        (pedestrians), CBFA, CBNA, CBNAO (cyclists), CCCscp or CMCscp (a car or a motorcyclist at a
+        junction).
     speed
         Speed of the vehicle under test at the start [km/h].
     impact_location
-        Point of the vehicle's front that would hit the target's middle, from the side where the target starts [% of the
-        width]; below 0 or above 100 the target's middle passes behind or ahead of the vehicle's corner.
+        Point of the vehicle's front that would hit the target's middle, from the side where the
+        target starts [% of the width]; below 0 or above 100 the target's middle passes behind or
+        ahead of the vehicle's corner.
     target, target_speed
         `adult`, `child`, `cyclist`, `motorcyclist` or `car`; its speed once it moves [km/h].
     side
         Side where the target starts: `near` or `far`.
     lateral_start, acceleration_distance
-        Distance of the standing target from the middle of the lane, and distance within which it reaches its speed [m].
-        Without a `lateral_start` cyclists, motorcyclists and cars start at their speed.
+        Distance of the standing target from the middle of the lane, and distance within which it
+        reaches its speed [m]. Without a `lateral_start` cyclists, motorcyclists and cars start at
+        their speed.
     short
-        Distance before the vehicle's path at which a pedestrian stops, who otherwise stops 5 m past the middle [m].
+        Distance before the vehicle's path at which a pedestrian stops, who otherwise stops 5 m past
+        the middle [m].
     lead
-        Time by which a target with a `lateral_start` is at the place of the impact before the vehicle [s].
+        Time by which a target with a `lateral_start` is at the place of the impact before the
+        vehicle [s].
     start_share
         Share of the usual distance to the impact at which the target starts [-].
     heading
-        Rotation of the target's path around the point of impact, counterclockwise seen from above [degrees].
+        Rotation of the target's path around the point of impact, counterclockwise seen from above
+        [degrees].
     hidden
         Whether two parked cars stand between target and vehicle.
     sensor_setback
         Distance of the sensors behind the middle of the front bumper [m].
     time_to_impact, time_after
-        Time from the start to the impact, by default 6 s or as long as the target needs, and from there to the end of
-        the run [s].
+        Time from the start to the impact, by default 6 s or as long as the target needs, and from
+        there to the end of the run [s].
 
     Notes
     -----
-    `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest along the lane.
+    `lateral` refers to the target's middle, `gap` to the corner or side of its body that is nearest
+    along the lane.
 
-    Where the protocol leaves a choice, this class follows Euro NCAP's calculator (euroncap-rating-2026 5.4.9).
-    `target_speed`, `start_share` and `heading` express its robustness layers. Assumptions where the calculator leaves a
-    choice too:
+    Where the protocol leaves a choice, this class follows Euro NCAP's calculator
+    (euroncap-rating-2026 5.4.9). `target_speed`, `start_share` and `heading` express its robustness
+    layers. Assumptions where the calculator leaves a choice too:
 
     - With every layer the target still arrives at the impact location.
-    - A faster target starts from the usual position; if it starts at its speed, from correspondingly farther away.
-    - With a smaller `start_share` a standing target sets off later, and the run of a moving target begins with the
-      target nearer.
-    - At a junction the middle of the target meets the middle of the front. The target comes from the near side; the
-      calculator chooses a side at random.
+    - A faster target starts from the usual position; if it starts at its speed, from
+      correspondingly farther away.
+    - With a smaller `start_share` a standing target sets off later, and the run of a moving target
+      begins with the target nearer.
+    - At a junction the middle of the target meets the middle of the front. The target comes from
+      the near side; the calculator chooses a side at random.
     """
 
     test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
     target: Literal["adult", "child", "cyclist", "motorcyclist", "car"] | None = None
-    speed: Annotated[Speed, searched(10.0, 80.0, "km/h", "speed of the vehicle at the start")] = 40.0
+    speed: Annotated[Speed, searched(10.0, 80.0, "km/h", "speed of the vehicle at the start")] = (
+        40.0
+    )
     impact_location: Annotated[
         ImpactLocation,
         searched(
-            0.0, 100.0, "%", "impact location, share of the vehicle's front from the side where the target starts"
+            0.0,
+            100.0,
+            "%",
+            "impact location, share of the vehicle's front from the side where the target starts",
         ),
     ] = 50.0
-    target_speed: Annotated[float, Meta(gt=0, le=150), searched(3.0, 60.0, "km/h", "speed of the target")] | None = None
+    target_speed: (
+        Annotated[float, Meta(gt=0, le=150), searched(3.0, 60.0, "km/h", "speed of the target")]
+        | None
+    ) = None
     side: Literal["near", "far"] | None = None
     lateral_start: Annotated[float, Meta(gt=0, le=12)] | None = None
     acceleration_distance: Metres | None = None
@@ -205,7 +230,11 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def obstacle(self) -> str:
         """The target, and where it comes from."""
         target = self.parameter("target")
-        start = "behind a parked car" if self.parameter("hidden") else f"the {self.parameter('side')} side"
+        start = (
+            "behind a parked car"
+            if self.parameter("hidden")
+            else f"the {self.parameter('side')} side"
+        )
         return f"{'an' if target == 'adult' else 'a'} {target} from {start}"
 
     @property
@@ -223,7 +252,11 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
-        end = start.distance_to_impact + self.stop - start.side * start.impact_left if self.is_on_foot else np.inf
+        end = (
+            start.distance_to_impact + self.stop - start.side * start.impact_left
+            if self.is_on_foot
+            else np.inf
+        )
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
         impact = self.start_speed * start.time_to_impact + start.extent.length / 2
@@ -233,7 +266,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return [crossing, *self._parked_cars(impact)] if self.parameter("hidden") else [crossing]
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
-        """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next lane."""
+        """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next
+        lane.
+        """
         row = f"{self.test}, {self.speed:g} km/h"
         if self.is_on_foot and self.parameter("lateral_start") is not None and not self.heading:
             middle = replace(self, impact_location=50.0, start_share=1.0)
@@ -247,8 +282,12 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """The parked cars beside the lane, and the row that hides the target."""
         front = impact - PARKED_GAP
         left = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2
-        parked = [Track.of("row", SCREEN, front - ROW_LENGTH / 2, left, size=(ROW_LENGTH, PARKED_WIDTH))]
+        parked = [
+            Track.of("row", SCREEN, front - ROW_LENGTH / 2, left, size=(ROW_LENGTH, PARKED_WIDTH))
+        ]
         for car, length in PARKED_LENGTHS.items():
-            parked.append(Track.of(car, "car", front - length / 2, left, size=(length, PARKED_WIDTH)))
+            parked.append(
+                Track.of(car, "car", front - length / 2, left, size=(length, PARKED_WIDTH))
+            )
             front = front - length - PARKED_GAP
         return parked

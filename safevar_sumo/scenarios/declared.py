@@ -1,5 +1,5 @@
-"""Searched parameters of a study: what [scenario.search] leaves out is what the scenario's class declares, shipped or
-the user's own, and the weather.
+"""Searched parameters of a study: what [scenario.search] leaves out is what the scenario's class
+declares, shipped or the user's own, and the weather.
 """
 
 from __future__ import annotations
@@ -16,11 +16,14 @@ from safevar_sumo.study import MatrixTable, SearchTable, Weather, convert_table,
 from safevar_sumo.study.schema import Parameters
 
 
-def with_declared(domain: Parameters, name: str, tables: Mapping[str, Any], places: Sequence[str]) -> Parameters:
-    """The domain of a searched parameter with all keys that a scenario's class or the weather declares.
+def with_declared(
+    domain: Parameters, name: str, tables: Mapping[str, Any], places: Sequence[str]
+) -> Parameters:
+    """The domain of a searched parameter with all keys that a scenario's class or the weather
+    declares.
 
-    The original is the class's default, or the value of the study's weather. In a matrix the class is that of the first
-    test that has the parameter.
+    The original is the class's default, or the value of the study's weather. In a matrix the class
+    is that of the first test that has the parameter.
 
     Raises
     ------
@@ -31,7 +34,12 @@ def with_declared(domain: Parameters, name: str, tables: Mapping[str, Any], plac
         free = free_parameters(model)
         if name in free:
             one = free[name]
-            declared = {"unit": one.unit, "lower": one.lower, "upper": one.upper, "meaning": one.meaning}
+            declared = {
+                "unit": one.unit,
+                "lower": one.lower,
+                "upper": one.upper,
+                "meaning": one.meaning,
+            }
             if isinstance(values[name], int | float):
                 declared["original"] = values[name]
             return {**declared, **domain}
@@ -41,7 +49,9 @@ def with_declared(domain: Parameters, name: str, tables: Mapping[str, Any], plac
 def _models(tables: Mapping[str, Any], places: Sequence[str]) -> Iterator[tuple[type, Parameters]]:
     """The weather's class with its values, and those of the scenarios with their defaults."""
     weather = tables.get("weather")
-    table = weather_of(weather if isinstance(weather, str) else convert_table(weather, Weather, "weather"))
+    table = weather_of(
+        weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
+    )
     yield Weather, msgspec.structs.asdict(table)
     matrix = tables.get("matrix")
     tests = convert_table(matrix, MatrixTable, "matrix").tests if matrix else []
@@ -57,7 +67,9 @@ def _models(tables: Mapping[str, Any], places: Sequence[str]) -> Iterator[tuple[
 
 def _defaults(model: type) -> Parameters:
     """The defaults of a class's fields."""
-    fields: Sequence[Any] = msgspec.structs.fields(model) if issubclass(model, msgspec.Struct) else ()
+    fields: Sequence[Any] = (
+        msgspec.structs.fields(model) if issubclass(model, msgspec.Struct) else ()
+    )
     if dataclasses.is_dataclass(model):
         fields = dataclasses.fields(model)
     return {field.name: field.default for field in fields}

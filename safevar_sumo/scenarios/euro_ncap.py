@@ -1,4 +1,5 @@
-"""Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): what their scenarios share.
+"""Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): what their scenarios
+share.
 
 It is the protocol's table, the directions of targets and their speeds over time.
 
@@ -39,17 +40,27 @@ class Direction(NamedTuple):
 
         Sine and cosine are rounded, as their last bits differ between machines.
         """
-        cosine, sine = (round(function(math.radians(heading)), 12) for function in (math.cos, math.sin))
-        return Direction(self.along * cosine - self.left * sine, self.left * cosine + self.along * sine)
+        cosine, sine = (
+            round(function(math.radians(heading)), 12) for function in (math.cos, math.sin)
+        )
+        return Direction(
+            self.along * cosine - self.left * sine, self.left * cosine + self.along * sine
+        )
 
     def extent(self, body: BodySize) -> BodySize:
         """Size along the lane and across it of a body that faces in this direction [m]."""
         along = abs(self.along)
         left = abs(self.left)
-        return BodySize(body.length * along + body.width * left, body.length * left + body.width * along)
+        return BodySize(
+            body.length * along + body.width * left, body.length * left + body.width * along
+        )
 
 
-SAME_DIRECTION, FROM_RIGHT, FROM_LEFT = Direction(1.0, 0.0), Direction(0.0, 1.0), Direction(0.0, -1.0)
+SAME_DIRECTION, FROM_RIGHT, FROM_LEFT = (
+    Direction(1.0, 0.0),
+    Direction(0.0, 1.0),
+    Direction(0.0, -1.0),
+)
 
 
 class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,8 +75,8 @@ class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
     target_speed, acceleration_distance
         Speed of the target [km/h] and distance within which it reaches that speed [m].
     side, lateral_start, hidden
-        Of a crossing target: where it starts [m], and whether parked cars hide it. A target without a `lateral_start`
-        starts at its full speed.
+        Of a crossing target: where it starts [m], and whether parked cars hide it. A target without
+        a `lateral_start` starts at its full speed.
     headway
         Of a car or motorcyclist ahead: time headway at the start [s].
     """
@@ -88,8 +99,8 @@ TESTS = msgspec.convert(shipped_table("scenarios/euro_ncap.toml"), dict[str, Tes
 
 
 class SpeedProfile(NamedTuple):
-    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to `speed` [m/s] within
-    `run_up` [m]; or of N targets, in arrays.
+    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to
+    `speed` [m/s] within `run_up` [m]; or of N targets, in arrays.
     """
 
     begin: Quantity
@@ -97,21 +108,26 @@ class SpeedProfile(NamedTuple):
     run_up: float
 
     @classmethod
-    def with_arrival(cls, distance: Quantity, time: Quantity, speed: Quantity, run_up: float) -> SpeedProfile:
+    def with_arrival(
+        cls, distance: Quantity, time: Quantity, speed: Quantity, run_up: float
+    ) -> SpeedProfile:
         """The profile that covers `distance` [m] by `time` [s].
 
         Past the run-up, distance = speed * (time - begin) - run_up.
         """
         if np.any(distance < run_up):
             raise InputError(
-                "", f"acceleration_distance = {run_up:g} m is longer than the distance of {np.min(distance):g} m"
+                "",
+                f"acceleration_distance = {run_up:g} m is longer than the distance of"
+                f" {np.min(distance):g} m",
             )
         shortest_time = (distance + run_up) / speed
         begin = time - shortest_time
         if np.any(begin < 0):
             raise InputError(
                 "",
-                f"the target needs {np.max(shortest_time):.2f} s to the impact and has {np.max(time):g} s",
+                f"the target needs {np.max(shortest_time):.2f} s to the impact and has"
+                f" {np.max(time):g} s",
                 "a faster target, a shorter distance or a longer time_to_impact",
             )
         return cls(begin, speed, run_up)
@@ -121,7 +137,10 @@ class SpeedProfile(NamedTuple):
         """Distance covered [m] at a time [s]."""
         elapsed = np.maximum(time - self.begin, 0.0)
         return np.where(
-            elapsed >= 2 * self.run_up / self.speed,  # twice the time that the run-up would take at full speed
+            elapsed
+            >= 2
+            * self.run_up
+            / self.speed,  # twice the time that the run-up would take at full speed
             self.speed * elapsed - self.run_up,
             self.speed * self.speed / (4 * np.float64(self.run_up)) * elapsed * elapsed,
         )[()]
@@ -144,7 +163,8 @@ def lateral_offset(location: Quantity, width: float) -> Quantity:
 
 
 class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the protocol's scenarios, with the parameters that all of them have; for others see `LaneTest`.
+    """Base of the protocol's scenarios, with the parameters that all of them have; for others see
+    `LaneTest`.
 
     Parameters
     ----------
@@ -179,7 +199,9 @@ class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             remarks.append(f"speed = {self.speed:g} km/h is outside the protocol's {tested}")
         if self.impact_location not in row.locations:
             tested = ", ".join(f"{location:g}" for location in row.locations)
-            remarks.append(f"impact_location = {self.impact_location:g} % is none of the protocol's {tested} %")
+            remarks.append(
+                f"impact_location = {self.impact_location:g} % is none of the protocol's {tested} %"
+            )
         if self.grade:
             remarks.append(f"grade = {self.grade:g} %, and the protocol's road is level")
         return [f"{self.test}: {remark}" for remark in remarks]

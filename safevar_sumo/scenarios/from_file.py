@@ -58,14 +58,16 @@ class OpenScenario(TrackScenario):
     @property
     def _key(self) -> tuple[object, ...]:
         values = {
-            name: value.tobytes() if isinstance(value, np.ndarray) else value for name, value in self.values.items()
+            name: value.tobytes() if isinstance(value, np.ndarray) else value
+            for name, value in self.values.items()
         }
         return self.file, self.ego, repr(values)
 
     def free(self) -> Mapping[str, FreeParameter]:
         """Every number among the file's parameters may be searched; a file states no units."""
         return {
-            name: FreeParameter(lower=-WIDEST, upper=WIDEST, unit="", meaning=name) for name in self._scenes[0].numbers
+            name: FreeParameter(lower=-WIDEST, upper=WIDEST, unit="", meaning=name)
+            for name in self._scenes[0].numbers
         }
 
     def at(self, values: Mapping[str, Quantity]) -> OpenScenario:
@@ -74,12 +76,16 @@ class OpenScenario(TrackScenario):
 
     @cached_property
     def _different(self) -> tuple[list[Mapping[str, Any]], IntArray]:
-        """The values of all different encounters, and the number of those of each of N encounters."""
+        """The values of all different encounters, and the number of those of each of N
+        encounters.
+        """
         arrays = {name: value for name, value in self.values.items() if np.ndim(value)}
         if not arrays:
             return [self.values], np.zeros(1, dtype=int)
         rows, which = np.unique(np.stack([*arrays.values()], axis=1), axis=0, return_inverse=True)
-        return [{**self.values, **dict(zip(arrays, row, strict=True))} for row in rows], np.reshape(which, -1)
+        return [{**self.values, **dict(zip(arrays, row, strict=True))} for row in rows], np.reshape(
+            which, -1
+        )
 
     @cached_property
     def _scenes(self) -> list[Played]:
@@ -89,19 +95,30 @@ class OpenScenario(TrackScenario):
     def _played(self, every: int) -> list[Played]:
         try:
             found = [
-                play(self.file, {name: text_of(value) for name, value in values.items()}, self.ego, every)
+                play(
+                    self.file,
+                    {name: text_of(value) for name, value in values.items()},
+                    self.ego,
+                    every,
+                )
                 for values in self._different[0]
             ]
         except InputError as error:
             name = os.path.basename(self.file)
-            raise InputError("", f"scenario.file = {name!r}: {error.problem}", error.legal) from None
+            raise InputError(
+                "", f"scenario.file = {name!r}: {error.problem}", error.legal
+            ) from None
         if len({scene.ego for scene in found}) > 1:
             problem = f"the body of {self.ego} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("_different", "_scenes")}
+        return {
+            key: value
+            for key, value in self.__dict__.items()
+            if key not in ("_different", "_scenes")
+        }
 
     def _of_scenes(self, values: Sequence[float]) -> Quantity:
         """A number, or an array for N encounters."""
@@ -115,7 +132,9 @@ class OpenScenario(TrackScenario):
 
     @property
     def test_speed(self) -> Quantity:
-        """The speed that Ego holds, and the vehicle under test until its driving system acts [m/s]."""
+        """The speed that Ego holds, and the vehicle under test until its driving system acts
+        [m/s].
+        """
         return self._of_scenes([scene.speed for scene in self._scenes])
 
     @property
@@ -147,7 +166,10 @@ class OpenScenario(TrackScenario):
     def dependence(self) -> str:
         """What depends on Ego, and until when."""
         played = self._scenes[0]
-        return f"{played.dependence} at {played.depends_until:.1f} s depends on an Ego that keeps its speed"
+        return (
+            f"{played.dependence} at {played.depends_until:.1f} s depends on an Ego that keeps its"
+            " speed"
+        )
 
     @property
     def uneventful(self) -> str:
@@ -156,7 +178,9 @@ class OpenScenario(TrackScenario):
 
     @property
     def is_uneventful(self) -> Quantity | bool:
-        """In which of N searched encounters nothing happens to an Ego that keeps its speed, shape (N,)."""
+        """In which of N searched encounters nothing happens to an Ego that keeps its speed, shape
+        (N,).
+        """
         are_uneventful = self._of_scenes([bool(scene.uneventful) for scene in self._scenes])
         return are_uneventful if np.ndim(are_uneventful) else False
 
@@ -166,11 +190,17 @@ class OpenScenario(TrackScenario):
         self.remarks()
 
     def remarks(self) -> list[str]:
-        """What of the file has no effect here, or never happens, and that the vehicle has Ego's body."""
+        """What of the file has no effect here, or never happens, and that the vehicle has Ego's
+        body.
+        """
         played = self._scenes[0]
         car = f"{VUT_LENGTH:.2f} m x {VUT_WIDTH:.2f} m"
         body = f"{played.ego.length:.2f} m x {played.ego.width:.2f} m"
-        differs = [] if body == car else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
+        differs = (
+            []
+            if body == car
+            else [f"the vehicle has {self.ego}'s body, {body}, not that of other tests, {car}"]
+        )
         return [*played.remarks, *differs]
 
     def lanes(self, roads: Roads) -> XmlChanges:
@@ -192,7 +222,9 @@ class OpenScenario(TrackScenario):
             for number in range(len(scenes[0].others))
         ]
 
-    def _track(self, scenes: Sequence[Played], bodies: Sequence[Moved], samples: FloatArray, every: int) -> Track:
+    def _track(
+        self, scenes: Sequence[Played], bodies: Sequence[Moved], samples: FloatArray, every: int
+    ) -> Track:
         name = bodies[0].name
         shape = bodies[0].shape
         if len({(body.name, body.shape.length, body.shape.width) for body in bodies}) > 1:
@@ -205,7 +237,9 @@ class OpenScenario(TrackScenario):
         ahead = np.array([scene.start.facing for scene in scenes])
         place = np.round((place - [scene.start.place for scene in scenes]) / ahead, DIGITS)
         facing = np.round(facing / ahead, DIGITS + 3)
-        beyond = np.maximum(samples[:, np.newaxis] - [every * (len(body.speed) - 1) for body in bodies], 0.0)
+        beyond = np.maximum(
+            samples[:, np.newaxis] - [every * (len(body.speed) - 1) for body in bodies], 0.0
+        )
         facing = facing / np.abs(facing)
         place = place + beyond * STEP * speed * facing
         which = self._different[1]

@@ -1,7 +1,8 @@
-"""A car from the next lane cuts in; a leader cuts out and reveals a standing car (UN R157, annex 4, appendix 3).
+"""A car from the next lane cuts in; a leader cuts out and reveals a standing car (UN R157, annex 4,
+appendix 3).
 
-The lateral movement is as the regulation draws it: at a constant speed from one lane's middle to the other's, with
-bodies that stay parallel to the lanes.
+The lateral movement is as the regulation draws it: at a constant speed from one lane's middle to
+the other's, with bodies that stay parallel to the lanes.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ from safevar_sumo.scenarios.ahead import LANE_WIDTH, VEHICLE_SPEED, next_lane
 from safevar_sumo.scenarios.base import PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
 from safevar_sumo.scenarios.roads import Roads
-from safevar_sumo.scenarios.tracks import BODIES, DEPARTURE, KMH, BodySize, LaneTest, Track, travelled
+from safevar_sumo.scenarios.tracks import (
+    BODIES,
+    DEPARTURE,
+    KMH,
+    BodySize,
+    LaneTest,
+    Track,
+    travelled,
+)
 from safevar_sumo.study import searched
 
 CAR = BodySize(BODIES["car"].length, 1.9)
@@ -27,12 +36,18 @@ BEGINS_AT = 1.0
 """Time at which the lateral movement begins [s]: until then a driver sees where the car drives."""
 MotorwaySpeed = Annotated[float, Meta(gt=0, le=130), VEHICLE_SPEED]
 """Speed of the vehicle under test [km/h], up to that of the regulation's 01 series."""
-Gap = Annotated[float, Meta(gt=0, le=500), searched(5.0, 120.0, "m", "gap when the lateral movement begins")]
-LateralSpeed = Annotated[float, Meta(gt=0, le=5), searched(0.5, 3.0, "m/s", "speed of the lateral movement")]
+Gap = Annotated[
+    float, Meta(gt=0, le=500), searched(5.0, 120.0, "m", "gap when the lateral movement begins")
+]
+LateralSpeed = Annotated[
+    float, Meta(gt=0, le=5), searched(0.5, 3.0, "m/s", "speed of the lateral movement")
+]
 
 
 class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of both scenarios: a car changes the lane, `side` of the vehicle's; for other parameters see `LaneTest`."""
+    """Base of both scenarios: a car changes the lane, `side` of the vehicle's; for other parameters
+    see `LaneTest`.
+    """
 
     speed: MotorwaySpeed = 80.0
     gap: Gap = 40.0
@@ -66,10 +81,11 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Parameters
     ----------
     speed, target_speed
-        Speeds of the vehicle under test and of the other car at the start [km/h]; by default the other car is 20 km/h
-        slower, and not slower than 10 km/h.
+        Speeds of the vehicle under test and of the other car at the start [km/h]; by default the
+        other car is 20 km/h slower, and not slower than 10 km/h.
     gap
-        Distance of the other car's rear ahead of the vehicle's front when it begins to move sideways [m].
+        Distance of the other car's rear ahead of the vehicle's front when it begins to move
+        sideways [m].
     lateral_speed
         Speed at which it moves sideways, 3.5 m from lane's middle to lane's middle [m/s].
     side
@@ -81,15 +97,22 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Notes
     -----
-    Only contacts of the vehicle's front are collisions: a car that drives its flank or rear corner into the vehicle's
-    side is listed.
+    Only contacts of the vehicle's front are collisions: a car that drives its flank or rear corner
+    into the vehicle's side is listed.
     """
 
     target_speed: (
-        Annotated[float, Meta(ge=0, le=130), searched(10.0, 130.0, "km/h", "speed of the car that cuts in")] | None
+        Annotated[
+            float,
+            Meta(ge=0, le=130),
+            searched(10.0, 130.0, "km/h", "speed of the car that cuts in"),
+        ]
+        | None
     ) = None
     target_deceleration: Annotated[
-        float, Meta(ge=0, le=12), searched(0.0, 10.0, "m/s^2", "deceleration of the car once it is in the lane")
+        float,
+        Meta(ge=0, le=12),
+        searched(0.0, 10.0, "m/s^2", "deceleration of the car once it is in the lane"),
     ] = 0.0
     duration: Seconds = 30.0
     pre_crash = PreCrash.CUT_IN
@@ -98,20 +121,27 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def first_speed(self) -> Quantity:
         """Speed of the other car at the start [m/s]."""
-        return (np.maximum(self.speed - 20.0, 10.0) if self.target_speed is None else self.target_speed) * KMH
+        return (
+            np.maximum(self.speed - 20.0, 10.0) if self.target_speed is None else self.target_speed
+        ) * KMH
 
     def check(self) -> None:
         """Refuse a car that is beside the vehicle before any of it is in the vehicle's lane."""
         enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
         left = self.gap - (self.start_speed - self.first_speed) * enters_after
         if left <= 0:
-            problem = f"gap = {self.gap:g} m is closed before the car is in the lane, after {enters_after:.2f} s"
+            problem = (
+                f"gap = {self.gap:g} m is closed before the car is in the lane, after"
+                f" {enters_after:.2f} s"
+            )
             raise InputError("", problem, f"a gap above {self.gap - left:.4g} m")
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The car that cuts in."""
         arrives = BEGINS_AT + LANE_WIDTH / self.lateral_speed
-        speed = np.maximum(self.first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0)
+        speed = np.maximum(
+            self.first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0
+        )
         ahead = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
         x = ahead + CAR.length / 2 + travelled(speed, times)
         y = self.sign * (LANE_WIDTH - self.moved(times))
@@ -128,7 +158,8 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     headway
         Gap to the leader divided by the speed [s].
     gap
-        Distance of the standing car's rear ahead of the leader's front when the leader begins to move sideways [m].
+        Distance of the standing car's rear ahead of the leader's front when the leader begins to
+        move sideways [m].
     lateral_speed
         Speed at which the leader moves sideways, 3.5 m from lane's middle to lane's middle [m/s].
     side
@@ -143,7 +174,9 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     gap: Gap = 80.0
     headway: Annotated[
-        float, Meta(gt=0, le=60), searched(0.5, 4.0, "s", "headway, gap to the leader divided by the speed")
+        float,
+        Meta(gt=0, le=60),
+        searched(0.5, 4.0, "s", "headway, gap to the leader divided by the speed"),
     ] = 2.0
     time_after: Seconds = 10.0
     pre_crash = PreCrash.LEAD_STOPPED
@@ -152,7 +185,9 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def duration(self) -> Quantity:
         """Length of a run [s]."""
-        return BEGINS_AT + self.headway + (CAR.length + self.gap) / self.start_speed + self.time_after
+        return (
+            BEGINS_AT + self.headway + (CAR.length + self.gap) / self.start_speed + self.time_after
+        )
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The leader and the standing car.
@@ -165,7 +200,10 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         speed = self.start_speed
         apart = self.gap / self.start_speed * self.lateral_speed
         if np.any(apart < CAR.width):
-            moved = f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the standing car"
+            moved = (
+                f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the"
+                " standing car"
+            )
             problem = f"gap = {np.min(self.gap):g} m: {moved}"
             raise InputError("", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
         front = self.headway * speed + CAR.length

@@ -1,4 +1,6 @@
-"""The two scenarios of the published study: a pedestrian walks into the lane; parked vehicles block both lanes."""
+"""The two scenarios of the published study: a pedestrian walks into the lane; parked vehicles block
+both lanes.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ ROUNDING = 1e-6
 """How far beyond the place where he turns a pedestrian may get by rounding errors [m]."""
 VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
 WALKING_SPEED, LATERAL_START = 1.8, 5.16
-"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic file."""
+"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic
+file.
+"""
 
 
 SLOW_SPEEDS = (10.0, 15.0, 20.0)
@@ -50,7 +54,9 @@ def approach(roads: Roads | World) -> Frame:
 
 
 def _place(position: float, name: str) -> str:
-    """A place at the start [m], which a parameter decides, as text; SUMO counts one below 0 from the lane's end."""
+    """A place at the start [m], which a parameter decides, as text; SUMO counts one below 0 from
+    the lane's end.
+    """
     if position < 0:
         problem = f"{name} is {-position:.2f} m longer than the lane before the encounter"
         raise InputError("scenario.parameters", problem, f"a smaller {name}")
@@ -67,7 +73,8 @@ class _Memory(NamedTuple):
     conflict_point, clear_point
         Positions of the vehicle's front at which the conflict begins and ends [m].
     last_lateral, has_turned
-        The pedestrians' last lateral positions [m], and which of them have turned round; shape (N,).
+        The pedestrians' last lateral positions [m], and which of them have turned round; shape
+        (N,).
     """
 
     frame: Frame
@@ -77,15 +84,19 @@ class _Memory(NamedTuple):
     has_turned: BoolArray
 
 
-class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting to the vehicle.
+class PedestrianCrossing(
+    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
+    """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting
+    to the vehicle.
 
     Parameters
     ----------
     duration
         Duration of a simulation [s].
     turns_after
-        Distance past the middle of the lane at which the pedestrian turns round [m]; None if the pedestrian walks on.
+        Distance past the middle of the lane at which the pedestrian turns round [m]; None if the
+        pedestrian walks on.
     lane_width
         Width of the lane [m]: the pedestrian leaves the lane at half of this width from the middle.
     distance
@@ -97,7 +108,8 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
 
     Notes
     -----
-    Positions, speed and the turn are by default those of the traffic file, from the published study's package.
+    Positions, speed and the turn are by default those of the traffic file, from the published
+    study's package.
     """
 
     network: str = "pedestrian_crossing"
@@ -107,13 +119,23 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     distance: (
         Annotated[
             Positive,
-            searched(6.0, 30.0, "m", "gap at the start, from the front bumper to the middle of the pedestrian's path"),
+            searched(
+                6.0,
+                30.0,
+                "m",
+                "gap at the start, from the front bumper to the middle of the pedestrian's path",
+            ),
         ]
         | None
     ) = None
-    walking_speed: Annotated[Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None = None
+    walking_speed: (
+        Annotated[Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None
+    ) = None
     lateral_start: (
-        Annotated[Positive, searched(4.0, 13.0, "m", "start of the pedestrian, to the right of the lane's middle")]
+        Annotated[
+            Positive,
+            searched(4.0, 13.0, "m", "start of the pedestrian, to the right of the lane's middle"),
+        ]
         | None
     ) = None
     grade: Grade = 0.0
@@ -127,19 +149,25 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             changes["vehicle[@id='vut']"] = {"departPos": _place(self._front(roads), "distance")}
         if self.lateral_start is not None:
             _, left = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
-            changes["person[@id='pedestrian']"] = {"departPos": _place(-left - self.lateral_start, "lateral_start")}
+            changes["person[@id='pedestrian']"] = {
+                "departPos": _place(-left - self.lateral_start, "lateral_start")
+            }
         if self.walking_speed is not None:
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
         return changes
 
     def _front(self, roads: Roads) -> Quantity:
-        """Position of the vehicle's front on its lane at the start [m]; None as in the traffic file."""
+        """Position of the vehicle's front on its lane at the start [m]; None as in the traffic
+        file.
+        """
         if self.distance is None:
             return None
         return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
-        """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for nobody."""
+        """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
+        nobody.
+        """
         target_speed = WALKING_SPEED * KMH_PER_MS
         near = Crossing(test="CPNA", target_speed=target_speed, time_to_impact=7.0)
         for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
@@ -153,7 +181,9 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         turned = np.zeros((samples, 1), dtype=bool)
         if self.turns_after is not None:
             beyond = lateral > self.turns_after + ROUNDING
-            first = np.where(beyond[-1], np.argmax(beyond, axis=0), samples)  # he is back at his place two steps before
+            first = np.where(
+                beyond[-1], np.argmax(beyond, axis=0), samples
+            )  # he is back at his place two steps before
             turned = times >= first
             lateral = lateral - 2 * speed * step * np.maximum(times - first + 1, 0)
         return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
@@ -161,7 +191,9 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))
         path = frame.crossing_position(world, CROSSING_LANE)
-        lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(world.vehicle_positions(VUT))
+        lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(
+            world.vehicle_positions(VUT)
+        )
         if self.turns_after is not None and lateral.max() > self.turns_after:
             raise InputError(
                 NETWORK_KEY,
@@ -170,14 +202,20 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
             )
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path + half_width + world.vehicle_length(VUT)
-        return _Memory(frame, path - half_width, clear_point, lateral, np.zeros(len(lateral), dtype=bool))
+        return _Memory(
+            frame, path - half_width, clear_point, lateral, np.zeros(len(lateral), dtype=bool)
+        )
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
         vehicle_positions = world.vehicle_positions(VUT)
-        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(vehicle_positions)
+        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(
+            vehicle_positions
+        )
         lateral_speed = (lateral - memory.last_lateral) / step
         if self.turns_after is not None:
-            turns_now = ~memory.has_turned & (lateral + step * lateral_speed > self.turns_after + ROUNDING)
+            turns_now = ~memory.has_turned & (
+                lateral + step * lateral_speed > self.turns_after + ROUNDING
+            )
             if turns_now.any():
                 world.turn_back(PEDESTRIAN, np.flatnonzero(turns_now).tolist())
                 memory = memory._replace(has_turned=memory.has_turned | turns_now)
@@ -185,15 +223,17 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         moves_away = lateral * lateral_speed > 0
         over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)
         width = np.array(world.person_width(PEDESTRIAN))
-        scene = Scene(memory.conflict_point - front, lateral, lateral_speed, over, obstacle_width=width)
+        scene = Scene(
+            memory.conflict_point - front, lateral, lateral_speed, over, obstacle_width=width
+        )
         return scene, memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from the vehicle's
-        centre.
+        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from
+        the vehicle's centre.
 
-        TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (docs/method.md, section 4);
-        theta is the angle between the lane and the line of sight.
+        TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (docs/method.md,
+        section 4); theta is the angle between the lane and the line of sight.
         """
         half_length = trace.vehicle_length / 2
         ahead = trace.gap + half_length
@@ -208,19 +248,25 @@ class PedestrianCrossing(WorldScenario, Struct, frozen=True, kw_only=True, forbi
 
 
 PARKED_VEHICLE, PARKED_POSITION, VUT_FRONT = "parked_ahead", 85.0, 20.0
-"""Id of the parked vehicle ahead; fronts of this vehicle and of the one under test in the traffic file [m]."""
+"""Id of the parked vehicle ahead; fronts of this vehicle and of the one under test in the traffic
+file [m].
+"""
 PARKED_LENGTH = 4.7
 
 
 class _Parked(NamedTuple):
-    """The frame of the vehicle's lane; the parked vehicle's rear in it, shape (N,), and length [m]."""
+    """The frame of the vehicle's lane; the parked vehicle's rear in it, shape (N,), and length
+    [m].
+    """
 
     frame: Frame
     rear: FloatArray
     length: FloatArray
 
 
-class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LeadVehicleStopped(
+    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
 
     Parameters
@@ -228,7 +274,8 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     duration
         Length of a run [s].
     distance
-        Gap at the start, from the front bumper to the parked vehicle [m]; by default that of the traffic file.
+        Gap at the start, from the front bumper to the parked vehicle [m]; by default that of the
+        traffic file.
     grade
         Rise of the road over its length, negative downhill [%].
 
@@ -240,7 +287,12 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     network: str = "lead_vehicle_stopped"
     duration: Positive = 16.0
     distance: (
-        Annotated[Positive, searched(10.0, 75.0, "m", "gap at the start, from the front bumper to the parked vehicle")]
+        Annotated[
+            Positive,
+            searched(
+                10.0, 75.0, "m", "gap at the start, from the front bumper to the parked vehicle"
+            ),
+        ]
         | None
     ) = None
     grade: Grade = 0.0
@@ -250,12 +302,18 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle at its distance from the parked one, if the study sets it."""
-        return {} if self.distance is None else {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
+        return (
+            {}
+            if self.distance is None
+            else {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
+        )
 
     @property
     def _front(self) -> Quantity:
         """Position of the vehicle's front on its lane at the start [m]."""
-        return VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
+        return (
+            VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
+        )
 
     def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car is in the next lane."""
@@ -268,7 +326,9 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
     def begin(self, world: World) -> _Parked:
         frame = Frame.through_origin(world.lane_of(VUT))
         length = world.vehicle_length(PARKED_VEHICLE)
-        return _Parked(frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length, np.array(length))
+        return _Parked(
+            frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length, np.array(length)
+        )
 
     def observe(self, world: World, step: float, memory: _Parked) -> tuple[Scene, _Parked]:
         gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
@@ -277,7 +337,9 @@ class LeadVehicleStopped(WorldScenario, Struct, frozen=True, kw_only=True, forbi
         return Scene(gap, zeros, zeros, over=never, obstacle_length=memory.length), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree: distance between the centres of two vehicles; TTC = gap / v (docs/method.md, section 4)."""
+        """Safety degree: distance between the centres of two vehicles; TTC = gap / v
+        (docs/method.md, section 4).
+        """
         return Encounter(
             separation=trace.gap + (trace.vehicle_length + trace.obstacle_length) / 2,
             distance=trace.gap,

@@ -1,4 +1,6 @@
-"""What a scenario knows of its network: straight lanes, coordinates along them, and the world that moves the actors."""
+"""What a scenario knows of its network: straight lanes, coordinates along them, and the world that
+moves the actors.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,20 @@ from safevar_sumo.records import FloatArray, Quantity
 
 NETWORK_KEY = "scenario.parameters.network"
 MAX_BEND = 0.05
-"""Largest deviation of a lane's centre line from a straight line for which the lane counts as straight [m]."""
+"""Largest deviation of a lane's centre line from a straight line for which the lane counts as
+straight [m].
+"""
 Coordinates = tuple[float, float]
 MAX_SKEW = 0.05
-"""Largest offset along the road between the two ends of a crossing at which it still counts as at right angles [m]."""
+"""Largest offset along the road between the two ends of a crossing at which it still counts as at
+right angles [m].
+"""
 
 
 class Lane(NamedTuple):
-    """First and last point of a lane's centre line [m]; `flaw` says why the lane is not straight, "" if it is."""
+    """First and last point of a lane's centre line [m]; `flaw` says why the lane is not straight,
+    "" if it is.
+    """
 
     start: Coordinates
     end: Coordinates
@@ -34,7 +42,11 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     length = math.hypot(to_x - x, to_y - y)
     # The largest distance of a point from the line through the first and the last point:
     bend = max(
-        abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length if length else math.hypot(at_x - x, at_y - y)
+        (
+            abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length
+            if length
+            else math.hypot(at_x - x, at_y - y)
+        )
         for at_x, at_y in points
     )
     flaw = f"lane {name!r} deviates {bend:.2f} m from a straight line" if bend > MAX_BEND else ""
@@ -42,7 +54,9 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
 
 
 class Frame(NamedTuple):
-    """The coordinates of a straight lane: their origin [m], and the lane's direction, a unit vector."""
+    """The coordinates of a straight lane: their origin [m], and the lane's direction, a unit
+    vector.
+    """
 
     origin: Coordinates
     direction: Coordinates
@@ -65,8 +79,8 @@ class Frame(NamedTuple):
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """A frame with the lane's direction and the network's origin: a lane that leads east has exactly the network's
-        coordinates.
+        """A frame with the lane's direction and the network's origin: a lane that leads east has
+        exactly the network's coordinates.
         """
         return cls((0.0, 0.0), cls.of(lane).direction)
 
@@ -77,7 +91,9 @@ class Frame(NamedTuple):
         return (positions[:, 0] - x) * dir_x + (positions[:, 1] - y) * dir_y
 
     def left(self, positions: FloatArray) -> FloatArray:
-        """Distances of positions, shape (N, 2), to the left of the lane's middle [m]; shape (N,)."""
+        """Distances of positions, shape (N, 2), to the left of the lane's middle [m]; shape
+        (N,).
+        """
         x, y = self.origin
         dir_x, dir_y = self.direction
         return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
@@ -133,7 +149,9 @@ class World(Protocol):
         """Length of a vehicle [m]."""
 
     def lane(self, lane: str) -> Lane:
-        """A lane by its id, the same in all copies; take its `start` and `end` by name, as it has a third field."""
+        """A lane by its id, the same in all copies; take its `start` and `end` by name, as it has a
+        third field.
+        """
 
     def lane_of(self, vehicle: str) -> Lane:
         """The lane that a vehicle is on, the same in all copies."""
@@ -145,4 +163,6 @@ class World(Protocol):
         """Make a person continue at a walking speed [m/s], one for all copies or one for each."""
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
-        """Make a person turn round and walk back to its first edge at an unchanged speed, by default in all copies."""
+        """Make a person turn round and walk back to its first edge at an unchanged speed, by
+        default in all copies.
+        """

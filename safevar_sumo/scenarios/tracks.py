@@ -1,7 +1,8 @@
 """A scenario is who moves how: tracks of bodies, in coordinates of the vehicle's lane.
 
-`x` leads along the lane and `y` to its left; the front of the vehicle under test is at (0, 0) at the start. What is
-seen, measured and hit follows from the tracks (`sumo/stage.py`), so no scenario needs to know a road.
+`x` leads along the lane and `y` to its left; the front of the vehicle under test is at (0, 0) at
+the start. What is seen, measured and hit follows from the tracks (`sumo/stage.py`), so no scenario
+needs to know a road.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ SCREEN = "screen"
 
 
 class Track(NamedTuple):
-    """How a body moves; every quantity is a number or an array that broadcasts to (T, N): what is the same in all N
-    encounters has the shape (T, 1).
+    """How a body moves; every quantity is a number or an array that broadcasts to (T, N): what is
+    the same in all N encounters has the shape (T, 1).
 
     Attributes
     ----------
@@ -68,7 +69,8 @@ class Track(NamedTuple):
     x, y
         The body's middle [m].
     along, left
-        The direction in which it faces, a unit vector. (No sines in tracks: their last bits differ between machines.)
+        The direction in which it faces, a unit vector. (No sines in tracks: their last bits differ
+        between machines.)
     speed
         Its speed in this direction [m/s].
     """
@@ -94,11 +96,15 @@ class Track(NamedTuple):
         vy: Quantity = 0.0,
         size: tuple[float, float] | None = None,
     ) -> Track:
-        """A body with these velocities along the lane and to its left [m/s] that faces where it moves, and along the
-        lane while it stands; without a `size` it has that of its kind.
+        """A body with these velocities along the lane and to its left [m/s] that faces where it
+        moves, and along the lane while it stands; without a `size` it has that of its kind.
         """
         if size is None and kind not in BODIES:
-            raise InputError("Track.of", f"a body of the kind {kind!r} has no size", f"a size, or {one_of(BODIES)}")
+            raise InputError(
+                "Track.of",
+                f"a body of the kind {kind!r} has no size",
+                f"a size, or {one_of(BODIES)}",
+            )
         length, width = size or BODIES[kind]
         speed = np.sqrt(np.square(vx) + np.square(vy))
         moves = speed > 0
@@ -109,18 +115,22 @@ class Track(NamedTuple):
 
 
 def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
-    """Distances [m] covered since the first of T `times`, shape (T, 1) [s], at speeds that are linear in between."""
+    """Distances [m] covered since the first of T `times`, shape (T, 1) [s], at speeds that are
+    linear in between.
+    """
     at_times = speeds + np.zeros_like(times)
     covered = (at_times[1:] + at_times[:-1]) / 2 * (times[1:] - times[:-1])
     return np.concatenate([np.zeros_like(at_times[:1]), np.add.accumulate(covered, axis=0)])
 
 
 def first_in_strip(body: Track, half_width: float) -> Quantity:
-    """Position along the lane [m] of the first point of a body in the strip of this half width around the lane's
-    middle; of a body beside the strip that of its first corner.
+    """Position along the lane [m] of the first point of a body in the strip of this half width
+    around the lane's middle; of a body beside the strip that of its first corner.
     """
     corners = corners_of(body)
-    first = np.full(np.broadcast_shapes(*(np.shape(value) for corner in corners for value in corner)), np.inf)
+    first = np.full(
+        np.broadcast_shapes(*(np.shape(value) for corner in corners for value in corner)), np.inf
+    )
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
         first = np.where(np.abs(y) <= half_width, np.minimum(first, x), first)
         for side in (-half_width, half_width):
@@ -145,9 +155,17 @@ def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
 
 
 def check_tracks(code: UserCode, method: str, tracks: Any, times: FloatArray) -> Sequence[Track]:
-    """Refuse what a user's scenario returns if it is no list of tracks, or if a track has no number."""
-    if not isinstance(tracks, list | tuple) or not all(isinstance(track, Track) for track in tracks) or not tracks:
-        raise code.wrong(method, quoted(tracks), "a list of safevar_sumo.scenarios.Track, of one at least")
+    """Refuse what a user's scenario returns if it is no list of tracks, or if a track has no
+    number.
+    """
+    if (
+        not isinstance(tracks, list | tuple)
+        or not all(isinstance(track, Track) for track in tracks)
+        or not tracks
+    ):
+        raise code.wrong(
+            method, quoted(tracks), "a list of safevar_sumo.scenarios.Track, of one at least"
+        )
     for track in tracks:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             if np.asarray(value).dtype.kind not in "biuf":
@@ -165,8 +183,8 @@ LEGAL_FIELDS = {
 
 
 class TrackScenario(Scenario):
-    """A scenario whose actors move by tracks, whatever the vehicle under test does. Its fields are its parameters, each
-    a number or, where encounters are searched, an array of N.
+    """A scenario whose actors move by tracks, whatever the vehicle under test does. Its fields are
+    its parameters, each a number or, where encounters are searched, an array of N.
 
     Attributes
     ----------
@@ -175,13 +193,15 @@ class TrackScenario(Scenario):
     speed, start_speed
         Speed of the vehicle at the start [km/h], and the same in m/s; a scenario may have either.
     test_speed
-        See `Scenario`: with it a robot holds the speed, and only contacts of the vehicle's front are collisions.
+        See `Scenario`: with it a robot holds the speed, and only contacts of the vehicle's front
+        are collisions.
     vut_length, vut_width
         The vehicle's body [m].
     sensor_setback
         Distance of the sensors behind the middle of the front bumper [m].
     network
-        Where SUMO repeats runs and pictures show them: a straight lane on which the vehicle departs.
+        Where SUMO repeats runs and pictures show them: a straight lane on which the vehicle
+        departs.
     """
 
     RETURNS: ClassVar[Mapping[str, Returned]] = {"tracks": Returned(then=check_tracks)}
@@ -211,13 +231,17 @@ class TrackScenario(Scenario):
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, at its speed."""
         return {
-            "vType[@id='vut']": {"length": as_text(self.vut_length), "width": as_text(self.vut_width)},
+            "vType[@id='vut']": {
+                "length": as_text(self.vut_length),
+                "width": as_text(self.vut_width),
+            },
             DEPARTURE: {"departSpeed": as_text(self.start_speed)},
         }
 
 
 class LaneTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving system acts.
+    """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving
+    system acts.
 
     Parameters
     ----------

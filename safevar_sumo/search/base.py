@@ -1,4 +1,6 @@
-"""The contract of a search algorithm, and checks of users' algorithms; independent of SUMO, processes and files."""
+"""The contract of a search algorithm, and checks of users' algorithms; independent of SUMO,
+processes and files.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
-"""A generator that yields k filtered settings of n characteristics, shape (k, n), receives their evaluations, and so
-on; at its end it returns the run's result.
+"""A generator that yields k filtered settings of n characteristics, shape (k, n), receives their
+evaluations, and so on; at its end it returns the run's result.
 """
 
 
@@ -25,9 +27,10 @@ on; at its end it returns the run's result.
 class Problem:
     """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
 
-    `population` is the number of settings of a generation, for algorithms with generations; `scoring` defines the
-    objectives, and which evaluated settings are feasible. `region` is the feasible region of a study with constraints:
-    yielded settings must lie in this region after the filter.
+    `population` is the number of settings of a generation, for algorithms with generations;
+    `scoring` defines the objectives, and which evaluated settings are feasible. `region` is the
+    feasible region of a study with constraints: yielded settings must lie in this region after the
+    filter.
     """
 
     characteristics: CharacteristicSet
@@ -38,29 +41,43 @@ class Problem:
     region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape (number, n)."""
+        """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape
+        (number, n).
+        """
         lower = self.characteristics.lower
         upper = self.characteristics.upper
 
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
 
-        return self.region.draw_feasible(draw, number, filtered=True) if self.region else draw(number)
+        return (
+            self.region.draw_feasible(draw, number, filtered=True) if self.region else draw(number)
+        )
 
     def feasible(self, settings: FloatArray) -> BoolArray:
-        """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape (k,)."""
+        """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape
+        (k,).
+        """
         filtered = self.characteristics.filter(settings)
         return self.region.feasible(filtered) if self.region else np.ones(len(filtered), dtype=bool)
 
     def repaired(self, settings: FloatArray) -> FloatArray:
-        """Settings moved towards the original until they are feasible after the filter; shape (k, n)."""
+        """Settings moved towards the original until they are feasible after the filter; shape (k,
+        n).
+        """
         return self.region.repaired(settings) if self.region else settings
 
 
-def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng: np.random.Generator) -> Search:
+def check_search(
+    code: UserCode, method: str, search: Any, problem: Problem, rng: np.random.Generator
+) -> Search:
     """A user's search, whose settings and result are checked."""
     if not hasattr(search, "send"):
-        raise code.wrong(method, quoted(search), "a generator: a method that yields settings and returns its result")
+        raise code.wrong(
+            method,
+            quoted(search),
+            "a generator: a method that yields settings and returns its result",
+        )
     yielded = set[bytes]()
     budget = problem.evaluations
     answer = None
@@ -78,7 +95,9 @@ def check_search(code: UserCode, method: str, search: Any, problem: Problem, rng
 
 def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int) -> FloatArray:
     characteristics = problem.characteristics
-    shape = f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+    shape = (
+        f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+    )
     is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
     if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
         raise code.wrong("search", f"settings = {quoted(output)}", f"an array of {shape}")
@@ -87,31 +106,43 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
         code.check_numbers("search", characteristic.name, values, (len(output),), legal)
     settings: FloatArray = output.astype(float)
     if (characteristics.filter(settings) != settings).any():
-        raise code.wrong("search", "unfiltered settings", "problem.characteristics.filter(settings)")
+        raise code.wrong(
+            "search", "unfiltered settings", "problem.characteristics.filter(settings)"
+        )
     if problem.region:
         advice = (
-            f", for every setting that {code.name} yields: problem.characteristics.filter(problem.repaired(settings))"
+            f", for every setting that {code.name} yields:"
+            " problem.characteristics.filter(problem.repaired(settings))"
         )
         problem.region.check(settings, otherwise=advice)
     return settings
 
 
-def _checked_result(code: UserCode, result: Any, yielded: set[bytes], problem: Problem) -> Evaluations:
+def _checked_result(
+    code: UserCode, result: Any, yielded: set[bytes], problem: Problem
+) -> Evaluations:
     """The valid evaluations of a result."""
     if not yielded:
-        raise code.wrong("search", "no settings", f"a generator that yields from 1 to {problem.evaluations} settings")
-    if not isinstance(result, Evaluations) or any(setting.tobytes() not in yielded for setting in result.settings):
+        raise code.wrong(
+            "search",
+            "no settings",
+            f"a generator that yields from 1 to {problem.evaluations} settings",
+        )
+    if not isinstance(result, Evaluations) or any(
+        setting.tobytes() not in yielded for setting in result.settings
+    ):
         expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         raise code.wrong("search", quoted(result), expected)
     return result.take(problem.scoring.valid(result))
 
 
 class Algorithm:
-    """A search algorithm. Its fields are the parameters that a study gives in a table such as [search.nsga2].
+    """A search algorithm. Its fields are the parameters that a study gives in a table such as
+    [search.nsga2].
 
-    `title` is its name in tables and legends, by default its name in the study. `stops_by_itself` says that it may end
-    before it has used its budget: of others that do, the study's end and tables say so. `RETURNS` is what the method
-    of a user's class must return.
+    `title` is its name in tables and legends, by default its name in the study. `stops_by_itself`
+    says that it may end before it has used its budget: of others that do, the study's end and
+    tables say so. `RETURNS` is what the method of a user's class must return.
     """
 
     __slots__ = ()
@@ -123,9 +154,9 @@ class Algorithm:
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         """One run, which requests at most `problem.evaluations` evaluations.
 
-        All randomness comes from `rng`, so that a run which is resumed, with the evaluations of its journal, yields the
-        same settings again. Yielded settings are in the domains and filtered. The result consists of valid evaluations
-        (`problem.scoring.valid`) that the run received.
+        All randomness comes from `rng`, so that a run which is resumed, with the evaluations of its
+        journal, yields the same settings again. Yielded settings are in the domains and filtered.
+        The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
         """
 
     def try_out(self, problem: Problem) -> None:

@@ -1,4 +1,6 @@
-"""The baselines of the published study (method section 6): random search, and SafeFuzzer, a fuzzer."""
+"""The baselines of the published study (method section 6): random search, and SafeFuzzer, a
+fuzzer.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from safevar_sumo.study import ORIGINAL_DEGREE
 
 
 class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Samples uniformly in the domains; the result is the non-dominated archive over all evaluations."""
+    """Samples uniformly in the domains; the result is the non-dominated archive over all
+    evaluations.
+    """
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
@@ -26,7 +30,9 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
             archive = Evaluations.concatenate([archive, evaluated])
             archive = archive.take(problem.scoring.valid(archive))
             if len(archive):
-                archive = archive.take(moocore.is_nondominated(problem.scoring.values(archive), keep_weakly=True))
+                archive = archive.take(
+                    moocore.is_nondominated(problem.scoring.values(archive), keep_weakly=True)
+                )
         return archive
 
 
@@ -36,9 +42,11 @@ PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
 class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Changes a few characteristics of the original vehicle, in ranges that narrow towards less safe settings.
+    """Changes a few characteristics of the original vehicle, in ranges that narrow towards less
+    safe settings.
 
-    A setting's score (`_scores`) compares it with the others of its generation, and does not change later.
+    A setting's score (`_scores`) compares it with the others of its generation, and does not change
+    later.
 
     Parameters
     ----------
@@ -49,8 +57,8 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     warm_up
         Number of evaluations before ranges are narrowed or a generation must improve.
     generations_between_updates, generations_without_improvement
-        Number of generations between two updates of the ranges, and number without a new lowest score after which the
-        search ends.
+        Number of generations between two updates of the ranges, and number without a new lowest
+        score after which the search ends.
     safety_weight
         Weight of the first objective in the score; the other objectives have weight 1.
     """
@@ -99,14 +107,16 @@ class _Ranges:
         self.max_changes = len(problem.characteristics.vehicle)
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to `max_changes`, in an
-        encounter drawn uniformly.
+        """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to
+        `max_changes`, in an encounter drawn uniformly.
         """
-        return self._characteristics.filter(np.stack([self._draw_feasible_setting(rng) for _ in range(number)]))
+        return self._characteristics.filter(
+            np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
+        )
 
     def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
-        """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the original until it is
-        feasible.
+        """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the
+        original until it is feasible.
         """
         for _ in range(1 + MAX_REDRAWS):
             setting = self._draw_setting(rng)
@@ -117,17 +127,20 @@ class _Ranges:
     def _draw_setting(self, rng: np.random.Generator) -> FloatArray:
         setting = self._characteristics.original.copy()
         count = len(self._characteristics.vehicle)
-        for i in rng.choice(count, size=rng.integers(1, self.max_changes, endpoint=True), replace=False):
+        for i in rng.choice(
+            count, size=rng.integers(1, self.max_changes, endpoint=True), replace=False
+        ):
             setting[i] = self._draw_value(i, rng)
         for i in range(count, len(setting)):
             setting[i] = self._draw_value(i, rng)
         return setting
 
     def _draw_value(self, i: int, rng: np.random.Generator) -> float:
-        """A value of characteristic `i`, drawn uniformly from the values in its range that the filter keeps.
+        """A value of characteristic `i`, drawn uniformly from the values in its range that the
+        filter keeps.
 
-        The filter replaces values within a threshold of the original by the original, which is drawn if no others are
-        in the range.
+        The filter replaces values within a threshold of the original by the original, which is
+        drawn if no others are in the range.
         """
         original = self._characteristics.original[i]
         threshold = self._characteristics.threshold[i]
@@ -136,11 +149,15 @@ class _Ranges:
         if width_below + width_above <= 0:
             return float(original)
         position = rng.uniform(0.0, width_below + width_above)
-        return float(self.lower[i] + position if position < width_below else self.upper[i] - (position - width_below))
+        return float(
+            self.lower[i] + position
+            if position < width_below
+            else self.upper[i] - (position - width_below)
+        )
 
     def narrow(self, window: Evaluations) -> None:
-        """End each range at the mean of the increased values and the mean of the decreased values, over the settings of
-        `window` that are less safe than the original.
+        """End each range at the mean of the increased values and the mean of the decreased values,
+        over the settings of `window` that are less safe than the original.
         """
         is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
@@ -152,23 +169,31 @@ class _Ranges:
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))  # rounded, halves upwards
+        self.max_changes = max(
+            1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5))
+        )  # rounded, halves upwards
 
     def _originals(self, window: Evaluations) -> FloatArray:
-        """The first objective of the original vehicle; in its own encounter, if that is a safety degree there."""
+        """The first objective of the original vehicle; in its own encounter, if that is a safety
+        degree there.
+        """
         if self._scoring.safe_original is not None and self._scoring.objectives[0] == F_SAFE:
             return window.column(ORIGINAL_DEGREE)
         return np.full(len(window), self._original_objective)
 
 
 def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) -> FloatArray:
-    """The scores of a generation, less being better, by default (6 SD_norm + f_diff + num_norm) / 8; NaN if invalid.
+    """The scores of a generation, less being better, by default (6 SD_norm + f_diff + num_norm) /
+    8; NaN if invalid.
 
-    SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the value of each
-    objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n characteristics. In a study with other
-    objectives, the first takes the place of the safety degree, and further ones are scaled to [0, 1], too.
+    SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the
+    value of each objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n
+    characteristics. In a study with other objectives, the first takes the place of the safety
+    degree, and further ones are scaled to [0, 1], too.
     """
-    values = np.where(scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan)
+    values = np.where(
+        scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan
+    )
     score = safety_weight * _normalise(values[:, 0])
     for objective, column in zip(scoring.objectives[1:], values[:, 1:].T, strict=True):
         if objective.name == F_DIFF.name:

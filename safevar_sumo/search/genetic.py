@@ -1,4 +1,6 @@
-"""NSGA-II (Deb et al. 2002) on DEAP, as published: its crossover, mutation and crowding distance."""
+"""NSGA-II (Deb et al. 2002) on DEAP, as published: its crossover, mutation and crowding
+distance.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ Probability = Annotated[float, Meta(ge=0, le=1)]
 DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 MAX_MISSES = 50
-"""Maximum number of consecutive draws without a feasible child; if the next draw has none either, its children are
-repaired.
+"""Maximum number of consecutive draws without a feasible child; if the next draw has none either,
+its children are repaired.
 """
 
 
@@ -30,10 +32,13 @@ def fitness_class(objective_count: int) -> type:
     """The class of a fitness with this number of objectives, all minimised."""
 
     def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
-        if values:  # DEAP's constructor also checks the type of the weights, which takes longer than everything else
+        # DEAP's constructor also checks the type of the weights, which takes longer than all else.
+        if values:
             self.values = values
 
-    return type("Fitness", (base.Fitness,), {"weights": (-1.0,) * objective_count, "__init__": initialise})
+    return type(
+        "Fitness", (base.Fitness,), {"weights": (-1.0,) * objective_count, "__init__": initialise}
+    )
 
 
 class Individual(list[float]):
@@ -42,9 +47,11 @@ class Individual(list[float]):
     Attributes
     ----------
     fitness, evaluation
-        Once evaluated: the values of the objectives, and the batch of evaluations with the row in it.
+        Once evaluated: the values of the objectives, and the batch of evaluations with the row in
+        it.
     violation
-        By how much the original vehicle is not safe in the same encounter; 0 in studies that search only the vehicle.
+        By how much the original vehicle is not safe in the same encounter; 0 in studies that search
+        only the vehicle.
     standing
         What survivors are compared by: less is better.
     has_failed
@@ -61,11 +68,12 @@ class Individual(list[float]):
 class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Elitist search by rank and crowding distance, with as many offspring as individuals.
 
-    The variables are the characteristics' unfiltered values; simulation and results use filtered ones.
-    The default mutation probability is 1/n per variable; crossover is simulated binary, mutation polynomial, both
-    bounded by the domains. A tournament has `tournament_size` individuals. The result is the non-dominated part of the
-    last population. A setting whose simulation failed does not survive. In a study that searches its scenario, a
-    feasible setting is better than an infeasible one, and of two infeasible ones that with the smaller violation.
+    The variables are the characteristics' unfiltered values; simulation and results use filtered
+    ones. The default mutation probability is 1/n per variable; crossover is simulated binary,
+    mutation polynomial, both bounded by the domains. A tournament has `tournament_size`
+    individuals. The result is the non-dominated part of the last population. A setting whose
+    simulation failed does not survive. In a study that searches its scenario, a feasible setting is
+    better than an infeasible one, and of two infeasible ones that with the smaller violation.
     """
 
     crossover_probability: Probability = 0.9
@@ -82,9 +90,13 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         used = 0
         while offspring:
             used += yield from request_evaluations(offspring, problem)
-            alive = survivors + [individual for individual in offspring if not individual.has_failed]
+            alive = survivors + [
+                individual for individual in offspring if not individual.has_failed
+            ]
             survivors = select_survivors(alive, problem.population)
-            offspring = reproduction.draw_offspring(survivors, min(problem.population, problem.evaluations - used))
+            offspring = reproduction.draw_offspring(
+                survivors, min(problem.population, problem.evaluations - used)
+            )
         batches = [individual.evaluation for individual in survivors if individual.standing[0] == 0]
         front = [evaluations.take([row]) for evaluations, row in batches]
         return Evaluations.concatenate([problem.original.take([]), *front])
@@ -100,14 +112,16 @@ class Reproduction:
         self._random_state = random.Random(int(rng.integers(2**63))).getstate()
         self._misses = 0
         probability = operators.mutation_probability
-        self._mutation_probability = 1 / len(characteristics) if probability is None else probability
+        self._mutation_probability = (
+            1 / len(characteristics) if probability is None else probability
+        )
         self._lower = characteristics.lower.tolist()
         self._upper = characteristics.upper.tolist()
 
     @contextmanager
     def _randomness(self) -> Iterator[None]:
-        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's state
-        afterwards.
+        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's
+        state afterwards.
         """
         state_of_caller = random.getstate()
         random.setstate(self._random_state)
@@ -124,20 +138,27 @@ class Reproduction:
         domains = (self._lower, self._upper)
         with self._randomness():
             while population and len(offspring) < number:
-                pair = [Individual(run_tournament(population, operators.tournament_size)) for _ in range(2)]
+                pair = [
+                    Individual(run_tournament(population, operators.tournament_size))
+                    for _ in range(2)
+                ]
                 if random.random() <= operators.crossover_probability:
                     tools.cxSimulatedBinaryBounded(*pair, operators.crossover_index, *domains)
                 for child in pair:
-                    tools.mutPolynomialBounded(child, operators.mutation_index, *domains, self._mutation_probability)
+                    tools.mutPolynomialBounded(
+                        child, operators.mutation_index, *domains, self._mutation_probability
+                    )
                 offspring += self._feasible_children(pair)
         return offspring[:number]
 
     def _feasible_children(self, children: list[Individual]) -> list[Individual]:
-        """The children that satisfy the study's constraints; the caller draws again for those that do not.
+        """The children that satisfy the study's constraints; the caller draws again for those that
+        do not.
 
-        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible one. The first
-        population is feasible, so an infeasible child would not survive, and is not simulated. After `MAX_MISSES` draws
-        in a row without a feasible child, the next children are moved towards the original until they are feasible.
+        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible
+        one. The first population is feasible, so an infeasible child would not survive, and is not
+        simulated. After `MAX_MISSES` draws in a row without a feasible child, the next children are
+        moved towards the original until they are feasible.
         """
         if not self._problem.region:
             return children
@@ -145,11 +166,15 @@ class Reproduction:
         self._misses = 0 if feasible.any() else self._misses + 1
         if self._misses > MAX_MISSES:
             self._misses = 0
-            return [Individual(values) for values in self._problem.repaired(np.array(children)).tolist()]
+            return [
+                Individual(values) for values in self._problem.repaired(np.array(children)).tolist()
+            ]
         return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
 
 
-def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> Generator[FloatArray, Evaluations, int]:
+def request_evaluations(
+    individuals: Sequence[Individual], problem: Problem
+) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring = problem.scoring
@@ -157,7 +182,9 @@ def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> 
     violations = scoring.violation(evaluated)
     failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
-    for row, (individual, values, violation, has_failed) in enumerate(zip(individuals, *columns, strict=True)):
+    for row, (individual, values, violation, has_failed) in enumerate(
+        zip(individuals, *columns, strict=True)
+    ):
         individual.evaluation = (evaluated, row)
         individual.violation = violation
         individual.has_failed = has_failed
@@ -166,15 +193,20 @@ def request_evaluations(individuals: Sequence[Individual], problem: Problem) -> 
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
-    """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2` does; sets their
-    `standing`: the rank, from 0, then the negative crowding distance. Infeasible individuals follow all feasible ones,
-    each in a rank of its own, by their violation (constrained domination, Deb et al. 2002).
+    """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2`
+    does; sets their `standing`: the rank, from 0, then the negative crowding distance. Infeasible
+    individuals follow all feasible ones, each in a rank of its own, by their violation (constrained
+    domination, Deb et al. 2002).
     """
-    infeasible = sorted((one for one in individuals if one.violation), key=lambda one: one.violation)
+    infeasible = sorted(
+        (one for one in individuals if one.violation), key=lambda one: one.violation
+    )
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
     individuals = [individual for individual in individuals if not individual.violation]
-    sorted_individuals = sorted(individuals, key=lambda individual: individual.fitness.wvalues, reverse=True)
+    sorted_individuals = sorted(
+        individuals, key=lambda individual: individual.fitness.wvalues, reverse=True
+    )
     best = []
     for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
         tools.emo.assignCrowdingDist(front)
@@ -191,7 +223,9 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
     if not individuals:
         return []
     # DEAP's weighted values are the negative objectives.
-    ranks = moocore.pareto_rank([individual.fitness.wvalues for individual in individuals], maximise=True).tolist()
+    ranks = moocore.pareto_rank(
+        [individual.fitness.wvalues for individual in individuals], maximise=True
+    ).tolist()
     fronts: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
         fronts[rank].append(individual)
@@ -199,11 +233,15 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
 
 
 def run_tournament(population: list[Individual], size: int = 2) -> Individual:
-    """The best, by standing, of `size` individuals drawn without replacement; chance decides ties."""
+    """The best, by standing, of `size` individuals drawn without replacement; chance decides
+    ties.
+    """
     if len(population) == 1:
         return population[0]  # draws nothing from `random`
     best, *rivals = random.sample(population, min(size, len(population)))
     for rival in rivals:
-        if rival.standing < best.standing or (rival.standing == best.standing and random.random() >= 0.5):
+        if rival.standing < best.standing or (
+            rival.standing == best.standing and random.random() >= 0.5
+        ):
             best = rival
     return best

@@ -1,4 +1,6 @@
-"""The algorithms of pymoo (Blank and Deb 2020) by name, such as `pymoo:NSGA3`: its ask and tell behind our contract."""
+"""The algorithms of pymoo (Blank and Deb 2020) by name, such as `pymoo:NSGA3`: its ask and tell
+behind our contract.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from safevar_sumo.errors import InputError, SimulationError, UserCodeError, check_name, describe_error
+from safevar_sumo.errors import (
+    InputError,
+    SimulationError,
+    UserCodeError,
+    check_name,
+    describe_error,
+)
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search.base import Algorithm, Problem, Search
@@ -54,13 +62,19 @@ MODULES = {
     "soo.nonconvex.pso_ep": "EPPSO",
     "soo.nonconvex.sres": "SRES",
 }
-"""pymoo's algorithms for real numbers by their module: `moo` for several objectives, `soo` for one."""
-PYMOO_ALGORITHMS = {PYMOO + name: module for module, names in MODULES.items() for name in names.split()}
-"""The module of each algorithm, by its name in a study. Not here: algorithms for problems that change over time
-(DNSGA2, KGB), for bits (BGA) and for a person who decides (PINSGA2), and a second random search.
+"""pymoo's algorithms for real numbers by their module: `moo` for several objectives, `soo` for one.
+"""
+PYMOO_ALGORITHMS = {
+    PYMOO + name: module for module, names in MODULES.items() for name in names.split()
+}
+"""The module of each algorithm, by its name in a study. Not here: algorithms for problems that
+change over time (DNSGA2, KGB), for bits (BGA) and for a person who decides (PINSGA2), and a second
+random search.
 """
 PARTITIONS = 12
-"""Partitions of each objective in Das and Dennis's directions (1998), where a study gives no others."""
+"""Partitions of each objective in Das and Dennis's directions (1998), where a study gives no
+others.
+"""
 MAX_DIRECTIONS = 100_000
 """Largest number of reference directions, and of individuals."""
 Count = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
@@ -89,10 +103,11 @@ FAILED = 1e9
 class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An algorithm of pymoo; its fields are those arguments of pymoo's class that are plain values.
 
-    A population that has a size by default has the study's. `ref_dirs` are reference directions, or the number of
-    partitions of Das and Dennis's. The variables are the characteristics' unfiltered values; an algorithm for one
-    objective minimises the first. The result is pymoo's optimum, together with the settings of an incomplete last
-    generation. A setting that could not be scored is infeasible.
+    A population that has a size by default has the study's. `ref_dirs` are reference directions, or
+    the number of partitions of Das and Dennis's. The variables are the characteristics' unfiltered
+    values; an algorithm for one objective minimises the first. The result is pymoo's optimum,
+    together with the settings of an incomplete last generation. A setting that could not be scored
+    is infeasible.
     """
 
     name: ClassVar[str]
@@ -126,21 +141,28 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                     algorithm.tell(infills=asked)
                     optimum = algorithm.opt
                 else:
-                    optimum = filter_optimum(Population.merge(optimum, batch), least_infeasible=True)
+                    optimum = filter_optimum(
+                        Population.merge(optimum, batch), least_infeasible=True
+                    )
         every = Evaluations.concatenate(seen)
         rows = {setting.tobytes(): row for row, setting in enumerate(every.settings)}
         result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
         return result.take(problem.scoring.valid(result))
 
     def try_out(self, problem: Problem) -> None:
-        """Search a formula in place of simulations, if the study gives arguments or has a small population.
+        """Search a formula in place of simulations, if the study gives arguments or has a small
+        population.
 
         Raises
         ------
         InputError
             Naming the arguments without which pymoo would not fail.
         """
-        given = {name: value for name in self.__struct_fields__ if (value := getattr(self, name)) is not UNSET}
+        given = {
+            name: value
+            for name in self.__struct_fields__
+            if (value := getattr(self, name)) is not UNSET
+        }
         key = f"search.{self.name!r}"
         size = given.get("pop_size", 0)
         if size > problem.evaluations:
@@ -150,7 +172,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         if not is_tried or not (failure := self._failure(problem)):
             return
         without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
-        blamed = [name for name, other in without.items() if not other._failure(problem)] or list(given)
+        blamed = [name for name, other in without.items() if not other._failure(problem)] or list(
+            given
+        )
         named = " and ".join(f"{key}.{name} = {given[name]!r}" for name in blamed)
         named = named or f"{key} with search.population = {problem.population}"
         raise InputError("", f"{named}: pymoo fails: {failure}", "another value, or none")
@@ -167,7 +191,10 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                     asked += len(settings)
         except StopIteration:
             pass
-        except (SimulationError, UserCodeError):  # a script of the user's that calls the library is on the stack
+        except (
+            SimulationError,
+            UserCodeError,
+        ):  # a script of the user's that calls the library is on the stack
             return f"it does not end within {TRIAL_TIME:g} s"
         except InputError as error:
             return error.problem
@@ -178,7 +205,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         from pymoo.core.problem import Problem as PymooProblem
         from pymoo.util.ref_dirs import get_reference_directions
 
-        objectives = len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
+        objectives = (
+            len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
+        )
         defaults = _plain_arguments(self.name)
         given = {
             name: np.array(value) if isinstance(value, list) and name != "F" else value
@@ -191,15 +220,24 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             partitions = given.get("ref_dirs", PARTITIONS)
             if isinstance(partitions, int):
                 if math.comb(partitions + objectives - 1, partitions) > MAX_DIRECTIONS:
-                    raise ValueError(f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference directions")
-                given["ref_dirs"] = get_reference_directions("das-dennis", objectives, n_partitions=partitions)
+                    raise ValueError(
+                        f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference"
+                        " directions"
+                    )
+                given["ref_dirs"] = get_reference_directions(
+                    "das-dennis", objectives, n_partitions=partitions
+                )
             if given.get("pop_size", np.inf) < len(given["ref_dirs"]):
-                raise ValueError(f"pop_size is less than the {len(given['ref_dirs'])} reference directions")
+                raise ValueError(
+                    f"pop_size is less than the {len(given['ref_dirs'])} reference directions"
+                )
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
         constraints = 0 if self.name.endswith("MOEAD") else 1  # it refuses constraints
         task = PymooProblem(len(lower), objectives, n_ieq_constr=constraints, xl=lower, xu=upper)
-        algorithm = copy.deepcopy(_class_of(self.name)(**given))  # runs share the defaults of pymoo's classes
+        algorithm = copy.deepcopy(
+            _class_of(self.name)(**given)
+        )  # runs share the defaults of pymoo's classes
         return algorithm.setup(task, termination=("n_eval", problem.evaluations), seed=seed)
 
 
@@ -212,7 +250,9 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
 
 
 def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
-    """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains, the safer."""
+    """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains,
+    the safer.
+    """
     characteristics = problem.characteristics
     scoring = problem.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
@@ -222,7 +262,10 @@ def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
         settings=settings,
         outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
         collision_speed=np.full(len(settings), np.nan),
-        metrics={**dict.fromkeys(names, degree), ORIGINAL_DEGREE: np.full(len(settings), scoring.safe_original or 0.0)},
+        metrics={
+            **dict.fromkeys(names, degree),
+            ORIGINAL_DEGREE: np.full(len(settings), scoring.safe_original or 0.0),
+        },
         f_diff=characteristics.largest_change(settings),
         f_num_diff=characteristics.number_changed(settings),
     )
@@ -233,7 +276,9 @@ def _score(population: Any, evaluations: Evaluations, problem: Problem, algorith
     scoring = problem.scoring
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
-    values = np.where(valid[:, np.newaxis], scoring.values(evaluations), FAILED)[:, : algorithm.problem.n_obj]
+    values = np.where(valid[:, np.newaxis], scoring.values(evaluations), FAILED)[
+        :, : algorithm.problem.n_obj
+    ]
     violations = np.where(valid | (violations > 0), np.minimum(violations, FAILED), FAILED)
     population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
@@ -270,7 +315,9 @@ class _Randomness:
         np.random.set_state(self._outside)
         pymoo.util.np = np
         if isinstance(error, Exception):
-            raise InputError(self._name, describe_error(error), "other arguments or objectives") from error
+            raise InputError(
+                self._name, describe_error(error), "other arguments or objectives"
+            ) from error
 
 
 def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
@@ -288,7 +335,9 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
         is_required = default is inspect.Parameter.empty and argument != "ref_dirs"
         fields.append((argument, kind) if is_required else (argument, kind | UnsetType, UNSET))
     namespace = {"name": name, "title": f"{name.removeprefix(PYMOO)} (pymoo)"}
-    algorithm: Any = msgspec.defstruct(label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace)
+    algorithm: Any = msgspec.defstruct(
+        label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace
+    )
     return algorithm  # type: ignore[no-any-return]
 
 
@@ -302,16 +351,24 @@ def _class_of(name: str) -> Any:
     Config.warnings["not_compiled"] = False
     from pymoo.functions import FunctionLoader
 
-    # Its compiled crowding distances end the process (GDE3PCD in 0.6.2), and all machines have the other ones.
+    # Its compiled crowding distances end the process (GDE3PCD in 0.6.2), and all machines have the
+    # other ones.
     FunctionLoader.get_instance().is_compiled = False
-    return getattr(importlib.import_module(f"pymoo.algorithms.{PYMOO_ALGORITHMS[name]}"), name.removeprefix(PYMOO))
+    return getattr(
+        importlib.import_module(f"pymoo.algorithms.{PYMOO_ALGORITHMS[name]}"),
+        name.removeprefix(PYMOO),
+    )
 
 
 def _plain_arguments(name: str) -> dict[str, Any]:
-    """Arguments of an algorithm's class and its bases that a file can give, with their default values."""
+    """Arguments of an algorithm's class and its bases that a file can give, with their default
+    values.
+    """
     algorithm = _class_of(name)
     arguments = dict[str, inspect.Parameter]()
-    variant = getattr(importlib.import_module(algorithm.__module__), "Variant", algorithm)  # takes those of DE
+    variant = getattr(
+        importlib.import_module(algorithm.__module__), "Variant", algorithm
+    )  # takes those of DE
     for one in (*algorithm.__mro__[:-2], variant):
         arguments = {**inspect.signature(one.__init__).parameters, **arguments}
     if "ref_points" in arguments:
@@ -319,5 +376,6 @@ def _plain_arguments(name: str) -> dict[str, Any]:
     return {
         argument: parameter.default
         for argument, parameter in arguments.items()
-        if argument not in HIDDEN and (argument in TYPES or isinstance(parameter.default, bool | int | float | str))
+        if argument not in HIDDEN
+        and (argument in TYPES or isinstance(parameter.default, bool | int | float | str))
     }

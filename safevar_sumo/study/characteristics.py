@@ -1,6 +1,6 @@
-"""The tables of a study about its characteristics, and their checks: values and domains; how characteristics vary in
-the world; constraints that they satisfy together; and limits that a user sets, under [limits] or on the command line as
-`NAME >= X` and `NAME <= X`.
+"""The tables of a study about its characteristics, and their checks: values and domains; how
+characteristics vary in the world; constraints that they satisfy together; and limits that a user
+sets, under [limits] or on the command line as `NAME >= X` and `NAME <= X`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def mistake(problem: str, legal: str) -> ValueError:
 
 
 class Domain(Table, frozen=True, kw_only=True):
-    """What a search varies: its `original` value, and the ends `lower` and `upper` of its domain, in `unit`.
+    """What a search varies: its `original` value, and the ends `lower` and `upper` of its domain,
+    in `unit`.
 
     `meaning` describes it and begins with a short name (up to the first comma or bracket).
     """
@@ -43,7 +44,10 @@ class Domain(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if max(abs(self.original), abs(self.lower), abs(self.upper)) > MAX_MAGNITUDE:
-            raise mistake(f"{self.original} in [{self.lower}, {self.upper}]", f"numbers up to {MAX_MAGNITUDE:g}")
+            raise mistake(
+                f"{self.original} in [{self.lower}, {self.upper}]",
+                f"numbers up to {MAX_MAGNITUDE:g}",
+            )
         if self.lower >= self.upper:
             raise mistake(f"lower = {self.lower} and upper = {self.upper}", "lower < upper")
         if not self.lower <= self.original <= self.upper:
@@ -51,8 +55,8 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
-    """One row of the characteristics table; f_diff multiplies its change by `weight`, and `counterpart` is the part of
-    a real vehicle that sets it.
+    """One row of the characteristics table; f_diff multiplies its change by `weight`, and
+    `counterpart` is the part of a real vehicle that sets it.
     """
 
     weight: PositiveNumber = 1.0
@@ -60,7 +64,9 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
 
 
 def unit_text(unit: str, layout: str = " {}") -> str:
-    """A unit as text after a number or, in another `layout`, after a name; empty for a pure number."""
+    """A unit as text after a number or, in another `layout`, after a name; empty for a pure
+    number.
+    """
     return "" if unit in ("-", "") else layout.format(unit)
 
 
@@ -76,8 +82,8 @@ class Uniform(_Distribution, frozen=True, kw_only=True, tag="uniform"):
 
 
 class Normal(_Distribution, frozen=True, kw_only=True, tag="normal"):
-    """A normal distribution with `mean`, by default the original, and standard deviation `deviation`, cut off at the
-    ends of the domain.
+    """A normal distribution with `mean`, by default the original, and standard deviation
+    `deviation`, cut off at the ends of the domain.
     """
 
     deviation: PositiveNumber
@@ -85,8 +91,8 @@ class Normal(_Distribution, frozen=True, kw_only=True, tag="normal"):
 
 
 class Triangular(_Distribution, frozen=True, kw_only=True, tag="triangular"):
-    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at `mode`, by default the
-    original.
+    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at
+    `mode`, by default the original.
     """
 
     mode: float | None = None
@@ -95,7 +101,8 @@ class Triangular(_Distribution, frozen=True, kw_only=True, tag="triangular"):
 
 
 class Lognormal(_Distribution, frozen=True, kw_only=True, tag="lognormal"):
-    """A lognormal distribution with `median`, by default the original, cut off at the ends of the domain.
+    """A lognormal distribution with `median`, by default the original, cut off at the ends of the
+    domain.
 
     `sigma` [-] is the standard deviation of the value's logarithm.
     """
@@ -114,8 +121,8 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
 class Correlation(Table, frozen=True, kw_only=True):
-    """The correlation, `value`, of the two characteristics `between` after each is transformed to a standard normal
-    variable (Gaussian copula).
+    """The correlation, `value`, of the two characteristics `between` after each is transformed to a
+    standard normal variable (Gaussian copula).
     """
 
     between: Annotated[list[str], Meta(min_length=2, max_length=2)]
@@ -123,9 +130,13 @@ class Correlation(Table, frozen=True, kw_only=True):
 
 
 def check_variation(
-    rows: Mapping[str, Domain], variation: Mapping[str, Distribution], correlations: Sequence[Correlation]
+    rows: Mapping[str, Domain],
+    variation: Mapping[str, Distribution],
+    correlations: Sequence[Correlation],
 ) -> None:
-    """Refuse distributions and correlations that do not fit the characteristics' domains, or each other."""
+    """Refuse distributions and correlations that do not fit the characteristics' domains, or each
+    other.
+    """
     for name, distribution in variation.items():
         check_name("", f"variation.{name}: there is no such characteristic", name, rows)
         _check_distribution(f"variation.{name}", rows[name], distribution)
@@ -140,7 +151,11 @@ def check_variation(
 
 def stated_values(distribution: Distribution) -> dict[str, float]:
     """The parameters of a distribution that a study states."""
-    return {name: value for name, value in msgspec.structs.asdict(distribution).items() if value is not None}
+    return {
+        name: value
+        for name, value in msgspec.structs.asdict(distribution).items()
+        if value is not None
+    }
 
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
@@ -151,21 +166,27 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
     mode = stated.get("mode", row.original)
     for field, value in stated.items():
         if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
-            raise InputError("", f"{key}.{field} = {value:g}", f"a number in [{row.lower:g}, {row.upper:g}]{unit}")
+            raise InputError(
+                "",
+                f"{key}.{field} = {value:g}",
+                f"a number in [{row.lower:g}, {row.upper:g}]{unit}",
+            )
     if lower >= upper:
         raise InputError("", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
     if isinstance(distribution, Triangular) and not lower <= mode <= upper:
         raise InputError("", f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
     if isinstance(distribution, Lognormal) and row.lower <= 0:
-        raise InputError("", f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0")
+        raise InputError(
+            "", f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0"
+        )
 
 
 class Constraint(Table, frozen=True, kw_only=True):
     """The bounds `at_least` and `at_most` of a weighted sum of characteristics.
 
-    `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its bounds, is the unit of
-    a characteristic or "-"; it may be omitted if all characteristics of the sum have the same unit. `meaning` explains
-    the constraint and names its source.
+    `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its
+    bounds, is the unit of a characteristic or "-"; it may be omitted if all characteristics of the
+    sum have the same unit. `meaning` explains the constraint and names its source.
     """
 
     sum: Annotated[dict[str, float], Meta(min_length=1)]
@@ -186,14 +207,20 @@ class Constraint(Table, frozen=True, kw_only=True):
             f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
             for name, weight in self.sum.items()
         ]
-        return re.sub("^- ", "-", " ".join(terms).removeprefix("+ "))  # the first term has its sign without a space
+        return re.sub(
+            "^- ", "-", " ".join(terms).removeprefix("+ ")
+        )  # the first term has its sign without a space
 
     def allows(self, values: Mapping[str, float]) -> bool:
-        """Whether the sum is within its bounds at these values, or one of its terms has no value among them."""
+        """Whether the sum is within its bounds at these values, or one of its terms has no value
+        among them.
+        """
         if not self.sum.keys() <= values.keys():
             return True
         total = sum(weight * values[name] for name, weight in self.sum.items())
-        return (self.at_least is None or total >= self.at_least) and (self.at_most is None or total <= self.at_most)
+        return (self.at_least is None or total >= self.at_least) and (
+            self.at_most is None or total <= self.at_most
+        )
 
     def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""
@@ -204,7 +231,9 @@ class Constraint(Table, frozen=True, kw_only=True):
         """The bounds in words."""
         unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
-        return " and ".join(f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None)
+        return " and ".join(
+            f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None
+        )
 
 
 def check_bounds(at_least: float | None, at_most: float | None) -> None:
@@ -223,19 +252,27 @@ def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constrai
             check_name("", f"{key}.sum.{name}: there is no such characteristic", name, rows)
         units = {rows[name].unit for name in constraint.sum}
         legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
-        if (constraint.unit is None and len(units) > 1) or constraint.unit not in (None, *legal_units):
+        if (constraint.unit is None and len(units) > 1) or constraint.unit not in (
+            None,
+            *legal_units,
+        ):
             terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum)
             problem = f"{key}: unit = {constraint.unit!r} for the sum of {terms}"
             raise InputError("", problem, f"{one_of(legal_units)}; weights may convert units")
 
 
-LIMIT_FORM = re.compile(r"\s*([^<>=]*[^\s<>=])\s*(>=|<=)\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*")
-FORMS = '"NAME >= X" or "NAME <= X" with a number in the unit of the characteristic, such as "treadDepth >= 3"'
+LIMIT_FORM = re.compile(
+    r"\s*([^<>=]*[^\s<>=])\s*(>=|<=)\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
+)
+FORMS = (
+    '"NAME >= X" or "NAME <= X" with a number in the unit of the characteristic, such as'
+    ' "treadDepth >= 3"'
+)
 
 
 class Limit(Table, frozen=True, kw_only=True):
-    """The values that a characteristic may take, in its unit: `at_least`, `at_most`, or both; `source` says who demands
-    it.
+    """The values that a characteristic may take, in its unit: `at_least`, `at_most`, or both;
+    `source` says who demands it.
     """
 
     at_least: float | None = None
@@ -255,14 +292,14 @@ class Limit(Table, frozen=True, kw_only=True):
 def limits_of(
     texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None
 ) -> dict[str, Limit]:
-    """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >= 3`, and where a text
-    does not replace them, those `stated` in a study.
+    """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >=
+    3`, and where a text does not replace them, those `stated` in a study.
 
     Raises
     ------
     InputError
-        If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of one characteristic
-        cross, or a limit is outside the domain or excludes the original.
+        If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of
+        one characteristic cross, or a limit is outside the domain or excludes the original.
     """
     sides: dict[str, dict[str, Any]] = {}
     for text in texts:
@@ -285,12 +322,17 @@ def limits_of(
 
 
 def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = "") -> None:
-    """Refuse limits of unknown characteristics, outside the domain, or that exclude the original."""
+    """Refuse limits of unknown characteristics, outside the domain, or that exclude the
+    original.
+    """
     for name, limit in limits.items():
         check_name("", f"{table}{name}: there is no such characteristic", name, rows)
         row = rows[name]
         unit = unit_text(rows[name].unit)
-        for side, lower, upper in (("at_least", row.lower, row.original), ("at_most", row.original, row.upper)):
+        for side, lower, upper in (
+            ("at_least", row.lower, row.original),
+            ("at_most", row.original, row.upper),
+        ):
             value = getattr(limit, side)
             if value is not None and not lower <= value <= upper:
                 why = " is outside its domain"

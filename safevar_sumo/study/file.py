@@ -1,5 +1,5 @@
-"""Strict reading of study files, with the studies that they extend; writing of study files; and the names of the user
-code and FMUs of a study.
+"""Strict reading of study files, with the studies that they extend; writing of study files; and the
+names of the user code and FMUs of a study.
 """
 
 from __future__ import annotations
@@ -37,15 +37,17 @@ from safevar_sumo.study.validation import convert_table
 WHOLE_TABLES = ("published", "repeatability", "spread", "model_error")
 """Tables that a study inherits as a whole or not at all."""
 SYSTEM_KEYS = ("title", "published", "repeatability")
-"""Keys that describe one combination of vehicle, ADS, scenario, network, weather and matrix: a study does not inherit
-them from a study of another combination.
+"""Keys that describe one combination of vehicle, ADS, scenario, network, weather and matrix: a
+study does not inherit them from a study of another combination.
 """
 SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
 
 
 class _RawStudy(NamedTuple):
-    """Unchecked tables of a study, their origin, and remarks for the user on what they do not inherit."""
+    """Unchecked tables of a study, their origin, and remarks for the user on what they do not
+    inherit.
+    """
 
     source: object
     tables: Parameters
@@ -77,7 +79,9 @@ def study_path(study: str) -> Path:
 
 
 def load_study(study: StudyLike, **changes: Any) -> Study:
-    """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its shipped models."""
+    """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its
+    shipped models.
+    """
     raw = _raw_study(study)
     if changes:
         raw = _with_overrides(raw, plain_values(changes), raw.source)
@@ -89,8 +93,9 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
 
 
 def plain_values(value: Any) -> Any:
-    """Values of numpy and pandas, at any depth of tables and lists, as Python's own: a scalar or an array of no
-    dimension as a number, a Series by names as a table, another Series or array as a list.
+    """Values of numpy and pandas, at any depth of tables and lists, as Python's own: a scalar or an
+    array of no dimension as a number, a Series by names as a table, another Series or array as a
+    list.
     """
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
@@ -113,7 +118,9 @@ def _converted(raw: _RawStudy) -> Study:
     if "origin" in raw.tables:
         raise InputError("", "origin: there is no such key")
     tables = with_file(raw.tables, raw.origin.places)
-    tables = _with_parameters(_with_parameters(tables, "search", SearchTable), "repair", RepairTable)
+    tables = _with_parameters(
+        _with_parameters(tables, "search", SearchTable), "repair", RepairTable
+    )
     matrix = tables.get("matrix")
     vehicle = tables.get("vehicle")
     if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
@@ -122,14 +129,18 @@ def _converted(raw: _RawStudy) -> Study:
         raise _without_characteristics(vehicle["model"])
     study = convert_table(_with_declared(tables, raw.origin.places), Study)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
-        raise InputError("", "rating.claims: the study is not rated", "matrix.protocol, or no claims")
+        raise InputError(
+            "", "rating.claims: the study is not rated", "matrix.protocol, or no claims"
+        )
     for name in study.spread:
         locate_parameter(msgspec.to_builtins(study), name)
     return msgspec.structs.replace(study, origin=raw.origin)
 
 
 def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
-    """The tables of a study, with what the scenario's class declares of parameters that the study searches."""
+    """The tables of a study, with what the scenario's class declares of parameters that the study
+    searches.
+    """
     scenario = tables.get("scenario")
     search = scenario.get("search") if isinstance(scenario, dict) else None
     if not isinstance(scenario, dict) or not isinstance(search, dict):
@@ -138,30 +149,47 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
     domains = dict(search)
     for name, domain in search.items():
         if isinstance(domain, dict) and needed - domain.keys():
-            from safevar_sumo.scenarios.declared import with_declared  # the one import upwards: classes declare ranges
+            from safevar_sumo.scenarios.declared import (
+                with_declared,
+            )  # the one import upwards: classes declare ranges
 
             domains[name] = with_declared(domain, name, tables, places)
     return {**tables, "scenario": {**scenario, "search": domains}}
 
 
 def _without_characteristics(model: object) -> InputError:
-    """The error for a vehicle without characteristics: another model does not inherit those of the study's base."""
+    """The error for a vehicle without characteristics: another model does not inherit those of the
+    study's base.
+    """
     texts = (study_path(name).read_text(encoding="utf-8") for name in study_names())
     models = {
-        tables["vehicle"]["model"] for text in texts if "model" in (tables := tomllib.loads(text)).get("vehicle", {})
+        tables["vehicle"]["model"]
+        for text in texts
+        if "model" in (tables := tomllib.loads(text)).get("vehicle", {})
     }
-    problem = f"vehicle.model = {model!r} has no characteristics: vehicle.characteristics is missing"
-    legal = f"[vehicle.characteristics] of that model; of a shipped study that is extended, those of {one_of(models)}"
+    problem = (
+        f"vehicle.model = {model!r} has no characteristics: vehicle.characteristics is missing"
+    )
+    legal = (
+        "[vehicle.characteristics] of that model; of a shipped study that is extended, those of"
+        f" {one_of(models)}"
+    )
     return InputError("", f"{problem}{did_you_mean(model, models)}", legal)
 
 
-def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | RepairTable]) -> Parameters:
-    """Move the tables within a table, such as [search.nsga2] and those of [repair], to its `parameters`."""
+def _with_parameters(
+    tables: Parameters, name: str, record: type[SearchTable | RepairTable]
+) -> Parameters:
+    """Move the tables within a table, such as [search.nsga2] and those of [repair], to its
+    `parameters`.
+    """
     table = tables.get(name)
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
     inner_tables = {
-        key: value for key, value in table.items() if isinstance(value, dict) and key not in record.__struct_fields__
+        key: value
+        for key, value in table.items()
+        if isinstance(value, dict) and key not in record.__struct_fields__
     }
     other_keys = {key: value for key, value in table.items() if key not in inner_tables}
     parameters = {**other_keys.get("parameters", {}), **inner_tables}
@@ -169,21 +197,29 @@ def _with_parameters(tables: Parameters, name: str, record: type[SearchTable | R
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
-    """Read a TOML file and the study that it `extends`; keys of the file override that study, table by table."""
+    """Read a TOML file and the study that it `extends`; keys of the file override that study, table
+    by table.
+    """
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
-        raise InputError(path, f"cannot be read as TOML: {reason}", "the path of a study file") from None
+        raise InputError(
+            path, f"cannot be read as TOML: {reason}", "the path of a study file"
+        ) from None
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
     origin = Origin(
-        called=str(path) if folders else "", places=folders, files=(os.path.abspath(path),) if folders else ()
+        called=str(path) if folders else "",
+        places=folders,
+        files=(os.path.abspath(path),) if folders else (),
     )
     return _with_base(_RawStudy(path, tables, origin), path, visited_paths)
 
 
 def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
-    """The tables of `raw`, over those of the study that it extends, if any; with the folders of both."""
+    """The tables of `raw`, over those of the study that it extends, if any; with the folders of
+    both.
+    """
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
     if base is None:
@@ -198,17 +234,25 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
     if base_path in (*visited_paths, path):
-        raise InputError(raw.source, f"extends = {base!r} leads back to {base_path}", "another study")
+        raise InputError(
+            raw.source, f"extends = {base!r} leads back to {base_path}", "another study"
+        )
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
-    remarks = () if path.parent == STUDIES else merged_study.remarks  # shipped studies leave keys out on purpose
+    remarks = (
+        () if path.parent == STUDIES else merged_study.remarks
+    )  # shipped studies leave keys out on purpose
     files = (*raw.origin.files, *base_study.origin.files)
-    return merged_study._replace(origin=Origin(called=raw.origin.called, places=folders, files=files), remarks=remarks)
+    return merged_study._replace(
+        origin=Origin(called=raw.origin.called, places=folders, files=files), remarks=remarks
+    )
 
 
 def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
-    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none its wider study."""
+    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none
+    its wider study.
+    """
     left_out = {"wider"}
     if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
         left_out |= {"scenario", "matrix", "rating"}
@@ -229,13 +273,22 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
             **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides},
         }
         if "vehicle" in changed_keys or "ads" in changed_keys:
-            for key in {"spread", "model_error"} - overrides.keys():  # they concern the parameters of both
+            for key in {
+                "spread",
+                "model_error",
+            } - overrides.keys():  # they concern the parameters of both
                 tables.pop(key, None)
         if "matrix" in changed_keys and "rating" not in overrides:
             tables.pop("rating", None)
-        dropped = [f"[{key}]" for key, value in base.tables.items() if isinstance(value, dict) and key not in tables]
+        dropped = [
+            f"[{key}]"
+            for key, value in base.tables.items()
+            if isinstance(value, dict) and key not in tables
+        ]
         if dropped:
-            differences = " and a different ".join("ADS" if key == "ads" else key for key in changed_keys)
+            differences = " and a different ".join(
+                "ADS" if key == "ads" else key for key in changed_keys
+            )
             of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
             text = f"{source}: has a different {differences} {of_base}"
             remarks = (*remarks, text)
@@ -243,7 +296,9 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
 
 
 def _names_scenario(table: object, base_table: object) -> bool:
-    """Whether a table [scenario] names a file or another model than that of its base, whose matrix is not about it."""
+    """Whether a table [scenario] names a file or another model than that of its base, whose matrix
+    is not about it.
+    """
     if not isinstance(table, dict):
         return False
     base_model = base_table.get("model") if isinstance(base_table, dict) else None
@@ -255,12 +310,14 @@ def _model_and_network(table: object) -> object:
     if not isinstance(table, dict):
         return table
     parameters = table.get("parameters")
-    return table.get("model", table), parameters.get("network") if isinstance(parameters, dict) else None
+    return table.get("model", table), (
+        parameters.get("network") if isinstance(parameters, dict) else None
+    )
 
 
 def _merge(base: Tables, overrides: Tables) -> Parameters:
-    """Override `base` by `overrides`; another `model` or `distribution`, and the tables `WHOLE_TABLES`, replace a whole
-    table.
+    """Override `base` by `overrides`; another `model` or `distribution`, and the tables
+    `WHOLE_TABLES`, replace a whole table.
     """
     result = dict(base)
     for key, value in overrides.items():
@@ -273,13 +330,14 @@ def _refines(key: str, base_value: object, override: object) -> bool:
     if key in WHOLE_TABLES or not (isinstance(base_value, dict) and isinstance(override, dict)):
         return False
     return all(
-        override.get(choice, base_value.get(choice)) == base_value.get(choice) for choice in ("model", "distribution")
+        override.get(choice, base_value.get(choice)) == base_value.get(choice)
+        for choice in ("model", "distribution")
     )
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with `SCHEMA_LINE` and a comment; the study takes the file's name if that
-    is a legal name of a study.
+    """Write a complete study file that begins with `SCHEMA_LINE` and a comment; the study takes the
+    file's name if that is a legal name of a study.
 
     Raises
     ------
@@ -289,9 +347,15 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     if re.fullmatch(NAME_PATTERN, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
     lines = (
-        "".join(character if character.isprintable() else "?" for character in line) for line in comment.splitlines()
+        "".join(character if character.isprintable() else "?" for character in line)
+        for line in comment.splitlines()
     )
-    text = SCHEMA_LINE + "".join(f"# {line}".rstrip() + "\n" for line in lines) + "\n" + tomli_w.dumps(tables_of(study))
+    text = (
+        SCHEMA_LINE
+        + "".join(f"# {line}".rstrip() + "\n" for line in lines)
+        + "\n"
+        + tomli_w.dumps(tables_of(study))
+    )
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
 
@@ -320,7 +384,9 @@ def user_code(study: Study) -> list[tuple[str, str]]:
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
-        "search.algorithms": [name for name in study.search.algorithms if not name.startswith(PYMOO)],
+        "search.algorithms": [
+            name for name in study.search.algorithms if not name.startswith(PYMOO)
+        ],
     }
     fmus = fmus_of(study)
     return [
@@ -341,12 +407,20 @@ def data_files(study: Study) -> dict[str, str]:
     """
     places = study.origin.places or (os.getcwd(),)
     paths = {}
-    for key, table in (("vehicle", study.vehicle), ("ads", study.ads), ("scenario", study.scenario)):
+    for key, table in (
+        ("vehicle", study.vehicle),
+        ("ads", study.ads),
+        ("scenario", study.scenario),
+    ):
         for name in table.files:
-            found = [os.path.abspath(path) for place in places if (path := Path(place, name)).exists()]
+            found = [
+                os.path.abspath(path) for place in places if (path := Path(place, name)).exists()
+            ]
             if not found:
                 problem = f"{key}.files: there is no file {name!r}"
-                raise InputError(study.source, problem, f"the path of a file or folder, relative to {places[0]}")
+                raise InputError(
+                    study.source, problem, f"the path of a file or folder, relative to {places[0]}"
+                )
             paths[name] = found[0]
     if study.scenario.model == MODEL:
         tests = () if study.matrix is None else study.matrix.tests

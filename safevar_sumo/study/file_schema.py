@@ -1,4 +1,6 @@
-"""The JSON schema of study files, for editors. `python -m safevar_sumo.study.file_schema` renews the shipped file."""
+"""The JSON schema of study files, for editors. `python -m safevar_sumo.study.file_schema` renews
+the shipped file.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +11,24 @@ import msgspec
 from safevar_sumo.shipped import STUDY_SCHEMA
 from safevar_sumo.study.schema import Study
 
-EXTENDS = {"type": "string", "description": "The study that this file extends, by its name or the path of its file."}
+EXTENDS = {
+    "type": "string",
+    "description": "The study that this file extends, by its name or the path of its file.",
+}
 FROM_FILE = {
-    "file": {"type": "string", "description": "A file of OpenSCENARIO, in place of model and parameters."},
+    "file": {
+        "type": "string",
+        "description": "A file of OpenSCENARIO, in place of model and parameters.",
+    },
     "ego": {"type": "string", "description": "The vehicle under test in the file, by default Ego."},
     "values": {"type": "object", "description": "Values of the file's parameters."},
 }
 
 
 def schema_text() -> str:
-    """The content of the shipped file: the records' schema, in which a file that extends a study may leave out any key;
-    the tables of algorithms and of a repair's parameters have names of their own.
+    """The content of the shipped file: the records' schema, in which a file that extends a study
+    may leave out any key; the tables of algorithms and of a repair's parameters have names of their
+    own.
     """
     schema = msgspec.json.schema(Study)
     tables = schema["$defs"]

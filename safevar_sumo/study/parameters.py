@@ -15,8 +15,8 @@ from safevar_sumo.study.characteristics import Table
 class FreeParameter(Table, frozen=True, kw_only=True):
     """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.
 
-    The search measures distances of values as differences, or with `log` as ratios, for positive quantities of unknown
-    magnitude.
+    The search measures distances of values as differences, or with `log` as ratios, for positive
+    quantities of unknown magnitude.
     """
 
     lower: float
@@ -31,13 +31,14 @@ def searched(lower: float, upper: float, unit: str, meaning: str) -> Meta:
     `speed: Annotated[float, searched(10, 80, "km/h", "speed of the vehicle")] = 40.0`.
     """
     return Meta(
-        description=meaning, extra={"free": FreeParameter(lower=lower, upper=upper, unit=unit, meaning=meaning)}
+        description=meaning,
+        extra={"free": FreeParameter(lower=lower, upper=upper, unit=unit, meaning=meaning)},
     )
 
 
 def free_parameters(model: type) -> dict[str, FreeParameter]:
-    """The fields of a `msgspec.Struct` or dataclass that are marked by `searched`, or by a `Meta` with the bounds `ge`
-    and `le`, a `description` and `extra={"unit": ...}`.
+    """The fields of a `msgspec.Struct` or dataclass that are marked by `searched`, or by a `Meta`
+    with the bounds `ge` and `le`, a `description` and `extra={"unit": ...}`.
     """
     if not (issubclass(model, msgspec.Struct) or dataclasses.is_dataclass(model)):
         return {}
@@ -49,7 +50,10 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
                 found[name] = extra["free"]
             elif "unit" in extra and meta.ge is not None and meta.le is not None:
                 found[name] = FreeParameter(
-                    lower=float(meta.ge), upper=float(meta.le), unit=extra["unit"], meaning=meta.description or name
+                    lower=float(meta.ge),
+                    upper=float(meta.le),
+                    unit=extra["unit"],
+                    meaning=meta.description or name,
                 )
     return found
 

@@ -1,4 +1,6 @@
-"""`[scenario]` with a `file` of OpenSCENARIO: it becomes the scenario `openscenario`, its domains, and a matrix."""
+"""`[scenario]` with a `file` of OpenSCENARIO: it becomes the scenario `openscenario`, its domains,
+and a matrix.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,16 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, unknown_name, warn
-from safevar_sumo.openscenario import EVERY, Source, constraints_of, open_file, originals, play, read, text_of
+from safevar_sumo.openscenario import (
+    EVERY,
+    Source,
+    constraints_of,
+    open_file,
+    originals,
+    play,
+    read,
+    text_of,
+)
 from safevar_sumo.study.parameters import free_parameters
 from safevar_sumo.study.schema import MatrixTest, Parameters, Weather
 
@@ -32,11 +43,16 @@ def path_of(name: str, places: Sequence[str]) -> str:
         path = Path(place, name)
         if path.is_file():
             return os.path.abspath(path)
-    raise InputError("", f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)")
+    raise InputError(
+        "", f"scenario.file: there is no file {name!r}", "the path of an OpenSCENARIO file (*.xosc)"
+    )
 
 
-def files_of(scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence[str]) -> dict[str, str]:
-    """The paths of all files that a scenario from a file depends on at any point of a matrix, by themselves.
+def files_of(
+    scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence[str]
+) -> dict[str, str]:
+    """The paths of all files that a scenario from a file depends on at any point of a matrix, by
+    themselves.
 
     Texts alone choose catalogs and roads, so points that differ in numbers are read once.
     """
@@ -44,28 +60,40 @@ def files_of(scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence
         return {}
     points = {}
     for test in tests or (MatrixTest(name=""),):
-        axes = [column if any(isinstance(one, str) for one in column) else column[:1] for column in test.over.values()]
+        axes = [
+            column if any(isinstance(one, str) for one in column) else column[:1]
+            for column in test.over.values()
+        ]
         for combination in product(*axes):
-            point = {**scenario, **test.parameters, **dict(zip(test.over, combination, strict=True))}
+            point = {
+                **scenario,
+                **test.parameters,
+                **dict(zip(test.over, combination, strict=True)),
+            }
             texts = frozenset(item for item in point.items() if isinstance(item[1], str))
             points[texts] = point
     files: dict[str, str] = {}
     for point in points.values():
         path = path_of(point["file"], places)
-        given = {name: text_of(value) for name, value in point.items() if name not in ("file", "ego")}
+        given = {
+            name: text_of(value) for name, value in point.items() if name not in ("file", "ego")
+        }
         try:
             document = read(path, given)
         except InputError as error:
-            raise InputError("", f"scenario.file = {point['file']!r}: {error.problem}", error.legal) from None
+            raise InputError(
+                "", f"scenario.file = {point['file']!r}: {error.problem}", error.legal
+            ) from None
         files |= {name: name for name in (path, *document.catalogs, document.road)}
     return files
 
 
 def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
-    """The tables of a study whose scenario names a `file`, with all that the file says in its place.
+    """The tables of a study whose scenario names a `file`, with all that the file says in its
+    place.
 
-    A range that is searched becomes its domain; what is not searched and has several values becomes points of the
-    matrix, without those that the file's constraints exclude.
+    A range that is searched becomes its domain; what is not searched and has several values becomes
+    points of the matrix, without those that the file's constraints exclude.
     """
     scenario = tables.get("scenario")
     if not isinstance(scenario, dict) or "file" not in scenario:
@@ -73,7 +101,9 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
     for key in ("model", "parameters", "files"):
         if scenario.get(key):
             raise InputError(
-                "", f"scenario.{key} beside scenario.file", "one of the two; values stand in [scenario.values]"
+                "",
+                f"scenario.{key} beside scenario.file",
+                "one of the two; values stand in [scenario.values]",
             )
     name = scenario["file"]
     if not isinstance(name, str):
@@ -98,9 +128,16 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     of_file = [*values, *(name for name in search if name not in WEATHER)]
     for name in of_file:
         if name not in offered.values:
-            raise unknown_name("scenario", f"the file declares no parameter {name}", name, offered.values)
-    domains = {name: table if name in WEATHER else _domain(name, table, offered) for name, table in search.items()}
-    fixed = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
+            raise unknown_name(
+                "scenario", f"the file declares no parameter {name}", name, offered.values
+            )
+    domains = {
+        name: table if name in WEATHER else _domain(name, table, offered)
+        for name, table in search.items()
+    }
+    fixed = {
+        name: value if isinstance(value, str) else _plain(value) for name, value in values.items()
+    }
     rest = offered.without({**values, **search})
     parameters = {"file": _relative(offered.concrete, places), **fixed}
     if "ego" in scenario:
@@ -108,18 +145,28 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
     if path != offered.concrete:
         kept["files"] = [_relative(path, places)]  # results depend on it, and a pack has it
-    result = {**tables, "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains}}
+    result = {
+        **tables,
+        "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains},
+    }
     matrix = tables.get("matrix")
-    searched = {name: domain["original"] for name, domain in domains.items() if name in offered.values}
+    searched = {
+        name: domain["original"] for name, domain in domains.items() if name in offered.values
+    }
     has_tests = isinstance(matrix, dict) and bool(matrix.get("tests"))
     points = [{}] if has_tests else _points(rest, {**fixed, **searched})
     if len(points) > 1:
-        points = _playable(offered.concrete, scenario.get("ego", "Ego"), {**fixed, **searched}, points)
+        points = _playable(
+            offered.concrete, scenario.get("ego", "Ego"), {**fixed, **searched}, points
+        )
     if len(points) == 1:
         parameters.update(points[0])
     else:
         name = Path(scenario["file"]).stem
-        tests = [{"name": name, "over": {key: [value] for key, value in point.items()}} for point in points]
+        tests = [
+            {"name": name, "over": {key: [value] for key, value in point.items()}}
+            for point in points
+        ]
         result["matrix"] = {**(matrix or {}), "tests": tests}
     constraints = _constraints(offered, fixed, domains, points)
     if constraints:
@@ -130,28 +177,52 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
 def _domain(name: str, table: object, offered: Source) -> Parameters:
     """The domain of a searched parameter: what the study leaves out comes from the file."""
     if not isinstance(table, dict):
-        raise InputError("scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty")
+        raise InputError(
+            "scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty"
+        )
     numbers = originals(offered)
     ends = offered.range_of(name)
     if name not in numbers:
-        raise InputError("scenario", f"{name} = {offered.values[name]!r} is no number", "a number to search")
+        raise InputError(
+            "scenario", f"{name} = {offered.values[name]!r} is no number", "a number to search"
+        )
     if ends is None and not {"lower", "upper"} <= table.keys():
-        raise InputError("scenario", f"{name} has no range in the file", "lower and upper in [scenario.search]")
+        raise InputError(
+            "scenario", f"{name} has no range in the file", "lower and upper in [scenario.search]"
+        )
     lower, upper = ends or (-np.inf, np.inf)
-    domain = {"unit": "-", "original": numbers[name], "meaning": name, "lower": lower, "upper": upper, **table}
+    domain = {
+        "unit": "-",
+        "original": numbers[name],
+        "meaning": name,
+        "lower": lower,
+        "upper": upper,
+        **table,
+    }
     if all(isinstance(domain[key], int | float) for key in ("lower", "upper", "original")):
         if domain["lower"] < lower or domain["upper"] > upper:
             problem = f"scenario.search.{name}: {domain['lower']:g} to {domain['upper']:g}"
-            raise InputError("scenario", problem, f"a part of the file's range, {lower:g} to {upper:g}")
+            raise InputError(
+                "scenario", problem, f"a part of the file's range, {lower:g} to {upper:g}"
+            )
         if not domain["lower"] <= domain["original"] <= domain["upper"]:
-            problem = f"scenario.search.{name}: the file's value {domain['original']:g} is not in its range"
-            raise InputError("scenario", problem, f"original = a value from {domain['lower']:g} to {domain['upper']:g}")
+            problem = (
+                f"scenario.search.{name}: the file's value {domain['original']:g} is not in its"
+                " range"
+            )
+            raise InputError(
+                "scenario",
+                problem,
+                f"original = a value from {domain['lower']:g} to {domain['upper']:g}",
+            )
     return domain
 
 
 def _points(rest: Source, given: Parameters) -> list[Parameters]:
     """The combinations of all values that nothing else gives."""
-    total = int(np.prod([float(len(choice.sets)) for choice in rest.choices])) if rest.choices else 1
+    total = (
+        int(np.prod([float(len(choice.sets)) for choice in rest.choices])) if rest.choices else 1
+    )
     if total > 50 * MOST_POINTS:
         raise _too_many(rest, total)
     points = []
@@ -160,11 +231,15 @@ def _points(rest: Source, given: Parameters) -> list[Parameters]:
         if len(points) > MOST_POINTS:
             raise _too_many(rest, total)
     if not points:
-        raise InputError("scenario", "the file's constraints exclude every combination of its values")
+        raise InputError(
+            "scenario", "the file's constraints exclude every combination of its values"
+        )
     return points
 
 
-def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameters]) -> list[Parameters]:
+def _playable(
+    file: str, ego: str, given: Parameters, points: Sequence[Parameters]
+) -> list[Parameters]:
     """The points that can be played and at which something happens; a warning names the others.
 
     If nothing happens at any point, all that can be played are kept: they have no verdict.
@@ -175,7 +250,12 @@ def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameter
     for point in points:
         name = " and ".join(f"{name} = {value}" for name, value in point.items())
         try:
-            scene = play(file, {name: text_of(value) for name, value in {**given, **point}.items()}, ego, EVERY)
+            scene = play(
+                file,
+                {name: text_of(value) for name, value in {**given, **point}.items()},
+                ego,
+                EVERY,
+            )
             problems[name] = scene.uneventful
             playable[name] = point
         except InputError as error:
@@ -196,9 +276,13 @@ def _playable(file: str, ego: str, given: Parameters, points: Sequence[Parameter
 
 
 def _too_many(rest: Source, total: int) -> InputError:
-    sizes = ", ".join(f"{' and '.join(choice.names)} ({len(choice.sets)})" for choice in rest.choices)
+    sizes = ", ".join(
+        f"{' and '.join(choice.names)} ({len(choice.sets)})" for choice in rest.choices
+    )
     legal = "parameters under [scenario.search] or [scenario.values], so that fewer are left"
-    return InputError("scenario", f"{total:,} combinations of {sizes}; at most {MOST_POINTS:,}", legal)
+    return InputError(
+        "scenario", f"{total:,} combinations of {sizes}; at most {MOST_POINTS:,}", legal
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -214,7 +298,9 @@ def _plain(value: Any) -> Any:
 
 def _relative(path: str, places: Sequence[str]) -> str:
     """A path as it is from the folder of the study."""
-    return os.path.relpath(path, places[0]) if places and path.startswith(places[0] + os.sep) else path
+    return (
+        os.path.relpath(path, places[0]) if places and path.startswith(places[0] + os.sep) else path
+    )
 
 
 def _constraints(
@@ -230,7 +316,9 @@ def _constraints(
     for point in points:
         given = {name: text_of(value) for name, value in {**fixed, **point}.items()}
         for bound in constraints_of(offered.concrete, given, names, low, high):
-            weights = {name: weight for name, weight in zip(names, bound.weights, strict=True) if weight}
+            weights = {
+                name: weight for name, weight in zip(names, bound.weights, strict=True) if weight
+            }
             table = {"sum": weights, bound.kind: bound.limit, "unit": "-", "meaning": bound.text}
             different[repr(table)] = table
     return [*different.values()]

@@ -35,14 +35,19 @@ Tables = Mapping[str, Any]
 """A study's tables, as in a file."""
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 Name = Annotated[
-    str, Meta(pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit")
+    str,
+    Meta(
+        pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit"
+    ),
 ]
 SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 """Prefixes of the parameters that may stand in [spread]."""
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the safety degree."""
 ORIGINAL_DEGREE: Final = "original_safety_degree"
-"""Column of the original vehicle's safety degree in the same encounter, in a study that searches its scenario."""
+"""Column of the original vehicle's safety degree in the same encounter, in a study that searches
+its scenario.
+"""
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
 DESCRIPTION_KEYS = ("meaning", "counterpart")
@@ -52,9 +57,10 @@ DESCRIPTION_KEYS = ("meaning", "counterpart")
 class ModelTable(Table, frozen=True, kw_only=True):
     """A `model` by its name, or by `package.module:Name`, and its `parameters`.
 
-    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu` is an FMU, named by
-    its path: `inputs` and `outputs` are the FMU's variables by the quantity they receive or return. `files` are data
-    files, or folders of them, that a model of your own reads, relative to the study's file.
+    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu`
+    is an FMU, named by its path: `inputs` and `outputs` are the FMU's variables by the quantity
+    they receive or return. `files` are data files, or folders of them, that a model of your own
+    reads, relative to the study's file.
     """
 
     model: str
@@ -66,19 +72,25 @@ class ModelTable(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.kind != "fmu" and (self.inputs or self.outputs):
-            raise mistake(f"{self.model!r} is no FMU, but has inputs or outputs", 'kind = "fmu", or no such keys')
+            raise mistake(
+                f"{self.model!r} is no FMU, but has inputs or outputs",
+                'kind = "fmu", or no such keys',
+            )
 
 
 ORIGINAL_MARGIN = 0.3
-"""Distance that the original vehicle must keep in an encounter that is searched, unless the study says another [m]."""
+"""Distance that the original vehicle must keep in an encounter that is searched, unless the study
+says another [m].
+"""
 
 
 class ScenarioTable(ModelTable, frozen=True, kw_only=True):
-    """The scenario: its `model` and `parameters`; and those of its parameters, and of the weather's, that are searched
-    together with the vehicle, under `search` by name.
+    """The scenario: its `model` and `parameters`; and those of its parameters, and of the
+    weather's, that are searched together with the vehicle, under `search` by name.
 
-    The original vehicle drives in the same encounter as each variant, and must keep at least `margin` [m] between
-    bodies there: otherwise the encounter does not count, as it shows nothing of the variant.
+    The original vehicle drives in the same encounter as each variant, and must keep at least
+    `margin` [m] between bodies there: otherwise the encounter does not count, as it shows nothing
+    of the variant.
     """
 
     search: dict[str, Domain] = {}
@@ -87,14 +99,17 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.margin != ORIGINAL_MARGIN and not self.search:
             raise mistake(
-                f"margin = {self.margin:g}, and nothing is searched", "a table search beside it, or no margin"
+                f"margin = {self.margin:g}, and nothing is searched",
+                "a table search beside it, or no margin",
             )
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):
-    """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that vary.
+    """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that
+    vary.
 
-    `files` are data files, or folders of them, that a model of your own reads, relative to the study's file.
+    `files` are data files, or folders of them, that a model of your own reads, relative to the
+    study's file.
     """
 
     model: str
@@ -106,22 +121,28 @@ class VehicleTable(Table, frozen=True, kw_only=True):
 class Weather(Table, frozen=True, kw_only=True):
     """Weather as data: its `name`, and its effects on the road and on the sensors.
 
-    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its depth on the road
-    [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as the grip of the same road when dry.
-    `recognition_delay` is the additional time that the sensors need to recognise a road user [s], for every ADS; the
-    reaction time of an ADS is one of its parameters. `light` decides only whether a rating darkens the weather for its
-    tests by night.
+    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its
+    depth on the road [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as
+    the grip of the same road when dry. `recognition_delay` is the additional time that the sensors
+    need to recognise a road user [s], for every ADS; the reaction time of an ADS is one of its
+    parameters. `light` decides only whether a rating darkens the weather for its tests by night.
     """
 
     name: str
     road_friction: Annotated[
-        float, Meta(gt=0, le=1.5), searched(0.1, 1.2, "-", "road friction, factor on the tyres' friction")
+        float,
+        Meta(gt=0, le=1.5),
+        searched(0.1, 1.2, "-", "road friction, factor on the tyres' friction"),
     ]
     visibility: Annotated[
-        float, Meta(gt=0, le=1.5), searched(0.05, 1.5, "-", "visibility, factor on the range of the sensors")
+        float,
+        Meta(gt=0, le=1.5),
+        searched(0.05, 1.5, "-", "visibility, factor on the range of the sensors"),
     ]
     recognition_delay: Annotated[
-        float, Meta(ge=0, le=5), searched(0.0, 2.0, "s", "additional time that the sensors need in this weather")
+        float,
+        Meta(ge=0, le=5),
+        searched(0.0, 2.0, "s", "additional time that the sensors need in this weather"),
     ] = 0.0
     light: Literal["day", "night"] = "day"
     water: Annotated[float, Meta(ge=0, le=20)] = 0.0
@@ -130,10 +151,10 @@ class Weather(Table, frozen=True, kw_only=True):
 class MetricsTable(Table, frozen=True, kw_only=True):
     """Thresholds of the safety metrics.
 
-    `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that
-    TET, TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the step).
-    `also` names further metrics: metrics of the package, such as `max_jerk`, or users' metrics as
-    `package.module:Name`.
+    `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that TET,
+    TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the
+    step). `also` names further metrics: metrics of the package, such as `max_jerk`, or users'
+    metrics as `package.module:Name`.
     """
 
     ttc_threshold: PositiveNumber
@@ -146,12 +167,12 @@ class MetricsTable(Table, frozen=True, kw_only=True):
 
 
 class SearchTable(Table, frozen=True, kw_only=True):
-    """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in generations of
-    `population`; `seed` is the seed of all random numbers.
+    """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in
+    generations of `population`; `seed` is the seed of all random numbers.
 
-    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises `objectives`, and drives
-    metrics in their unsafe direction. `parameters` hold the parameters of algorithms by name or label; a file has them
-    in tables such as [search.nsga2].
+    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises
+    `objectives`, and drives metrics in their unsafe direction. `parameters` hold the parameters of
+    algorithms by name or label; a file has them in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1)]
@@ -176,16 +197,20 @@ PYMOO = "pymoo:"
 
 
 def label_of(algorithm: str) -> str:
-    """Label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, the Name of any other `package.module:Name`."""
-    return algorithm.replace(":", "_") if algorithm.startswith(PYMOO) else algorithm.rpartition(":")[2]
+    """Label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, the Name of any other
+    `package.module:Name`.
+    """
+    return (
+        algorithm.replace(":", "_") if algorithm.startswith(PYMOO) else algorithm.rpartition(":")[2]
+    )
 
 
 class MatrixTest(Table, frozen=True, kw_only=True):
-    """A test of a matrix: its `name`, and a scenario at every combination of the values in `over`, in each of the
-    `weathers`.
+    """A test of a matrix: its `name`, and a scenario at every combination of the values in `over`,
+    in each of the `weathers`.
 
-    `parameters` are added to those of the study's scenario; a test with a `model` of its own has only its own
-    parameters. A weather is a name or a table.
+    `parameters` are added to those of the study's scenario; a test with a `model` of its own has
+    only its own parameters. A weather is a name or a table.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -200,20 +225,20 @@ class MatrixTest(Table, frozen=True, kw_only=True):
 
 
 class RatingTable(Table, frozen=True, kw_only=True):
-    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be simulated here, such
-    as glare.
+    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be
+    simulated here, such as glare.
     """
 
     claims: dict[str, list[str]] = {}
 
 
 class MatrixTable(Table, frozen=True, kw_only=True):
-    """The test points at which every setting is simulated: those of `tests`, or all cells of a `protocol`, which then
-    rates every setting.
+    """The test points at which every setting is simulated: those of `tests`, or all cells of a
+    `protocol`, which then rates every setting.
 
-    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree, `drac >` at that
-    with the largest value of this metric, `ttc_min <` with the smallest. With a `point`, by its name, only this one is
-    simulated, and nothing is rated.
+    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree,
+    `drac >` at that with the largest value of this metric, `ttc_min <` with the smallest. With a
+    `point`, by its name, only this one is simulated, and nothing is rated.
     """
 
     tests: list[MatrixTest] = []
@@ -223,15 +248,18 @@ class MatrixTable(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if bool(self.tests) == bool(self.protocol):
-            raise mistake(f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol")
+            raise mistake(
+                f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
+            )
 
 
 class RepairTable(Table, frozen=True, kw_only=True):
     """What a repair of the ADS may change and has to keep.
 
-    `parameters` may change, by name; a file has them directly under [repair]. Without any, those that come with a
-    shipped ADS may change. `promise` holds limits by characteristic that the user promises to keep, or is "all" for the
-    whole domain; by default the study's limits. `benign` are tests in which nobody needs to brake.
+    `parameters` may change, by name; a file has them directly under [repair]. Without any, those
+    that come with a shipped ADS may change. `promise` holds limits by characteristic that the user
+    promises to keep, or is "all" for the whole domain; by default the study's limits. `benign` are
+    tests in which nobody needs to brake.
     """
 
     parameters: dict[str, FreeParameter] = {}
@@ -242,10 +270,10 @@ class RepairTable(Table, frozen=True, kw_only=True):
 class Origin(Table, frozen=True, kw_only=True):
     """Where a study comes from; results do not depend on it.
 
-    `called` is the study's path as given on the command line, empty if the study was given by its name; `point` is the
-    point of the matrix to which the study was reduced, empty for a whole study; `places` are the folders of its file
-    and of the files that it extends, where user code is looked up first; `files` are those of these files that are not
-    shipped.
+    `called` is the study's path as given on the command line, empty if the study was given by its
+    name; `point` is the point of the matrix to which the study was reduced, empty for a whole
+    study; `places` are the folders of its file and of the files that it extends, where user code is
+    looked up first; `files` are those of these files that are not shipped.
     """
 
     called: str = ""
@@ -257,23 +285,24 @@ class Origin(Table, frozen=True, kw_only=True):
 class Study(Table, frozen=True, kw_only=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
-    `title` is its heading, `weather` a shipped weather by its name, or a table;
-    `matrix` are the test points at which the study is simulated, if there are several;
-    `rating` are the user's claims for a rating;
-    `step_length` is the simulation's time step [s], by default the time step in the network's options;
-    `published` are the original vehicle's metrics in the published study, by name, as far as known;
-    `repeatability` are standard deviations of repeats of one setting in the published study;
-    `spread` are sets of values of parameters, by their keys in the file, such as `ads.parameters.corridor`, that fit
-    the published data equally well, a list for each parameter, the study's own value first; `model_error` is the
-    model's further error, by metric, for a vehicle that differs from the original by the full width of a domain;
-    `variation` and `correlations` state how characteristics vary in the world, by name: uniformly by default;
-    `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits` are the values, by
-    name, up to which characteristics may wear in service; `repair` states what a repair of the ADS may change;
-    `wider` names a study of the same vehicle in a wider scope, in which limits are tried as well.
+    `title` is its heading, `weather` a shipped weather by its name, or a table; `matrix` are the
+    test points at which the study is simulated, if there are several; `rating` are the user's
+    claims for a rating; `step_length` is the simulation's time step [s], by default the time step
+    in the network's options; `published` are the original vehicle's metrics in the published study,
+    by name, as far as known; `repeatability` are standard deviations of repeats of one setting in
+    the published study; `spread` are sets of values of parameters, by their keys in the file, such
+    as `ads.parameters.corridor`, that fit the published data equally well, a list for each
+    parameter, the study's own value first; `model_error` is the model's further error, by metric,
+    for a vehicle that differs from the original by the full width of a domain; `variation` and
+    `correlations` state how characteristics vary in the world, by name: uniformly by default;
+    `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits`
+    are the values, by name, up to which characteristics may wear in service; `repair` states what a
+    repair of the ADS may change; `wider` names a study of the same vehicle in a wider scope, in
+    which limits are tried as well.
     """
 
-    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS of
-    # results/manifest.py. Any other new key becomes part of the identity of results.
+    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS
+    # of results/manifest.py. Any other new key becomes part of the identity of results.
     name: Name
     title: str
     scenario: ScenarioTable
@@ -302,12 +331,16 @@ class Study(Table, frozen=True, kw_only=True):
         if not rows:
             raise InputError("", "vehicle.characteristics: none", "at least one")
         if self.scenario.kind:
-            raise InputError("", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU")
+            raise InputError(
+                "", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU"
+            )
         self._check_search()
         check_variation(self.domains, self.variation, self.correlations)
         check_constraints(self.domains, self.constraints)
         check_limits(rows, self.limits, table="limits.")
-        if len({len(values) for values in self.spread.values()}) > 1 or not all(self.spread.values()):
+        if len({len(values) for values in self.spread.values()}) > 1 or not all(
+            self.spread.values()
+        ):
             problem = "spread: its lists differ in length or are empty"
             raise InputError("", problem, "a list for each parameter, all of one length")
         if 0 in self.published.values():
@@ -319,13 +352,19 @@ class Study(Table, frozen=True, kw_only=True):
         for name in self.scenario.search:
             key = f"scenario.search.{name}"
             if self.matrix is not None and self.matrix.protocol:
-                raise InputError("", f"{key}: the cells of {self.matrix.protocol} are fixed", "matrix.tests")
+                raise InputError(
+                    "", f"{key}: the cells of {self.matrix.protocol} are fixed", "matrix.tests"
+                )
             if name in self.vehicle.characteristics:
-                raise InputError("", f"{key}: a characteristic of the vehicle has this name", "a unique name")
+                raise InputError(
+                    "", f"{key}: a characteristic of the vehicle has this name", "a unique name"
+                )
             if name in self.scenario.parameters:
                 value = self.scenario.parameters[name]
                 legal = "one of the two: a value, or a domain"
-                raise InputError("", f"{key}: scenario.parameters.{name} = {value!r} fixes it", legal)
+                raise InputError(
+                    "", f"{key}: scenario.parameters.{name} = {value!r} fixes it", legal
+                )
             for test in tests:
                 if name in (*test.parameters, *test.over):
                     problem = f"{key}: test {test.name!r} of the matrix sets {name}, too"
@@ -343,7 +382,9 @@ class Study(Table, frozen=True, kw_only=True):
 
 
 def tables_of(study: Study) -> Parameters:
-    """A study as plain tables as in a file, without its origin and without keys that have their default values."""
+    """A study as plain tables as in a file, without its origin and without keys that have their
+    default values.
+    """
     tables: Parameters = _without_defaults(study)
     tables.pop("origin", None)
     return tables
@@ -360,7 +401,9 @@ def _without_defaults(value: Any) -> Any:
     table = {} if config.tag_field is None else {config.tag_field: config.tag}
     for field in msgspec.structs.fields(value):
         inner = getattr(value, field.name)
-        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        default = (
+            field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        )
         if inner != default:
             table[field.name] = _without_defaults(inner)
     return table
@@ -382,16 +425,23 @@ def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
         key_or_index = _key_or_index(table, last)
         is_number = isinstance(table[key_or_index], int | float)
     except (KeyError, IndexError, ValueError, TypeError):
-        is_number = path[:1] == ["weather"] and isinstance(tables["weather"], str)  # a shipped one, looked up later
+        is_number = path[:1] == ["weather"] and isinstance(
+            tables["weather"], str
+        )  # a shipped one, looked up later
         key_or_index = last
     if not (is_number and name.startswith(SPREAD_TABLES)):
-        expected = f"a number that is given under {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
+        expected = (
+            "a number that is given under"
+            f" {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
+        )
         raise InputError("", f"spread.{name!r} is no parameter of the study", expected)
     return table, key_or_index
 
 
 def _key_or_index(table: Any, name: str) -> int | str:
-    """The key in a table, or the index in a list; an index has one spelling, so that each parameter has one name."""
+    """The key in a table, or the index in a list; an index has one spelling, so that each parameter
+    has one name.
+    """
     return int(name) if isinstance(table, list) and name == str(int(name)) else name
 
 

@@ -1,4 +1,5 @@
-"""Converts tables to records: the first mistake with its path, the value, what is expected, and the nearest key.
+"""Converts tables to records: the first mistake with its path, the value, what is expected, and the
+nearest key.
 
 Checks within a record, and between records, stand in `__post_init__` of the records.
 """
@@ -71,7 +72,11 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
         return _unknown_key(_path_text([*path, field[1]]), field[1], kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):
-        known = [name for name, other in siblings.items() if isinstance(other, dict) and field[1] in other]
+        known = [
+            name
+            for name, other in siblings.items()
+            if isinstance(other, dict) and field[1] in other
+        ]
         hint = did_you_mean(path[-1], known) if path else ""  # a mistyped table is a new one
         needed = ", ".join(one.name for one in msgspec.structs.fields(kind) if one.required)
         legal = f"{needed} for what is new here" + (f"; else {', '.join(known)}" if known else "")
@@ -83,23 +88,32 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
         return unknown_name("", f"{text} = {quoted}", value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
         if expected[1] == "`object`" and _is_record(kind):
-            return InputError("", f"{text} = {quoted}", f"a table of {', '.join(kind.__struct_fields__)}")
+            return InputError(
+                "", f"{text} = {quoted}", f"a table of {', '.join(kind.__struct_fields__)}"
+            )
         for meta in getattr(kinds[-1], "__metadata__", ()):
             if meta.pattern and meta.description:
                 return InputError("", f"{text} = {quoted}", meta.description)
-        legal = re.sub(r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected[1])
+        legal = re.sub(
+            r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected[1]
+        )
         return InputError("", f"{text} = {quoted}", legal.replace("`", "").replace(" | ", " or "))
     problem, _, legal = problem.partition("\n")  # of a `__post_init__`
     return InputError("", f"{text}: {problem}".removeprefix(": "), legal)
 
 
 def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
-    """The error for an unknown key, with the nearest key of its own table, or of another table in the whole one."""
+    """The error for an unknown key, with the nearest key of its own table, or of another table in
+    the whole one.
+    """
     own = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = dict[str, str]()
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
-            places |= {inner: f"{field.name}.{inner}" for inner in getattr(field.type, "__struct_fields__", ())}
+            places |= {
+                inner: f"{field.name}.{inner}"
+                for inner in getattr(field.type, "__struct_fields__", ())
+            }
     places |= {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
@@ -112,7 +126,11 @@ def _meant(kind: Any, value: Any) -> Any:
         return _meant(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    kinds = [one for one in get_args(kind) if one is not NoneType and _is_table(one) == isinstance(value, dict)]
+    kinds = [
+        one
+        for one in get_args(kind)
+        if one is not NoneType and _is_table(one) == isinstance(value, dict)
+    ]
     for one in filter(_is_record, kinds):
         config = one.__struct_config__
         if value.get(config.tag_field or "") == config.tag:
@@ -131,12 +149,16 @@ def _is_record(kind: Any) -> bool:
 def _inner_type(kind: Any, name: str) -> Any:
     """The type of a record's field, or of the elements of a list or table."""
     if _is_record(kind):
-        return next((field.type for field in msgspec.structs.fields(kind) if field.encode_name == name), Any)
+        return next(
+            (field.type for field in msgspec.structs.fields(kind) if field.encode_name == name), Any
+        )
     return (get_args(kind) or [Any])[-1]
 
 
 def _wrong_key(value: Mapping[str, Any], kind: Any) -> str:
-    """The first key of a table by names whose value cannot be converted; msgspec does not tell it."""
+    """The first key of a table by names whose value cannot be converted; msgspec does not tell
+    it.
+    """
     for key, inner in value.items():
         try:
             msgspec.convert(inner, kind)
@@ -151,7 +173,9 @@ def _path_text(path: Sequence[str | int]) -> str:
         if isinstance(key, int):
             text += f"[{key}]"
         else:
-            text += ("." if text else "") + (repr(key) if ("." in key and text) or not key.isprintable() else key)
+            text += ("." if text else "") + (
+                repr(key) if ("." in key and text) or not key.isprintable() else key
+            )
     return text
 
 

@@ -1,4 +1,6 @@
-"""Simulates and scores many settings at once, in recorded scenes or in copies of a network in SUMO."""
+"""Simulates and scores many settings at once, in recorded scenes or in copies of a network in
+SUMO.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
             if measure.of == "settings":
                 metrics[name] = measure.function(settings, system.characteristics)
             else:
-                metrics[name] = np.where(is_invalid, np.nan, measure.function(runs, system.metrics_table))
+                metrics[name] = np.where(
+                    is_invalid, np.nan, measure.function(runs, system.metrics_table)
+                )
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
@@ -49,7 +53,9 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
 
 
 def reason_for_sumo(system: System) -> str:
-    """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded scenes suffice."""
+    """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded
+    scenes suffice.
+    """
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
@@ -65,13 +71,16 @@ def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
 
 
 def drive_all(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, listen: Listener | None = None
+    system: System,
+    settings: FloatArray,
+    engine: Engine = Engine.RECORDED,
+    listen: Listener | None = None,
 ) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
-    The result holds the runs at the first point, then the runs at the second point, and so on. Several points must have
-    scenarios of tracks; SUMO simulates only one point at once. `listen` is called with what the ADS observes
-    at every sample.
+    The result holds the runs at the first point, then the runs at the second point, and so on.
+    Several points must have scenarios of tracks; SUMO simulates only one point at once. `listen` is
+    called with what the ADS observes at every sample.
 
     Raises
     ------
@@ -87,7 +96,9 @@ def drive_all(
         stage = stage_of(system, settings)
         if not is_recorded(system, engine):
             with open_points_world(system, settings, stage) as sumo_world:
-                return drive(on_road, vehicles, sumo_world, observer_of(scenario, sumo_world, stage), listen)
+                return drive(
+                    on_road, vehicles, sumo_world, observer_of(scenario, sumo_world, stage), listen
+                )
         if stage is not None:
             lane = LaneWorld(stage, _start_speeds(on_road.points, len(settings)), stage.step)
             return drive(on_road, np.tile(vehicles, (len(system.points), 1)), lane, stage, listen)
@@ -96,8 +107,8 @@ def drive_all(
 
 
 def _recorded_world(system: System, settings: FloatArray, encounters: Scenario) -> RecordedWorld:
-    """The recorded scene of the system's only point for N settings, shape (N, n); a scene for each of its `encounters`
-    if the study searches them.
+    """The recorded scene of the system's only point for N settings, shape (N, n); a scene for each
+    of its `encounters` if the study searches them.
     """
     (point,) = system.points
     assert isinstance(point.scenario, WorldScenario)
@@ -120,12 +131,18 @@ def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> O
 
 
 def stage_of(system: System, settings: FloatArray) -> Stage | None:
-    """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a world itself."""
-    scenarios = [point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)]
+    """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a
+    world itself.
+    """
+    scenarios = [
+        point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)
+    ]
     if len(scenarios) < len(system.points):
         return None
     group = np.repeat(np.arange(len(scenarios)), len(settings))
-    if len(system.characteristics.scenario):  # an encounter that several vehicles meet is there once
+    if len(
+        system.characteristics.scenario
+    ):  # an encounter that several vehicles meet is there once
         encounters = settings[:, ~system.characteristics.of_vehicle]
         _, first, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
         if len(first) == len(settings):
@@ -142,11 +159,15 @@ def stage_of(system: System, settings: FloatArray) -> Stage | None:
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     """The speeds at the start of n vehicles at each point."""
     scenarios = (point.scenario for point in points)
-    return np.concatenate([np.zeros(n) + one.start_speed for one in scenarios if isinstance(one, TrackScenario)])
+    return np.concatenate(
+        [np.zeros(n) + one.start_speed for one in scenarios if isinstance(one, TrackScenario)]
+    )
 
 
 def _vehicles_per_encounter(encounters: FloatArray) -> int:
-    """How many vehicles in a row meet the same encounter: 2 if a variant and the original take turns, else 1."""
+    """How many vehicles in a row meet the same encounter: 2 if a variant and the original take
+    turns, else 1.
+    """
     is_paired = len(encounters) % 2 == 0 and np.array_equal(encounters[::2], encounters[1::2])
     return 2 if is_paired else 1
 
@@ -154,7 +175,9 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 def open_points_world(
     system: System, settings: FloatArray, stage: Stage | None, start: Start = open_in_process
 ) -> AbstractContextManager[SumoWorld]:
-    """Start SUMO on a copy of the network of the system's only point for each of N settings, shape (N, n)."""
+    """Start SUMO on a copy of the network of the system's only point for each of N settings, shape
+    (N, n).
+    """
     (point,) = system.points
     step = system.scenes.step
     n = len(settings)
@@ -162,12 +185,16 @@ def open_points_world(
     scenarios = [point.scenario]
     if len(encounters):
         rows = settings[:, ~system.characteristics.of_vehicle].tolist()
-        scenarios = [encounter(point, dict(zip(encounters.names, row, strict=True))).scenario for row in rows]
+        scenarios = [
+            encounter(point, dict(zip(encounters.names, row, strict=True))).scenario for row in rows
+        ]
     networks = stage_networks(scenarios)
     create: Callable[[Api, int], SumoWorld] = SumoWorld
     if stage is not None:
         speeds = _start_speeds(system.at_encounters(settings)[0].points, n)
-        create = partial(StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step))
+        create = partial(
+            StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step)
+        )
     if len(encounters):
         return open_varied_world(networks, step, create, start)
     return open_world(copied_network(networks[0], n), n, step, create, start)

@@ -1,4 +1,6 @@
-"""How vehicles under test move, as a world answers it; bodies as rectangles, and where they touch first."""
+"""How vehicles under test move, as a world answers it; bodies as rectangles, and where they touch
+first.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import TOUCH_OVERLAP, ZERO, BoolArray, Contact, FloatArray, IntArray, Quantity
+from safevar_sumo.records import (
+    TOUCH_OVERLAP,
+    ZERO,
+    BoolArray,
+    Contact,
+    FloatArray,
+    IntArray,
+    Quantity,
+)
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World as ScenariosWorld
@@ -18,9 +28,9 @@ from safevar_sumo.vehicles import SumoType
 
 
 class Motion(NamedTuple):
-    """Where N vehicles under test are: their front bumpers, shape (N, 2) [m], their speeds, shape (N,) [m/s], and the
-    speeds of those that hit somebody in this step, by vehicle number. Vehicles whose runs have ended keep their last
-    values.
+    """Where N vehicles under test are: their front bumpers, shape (N, 2) [m], their speeds, shape
+    (N,) [m/s], and the speeds of those that hit somebody in this step, by vehicle number. Vehicles
+    whose runs have ended keep their last values.
     """
 
     fronts: FloatArray
@@ -29,8 +39,8 @@ class Motion(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its direction, a unit vector,
-    `drift` its speed to the left of it.
+    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its
+    direction, a unit vector, `drift` its speed to the left of it.
     """
 
     middle: FloatArray
@@ -42,7 +52,12 @@ class Body(NamedTuple):
 
     @classmethod
     def behind(
-        cls, front: FloatArray, along: FloatArray, length: Quantity, width: Quantity, speed: FloatArray | float
+        cls,
+        front: FloatArray,
+        along: FloatArray,
+        length: Quantity,
+        width: Quantity,
+        speed: FloatArray | float,
     ) -> Body:
         """The body whose front's middle is at `front`, or M such bodies."""
         middle = front - along * (np.asarray(length)[..., np.newaxis] / 2)
@@ -52,16 +67,24 @@ class Body(NamedTuple):
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
         left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-        return np.asarray(self.along * self.speed[:, np.newaxis] + left * np.asarray(self.drift)[..., np.newaxis])
+        return np.asarray(
+            self.along * self.speed[:, np.newaxis] + left * np.asarray(self.drift)[..., np.newaxis]
+        )
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
-        """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape (M,)."""
-        return cls._make(np.array([body[column] for body in bodies]) for column in range(len(cls._fields)))
+        """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape
+        (M,).
+        """
+        return cls._make(
+            np.array([body[column] for body in bodies]) for column in range(len(cls._fields))
+        )
 
 
 class BodyPairs(NamedTuple):
-    """M pairs of bodies: numbers of the vehicles under test, shape (M,), their bodies and the others, in columns."""
+    """M pairs of bodies: numbers of the vehicles under test, shape (M,), their bodies and the
+    others, in columns.
+    """
 
     vehicles: IntArray
     own: Body
@@ -77,8 +100,8 @@ def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) 
 
 
 class Film(NamedTuple):
-    """How an actor moves: at every sample the position of its front bumper, or of a person [m], its direction, a unit
-    vector, and its speed [m/s]; shape (T, 5), or (T, N, 5) in N copies.
+    """How an actor moves: at every sample the position of its front bumper, or of a person [m], its
+    direction, a unit vector, and its speed [m/s]; shape (T, 5), or (T, N, 5) in N copies.
 
     Values are NaN while the actor is not on the road; `length` and `width` are in m.
     """
@@ -115,12 +138,14 @@ class World(Protocol):
     def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
         """Put the vehicles onto the road and return their first motion; called once, first.
 
-        Without `types` any speed is possible. With `keeps_drivers` SUMO's drivers keep the decelerations that the
-        traffic file gives them.
+        Without `types` any speed is possible. With `keeps_drivers` SUMO's drivers keep the
+        decelerations that the traffic file gives them.
         """
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
-        """Simulate a step in which the vehicles whose runs are open reach `speeds` [m/s], shape (N,)."""
+        """Simulate a step in which the vehicles whose runs are open reach `speeds` [m/s], shape
+        (N,).
+        """
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         """Vehicles that hit somebody in this step, each with the body that it hit."""
@@ -134,7 +159,9 @@ class World(Protocol):
 
 
 class SceneWorld(World, ScenariosWorld, Protocol):
-    """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as theirs."""
+    """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as
+    theirs.
+    """
 
     def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""
@@ -144,15 +171,15 @@ class SceneWorld(World, ScenariosWorld, Protocol):
 
 
 TOUCH = 1e-3
-"""Overlap up to which bodies only touch [m], as in SUMO: an impact that is due exactly at a sample must not depend on
-the last bit.
+"""Overlap up to which bodies only touch [m], as in SUMO: an impact that is due exactly at a sample
+must not depend on the last bit.
 """
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 COSINE_DECIMALS = 9
 """Decimals of a cosine between directions, which SUMO states in degrees."""
 COLLISION_PLACES = (
-    "vehicles in the lane of the vehicle under test or on a junction, persons on a crossing or in a network without "
-    "junctions: elsewhere SUMO looks for no collisions"
+    "vehicles in the lane of the vehicle under test or on a junction, persons on a crossing or in a"
+    " network without junctions: elsewhere SUMO looks for no collisions"
 )
 
 
@@ -168,18 +195,25 @@ class Contacts:
         self.first = Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n))
 
     def count(self, world: World, hits: Mapping[int, float], scene: Scene) -> dict[int, float]:
-        """Process the hits of one sample; returns those that are collisions: speeds [m/s] by vehicle number."""
+        """Process the hits of one sample; returns those that are collisions: speeds [m/s] by
+        vehicle number.
+        """
         new_copies = [copy for copy in hits if not self.first.side[copy]]
         if new_copies:
             self._locate(world.bodies(new_copies), scene)
         side = self.first.side
-        return {copy: speed for copy, speed in hits.items() if not self._is_tested[copy] or side[copy] == FRONT}
+        return {
+            copy: speed
+            for copy, speed in hits.items()
+            if not self._is_tested[copy] or side[copy] == FRONT
+        }
 
     def check(self, world: SceneWorld, scene: Scene, is_open: BoolArray, time: float) -> None:
-        """Refuse a scene in which the front of an open run's vehicle drives into a body and no collision is reported.
+        """Refuse a scene in which the front of an open run's vehicle drives into a body and no
+        collision is reported.
 
-        To be called at every sample, after `count`. A body that comes into the vehicle from the side is none in its
-        path.
+        To be called at every sample, after `count`. A body that comes into the vehicle from the
+        side is none in its path.
 
         Raises
         ------
@@ -197,8 +231,15 @@ class Contacts:
         depth = find_overlaps(around.own, around.other)
         is_missed = (depth > TOUCH_OVERLAP) & (find_touches(around.own, around.other).side == FRONT)
         if is_missed.any():
-            inside = f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a body"
-            raise InputError(NETWORK_KEY, f"at {time:g} s {inside}, and SUMO reports no collision", COLLISION_PLACES)
+            inside = (
+                f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a"
+                " body"
+            )
+            raise InputError(
+                NETWORK_KEY,
+                f"at {time:g} s {inside}, and SUMO reports no collision",
+                COLLISION_PLACES,
+            )
 
     def _locate(self, pairs: BodyPairs, scene: Scene) -> None:
         copies, own, other = pairs
@@ -208,13 +249,16 @@ class Contacts:
         is_at_end = (touches.side == FRONT) | (touches.side == REAR)
         share = np.where(is_at_end, lateral / own.width + 0.5, touches.behind_front / own.length)
         self.first.side[copies] = touches.side
-        self.first.speed[copies] = other.speed * np.round((own.along * other.along).sum(axis=1), COSINE_DECIMALS)
+        self.first.speed[copies] = other.speed * np.round(
+            (own.along * other.along).sum(axis=1), COSINE_DECIMALS
+        )
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
 
 def distance_between(body: Track, middle: FloatArray, length: float, width: float) -> FloatArray:
-    """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles at `middle`: the
-    least distance of a corner of either rectangle to the other one; 0 if they overlap.
+    """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles
+    at `middle`: the least distance of a corner of either rectangle to the other one; 0 if they
+    overlap.
     """
     squares = [_square_outside(x - middle, y, length, width) for x, y in corners_of(body)]
     # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
@@ -253,8 +297,8 @@ def _square_outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity)
 
 
 class Touches(NamedTuple):
-    """First touches of M vehicles: the touched side, the time since then [s], and how far the other body's middle was
-    then behind the vehicle's front [m].
+    """First touches of M vehicles: the touched side, the time since then [s], and how far the other
+    body's middle was then behind the vehicle's front [m].
     """
 
     side: npt.NDArray[np.str_]
@@ -263,13 +307,14 @@ class Touches(NamedTuple):
 
 
 def find_touches(own: Body, other: Body) -> Touches:
-    """The first touches of M overlapping pairs, a vehicle's own body and another, if their velocities were constant.
+    """The first touches of M overlapping pairs, a vehicle's own body and another, if their
+    velocities were constant.
 
-    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l' |cos a| + w' |sin
-    a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If their middles are x apart in such a
-    direction and approach each other at v, the overlap in it began (r - |x|) / v ago. The bodies touched in the
-    direction in which the overlap began last, or, if they approach each other in neither direction, in the one with the
-    smaller overlap.
+    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l'
+    |cos a| + w' |sin a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If
+    their middles are x apart in such a direction and approach each other at v, the overlap in it
+    began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last,
+    or, if they approach each other in neither direction, in the one with the smaller overlap.
     """
     axes = _axes_of(own)
     distance = _dot(other.middle - own.middle, axes)
@@ -277,7 +322,9 @@ def find_touches(own: Body, other: Body) -> Touches:
     overlap = _joint_extent(own, other, axes) - np.abs(distance)
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
-    ages = np.where(is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf)
+    ages = np.where(
+        is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf
+    )
     approaches = is_closing.any(axis=0)
     is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
@@ -287,8 +334,8 @@ def find_touches(own: Body, other: Body) -> Touches:
 
 
 def find_overlaps(own: Body, other: Body) -> FloatArray:
-    """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap least; negative
-    for bodies that do not touch.
+    """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap
+    least; negative for bodies that do not touch.
     """
     overlaps = _overlaps_along(own, other)
     return np.minimum(overlaps, _overlaps_along(other, own)) if (overlaps > 0).any() else overlaps
@@ -307,7 +354,9 @@ def _axes_of(body: Body) -> FloatArray:
 
 
 def _joint_extent(own: Body, other: Body, axes: FloatArray) -> FloatArray:
-    """Half the extents of M pairs of bodies along the axes of the own ones, added up, shape (2, M) [m]."""
+    """Half the extents of M pairs of bodies along the axes of the own ones, added up, shape (2, M)
+    [m].
+    """
     cosine, sine = np.abs(_dot(other.along, axes))
     along = (own.length + other.length * cosine + other.width * sine) / 2
     across = (own.width + other.length * sine + other.width * cosine) / 2

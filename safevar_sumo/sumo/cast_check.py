@@ -23,7 +23,8 @@ CAST_KEY = "scenario.model"
 
 
 def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step: float) -> None:
-    """Refuse actors that share a name, and quantities that are neither numbers nor arrays of all samples.
+    """Refuse actors that share a name, and quantities that are neither numbers nor arrays of all
+    samples.
 
     Raises
     ------
@@ -33,22 +34,33 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
     for name, count in Counter(track.name for track in cast).items():
         if count > 1:
             raise InputError(
-                "", f"{CAST_KEY}: at 0 s {count} actors are called {name!r}", "another name for each actor"
+                "",
+                f"{CAST_KEY}: at 0 s {count} actors are called {name!r}",
+                "another name for each actor",
             )
     for track in cast:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             shape = (1, *np.shape(value))[-2:]  # a number, or one row for all samples
-            if np.ndim(value) > 2 or shape[0] not in (1, n_samples) or shape[-1] not in (1, n_encounters):
+            if (
+                np.ndim(value) > 2
+                or shape[0] not in (1, n_samples)
+                or shape[-1] not in (1, n_encounters)
+            ):
                 end = f" ends at {(shape[0] - 1) * step:g} s and" if np.ndim(value) == 2 else ""
                 problem = f"actor {track.name!r}: {name}{end} has the shape {np.shape(value)}"
-                samples = f"({n_samples}, 1), a value for each time up to {(n_samples - 1) * step:g} s"
+                samples = (
+                    f"({n_samples}, 1), a value for each time up to {(n_samples - 1) * step:g} s"
+                )
                 raise InputError(
-                    "", f"{CAST_KEY}: {problem}", f"a number, or an array of the shape of `times`, {samples}"
+                    "",
+                    f"{CAST_KEY}: {problem}",
+                    f"a number, or an array of the shape of `times`, {samples}",
                 )
 
 
 def check_motion(track: Track, step: float) -> None:
-    """Refuse a body, whose quantities are columns, that is not at every sample at one place, or jumps.
+    """Refuse a body, whose quantities are columns, that is not at every sample at one place, or
+    jumps.
 
     Raises
     ------
@@ -56,32 +68,57 @@ def check_motion(track: Track, step: float) -> None:
         With the actor, the time [s] and what is expected.
     """
     for name, column in zip(Track._fields[2:], track[2:], strict=True):
-        _refuse(track, step, ~np.isfinite(column), column, f"has {name} = {{:g}}", "a finite number at every sample")
+        _refuse(
+            track,
+            step,
+            ~np.isfinite(column),
+            column,
+            f"has {name} = {{:g}}",
+            "a finite number at every sample",
+        )
     for name, column in (("length", track.length), ("width", track.width)):
         _refuse(track, step, column < 0, column, f"has {name} = {{:g}} m", "a size of 0 m or more")
     speed = np.broadcast_to(track.speed, np.broadcast_shapes(track.speed.shape, track.x.shape))
     outside = (speed < 0) | (speed > MOST_SPEED)
-    _refuse(track, step, outside, speed, "has a speed of {:g} m/s", f"a speed from 0 to {MOST_SPEED:g} m/s")
+    _refuse(
+        track,
+        step,
+        outside,
+        speed,
+        "has a speed of {:g} m/s",
+        f"a speed from 0 to {MOST_SPEED:g} m/s",
+    )
     norm = np.square(track.along) + np.square(track.left)
     is_unit = np.abs(norm - 1) <= UNIT_TOLERANCE
-    _refuse(track, step, ~is_unit, np.sqrt(norm), "has a direction of length {:g}", "a unit vector (along, left)")
+    _refuse(
+        track,
+        step,
+        ~is_unit,
+        np.sqrt(norm),
+        "has a direction of length {:g}",
+        "a unit vector (along, left)",
+    )
     for column in (track.x, track.y):
         jumps = np.diff(column, axis=0, prepend=column[:1]) / step
         expected = f"at most {MOST_SPEED:g} m/s between two samples"
         _refuse(track, step, np.abs(jumps) > MOST_SPEED, jumps, "jumps, at {:g} m/s", expected)
 
 
-def _refuse(track: Track, step: float, wrong: BoolArray, values: FloatArray, problem: str, expected: str) -> None:
+def _refuse(
+    track: Track, step: float, wrong: BoolArray, values: FloatArray, problem: str, expected: str
+) -> None:
     """Raise the error for the first sample at which something about a track is wrong, if any."""
     if wrong.any():
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
-        raise InputError("", f"{CAST_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected)
+        raise InputError(
+            "", f"{CAST_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected
+        )
 
 
 def check_start(cast: Sequence[Track], own: Body) -> None:
-    """Refuse bodies, whose quantities are columns, that are inside each other or inside the vehicle, `own`, at the
-    start.
+    """Refuse bodies, whose quantities are columns, that are inside each other or inside the
+    vehicle, `own`, at the start.
 
     Raises
     ------
@@ -89,12 +126,16 @@ def check_start(cast: Sequence[Track], own: Body) -> None:
         With the actors, the time [s] and what is expected.
     """
     bodies = {f"actor {track.name!r}": _first(track) for track in cast if track.kind != SCREEN}
-    for (name, body), (other_name, other) in combinations({**bodies, "the vehicle under test": own}.items(), 2):
+    for (name, body), (other_name, other) in combinations(
+        {**bodies, "the vehicle under test": own}.items(), 2
+    ):
         n = max(len(body.speed), len(other.speed))
         depth = find_overlaps(_repeated(body, n), _repeated(other, n)).max()
         if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
-            raise InputError("", f"{CAST_KEY}: {problem}", "bodies that do not overlap at the start")
+            raise InputError(
+                "", f"{CAST_KEY}: {problem}", "bodies that do not overlap at the start"
+            )
 
 
 def _repeated(body: Body, n: int) -> Body:
@@ -105,6 +146,17 @@ def _repeated(body: Body, n: int) -> Body:
 def _first(track: Track) -> Body:
     """A body at the start, of M encounters."""
     x, y, along, left, length, width, speed = np.broadcast_arrays(
-        *(column[0] for column in (track.x, track.y, track.along, track.left, track.length, track.width, track.speed))
+        *(
+            column[0]
+            for column in (
+                track.x,
+                track.y,
+                track.along,
+                track.left,
+                track.length,
+                track.width,
+                track.speed,
+            )
+        )
     )
     return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed)

@@ -1,5 +1,5 @@
-"""N copies of the XML of a network and its traffic, in which each id starts with the number of its copy; and the user's
-cache folder, which keeps such files.
+"""N copies of the XML of a network and its traffic, in which each id starts with the number of its
+copy; and the user's cache folder, which keeps such files.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.output import temporary_folder
 
 IdAttributes = Mapping[str, tuple[str, ...]]
-"""Attributes that contain ids, by element; an attribute may contain several ids, separated by spaces."""
+"""Attributes that contain ids, by element; an attribute may contain several ids, separated by
+spaces.
+"""
 
 ROAD_IDS: IdAttributes = {
     "edge": ("id", "from", "to", "crossingEdges", "bidi"),
@@ -35,7 +37,9 @@ ROAD_IDS: IdAttributes = {
 }
 """Elements of a built network, with their attributes that contain ids."""
 SHARED_ELEMENTS = ("location", "type", "prohibition")
-"""Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions contain them."""
+"""Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions
+contain them.
+"""
 DEMAND_IDS: IdAttributes = {
     "vType": ("id",),
     "route": ("id", "edges"),
@@ -60,7 +64,9 @@ def copied_id(copy: int | str, name: str) -> str:
 
 
 def copy_and_name(copied: str) -> tuple[int, str]:
-    """The copy to which an id belongs, and the name in the original network: the inverse of `copied_id`."""
+    """The copy to which an id belongs, and the name in the original network: the inverse of
+    `copied_id`.
+    """
     colon = ":" if copied.startswith(":") else ""
     copy, _, name = copied.removeprefix(":").partition(".")
     return int(copy), colon + name
@@ -81,8 +87,8 @@ def parse_xml(source: Path) -> ElementTree.Element:
 
 
 def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
-    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and junctions before
-    connections.
+    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and
+    junctions before connections.
 
     Raises
     ------
@@ -100,23 +106,29 @@ def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
 
 
 def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> None:
-    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in the file. There is
-    one traffic for all copies, or one for each.
+    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in
+    the file. There is one traffic for all copies, or one for each.
 
     Raises
     ------
     InputError
         If an element cannot be copied.
     """
-    texts = [[(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(root)] for root in roots]
+    texts = [
+        [(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(root)]
+        for root in roots
+    ]
     copies = sorted(
-        ((time, copy, text) for copy in range(n) for time, text in texts[copy % len(texts)]), key=itemgetter(0)
+        ((time, copy, text) for copy in range(n) for time, text in texts[copy % len(texts)]),
+        key=itemgetter(0),
     )
     _write(roots[0], [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:
-    """Yield children with their departure times [s]; types and routes get -1, so that they come first."""
+    """Yield children with their departure times [s]; types and routes get -1, so that they come
+    first.
+    """
     time = 0.0
     for child in root:
         if child.tag in ("vType", "route"):
@@ -127,13 +139,15 @@ def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element
 
 
 def parse_seconds(text: str) -> float | None:
-    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None if the text is no
-    time.
+    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None
+    if the text is no time.
     """
     try:
         total = 0.0
         fields = text.split(":")
-        for seconds, field in zip((86400, 3600, 60, 1)[-len(fields) :], fields, strict=True):  # seconds are last
+        for seconds, field in zip(
+            (86400, 3600, 60, 1)[-len(fields) :], fields, strict=True
+        ):  # seconds are last
             total += seconds * float(field)
     except ValueError:
         return None
@@ -144,20 +158,29 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
     """An element as XML with a placeholder in every id; changes the element."""
     for part in element.iter():
         if part.tag not in ids:
-            raise InputError("", f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids))
+            raise InputError(
+                "", f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids)
+            )
         for name in set(ids[part.tag]) & part.attrib.keys():
-            part.set(name, " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()))
+            part.set(
+                name,
+                " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()),
+            )
     return ElementTree.tostring(element, encoding="unicode")
 
 
 def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
-    """Write a file with the root's tag and attributes, without those of a namespace, and `blocks` of XML in it."""
+    """Write a file with the root's tag and attributes, without those of a namespace, and `blocks`
+    of XML in it.
+    """
     attributes = {name: value for name, value in root.attrib.items() if not name.startswith("{")}
     empty_text = ElementTree.tostring(
         ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False
     )
     head, _, tail = empty_text.rpartition("</")
-    file.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8")
+    file.write_text(
+        f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8"
+    )
 
 
 def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
@@ -185,9 +208,13 @@ def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path
             new.mkdir()
             build(new)
             with (new / name).open("rb+") as file:
-                os.fsync(file.fileno())  # so that not even a power failure leaves a part of it at its place
+                os.fsync(
+                    file.fileno()
+                )  # so that not even a power failure leaves a part of it at its place
             new.rename(target)
     except OSError as error:
         if not (target / name).is_file():  # no other process was faster
-            raise EnvironmentFault(f"{target}: cannot write the cache of networks: {error.strerror or error}") from None
+            raise EnvironmentFault(
+                f"{target}: cannot write the cache of networks: {error.strerror or error}"
+            ) from None
     return target / name

@@ -1,4 +1,6 @@
-"""Drives vehicles through a world, sample by sample: from what they observe to the speeds that they reach."""
+"""Drives vehicles through a world, sample by sample: from what they observe to the speeds that they
+reach.
+"""
 
 from __future__ import annotations
 
@@ -44,10 +46,14 @@ TRUTHS = ("active", "visible")
 
 @np.errstate(all="ignore")
 def drive(
-    system: System, settings: FloatArray, world: World, observer: Observer, listen: Listener | None = None
+    system: System,
+    settings: FloatArray,
+    world: World,
+    observer: Observer,
+    listen: Listener | None = None,
 ) -> SimulationRuns:
-    """Simulate N settings of the vehicle's n characteristics, shape (N, n), in a world that has not taken its first
-    step; see `drive_all`.
+    """Simulate N settings of the vehicle's n characteristics, shape (N, n), in a world that has not
+    taken its first step; see `drive_all`.
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
@@ -63,7 +69,9 @@ def drive(
     robot = DrivingRobot(points, vehicle, prepared, state, step)
     contacts = Contacts(n, np.repeat([point.scenario.is_hit_in_front for point in points], size))
     outcomes = _Outcomes(n)
-    last_sample = np.round(per_vehicle([point.scenario.duration / step for point in points], size)).astype(int)
+    last_sample = np.round(
+        per_vehicle([point.scenario.duration / step for point in points], size)
+    ).astype(int)
     log = _Log(world, int(last_sample.max()) + 1)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
@@ -85,7 +93,15 @@ def drive(
             command, memory = ads.drive(observation, memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
-            log.write(motion.fronts, scene, command, speed=speed, gear=state.gear, active=active, pedal=state.brake)
+            log.write(
+                motion.fronts,
+                scene,
+                command,
+                speed=speed,
+                gear=state.gear,
+                active=active,
+                pedal=state.brake,
+            )
             if not np.count_nonzero(outcomes.is_open):
                 break
 
@@ -97,7 +113,9 @@ def drive(
     encounter = observer.encounter(trace)
     ended = outcomes.classify()
     # In an encounter in which nothing happens, all but a collision says nothing.
-    is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (ended != Outcome.COLLISION)
+    is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (
+        ended != Outcome.COLLISION
+    )
     return SimulationRuns(
         trace=trace,
         encounter=encounter,
@@ -122,7 +140,9 @@ def enter(system: System, settings: FloatArray, world: World) -> Fleet:
     """Put the vehicles of N settings, shape (N, n), onto the road."""
     vehicle = system.vehicle
     n = len(settings)
-    characteristics = dict(zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True))
+    characteristics = dict(
+        zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True)
+    )
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
     ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
@@ -132,9 +152,11 @@ def enter(system: System, settings: FloatArray, world: World) -> Fleet:
     return Fleet(prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion)
 
 
-def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet) -> None:
-    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model diverged would appear
-    to stand.
+def _check_finite(
+    speed: FloatArray, settings: FloatArray, characteristics: CharacteristicSet
+) -> None:
+    """Refuse speeds that are not finite: SUMO would replace them by 0, and a vehicle whose model
+    diverged would appear to stand.
 
     The error replaces numpy's overflow warnings, which name neither a characteristic nor a value.
     """
@@ -149,13 +171,16 @@ def _check_finite(speed: FloatArray, settings: FloatArray, characteristics: Char
         ]
         values = ", ".join(changes) or "the original's values"
         raise InputError(
-            "vehicle", f"its speed is {speed[copy]} with {values}", "values that the model can compute with"
+            "vehicle",
+            f"its speed is {speed[copy]} with {values}",
+            "values that the model can compute with",
         )
 
 
 def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]:
-    """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres' friction (a number if
-    all points share it), time step and, unless all roads are level and dry, slope and water.
+    """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres'
+    friction (a number if all points share it), time step and, unless all roads are level and dry,
+    slope and water.
     """
     size = n // len(points)
     friction = per_vehicle([point.weather.road_friction for point in points], size)
@@ -168,7 +193,9 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]
 
 
 def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
-    """The vehicles' sensors: the weather adds its recognition delay and scales the range by its visibility."""
+    """The vehicles' sensors: the weather adds its recognition delay and scales the range by its
+    visibility.
+    """
     (point,) = system.points  # SUMO simulates one point at once
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
     # Nobody is within a negative range.
@@ -177,8 +204,8 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
 
 
 class _Log:
-    """Up to `capacity` samples of N runs; T samples are arrays of shape (T, N), and the vehicles' positions on SUMO's
-    plane an array of shape (T, N, 2) [m].
+    """Up to `capacity` samples of N runs; T samples are arrays of shape (T, N), and the vehicles'
+    positions on SUMO's plane an array of shape (T, N, 2) [m].
     """
 
     def __init__(self, world: World, capacity: int) -> None:
@@ -191,9 +218,13 @@ class _Log:
         self._positions = np.zeros((capacity, world.n, 2))
         names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
         kinds = {name: bool if name in TRUTHS else float for name in names}
-        self._columns = {name: np.zeros((capacity, world.n), dtype=kind) for name, kind in kinds.items()}
+        self._columns = {
+            name: np.zeros((capacity, world.n), dtype=kind) for name, kind in kinds.items()
+        }
 
-    def write(self, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray) -> None:
+    def write(
+        self, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray
+    ) -> None:
         """Write the next sample."""
         self._positions[self._samples] = position
         values = {**scene._asdict(), **command._asdict(), **others}
@@ -217,11 +248,11 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4), shape (N,); `collision_speed` [m/s] and `warning_ttc`, the true
-    time to collision at the first warning [s], are NaN without one.
+    """Outcomes of N runs (docs/method.md, section 4), shape (N,); `collision_speed` [m/s] and
+    `warning_ttc`, the true time to collision at the first warning [s], are NaN without one.
 
-    `is_open` is true where an outcome can change; `is_checked` where user code is checked: in runs that were open when
-    their vehicles last advanced.
+    `is_open` is true where an outcome can change; `is_checked` where user code is checked: in runs
+    that were open when their vehicles last advanced.
     """
 
     def __init__(self, n: int) -> None:
@@ -234,7 +265,12 @@ class _Outcomes:
         self._is_over = np.zeros(n, dtype=bool)
 
     def judge(
-        self, speed: FloatArray, over: BoolArray, collisions: dict[int, float], *, last: BoolArray | bool
+        self,
+        speed: FloatArray,
+        over: BoolArray,
+        collisions: dict[int, float],
+        *,
+        last: BoolArray | bool,
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""
         active = self.is_open & ~over

@@ -1,4 +1,6 @@
-"""A study can judge its ADS only if the original vehicle, on an empty road, drives to the place of the encounter."""
+"""A study can judge its ADS only if the original vehicle, on an empty road, drives to the place of
+the encounter.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +19,17 @@ from safevar_sumo.sumo.system import System
 MIN_PEDAL = 0.03
 """Brake pedal from which on the vehicle brakes [-], as for the robot of Euro NCAP's tests."""
 MIN_SLOWDOWN = 2.0
-"""Speed that braking takes off before it counts [m/s]: cruise controls brake to hold a speed, some by full strokes."""
+"""Speed that braking takes off before it counts [m/s]: cruise controls brake to hold a speed, some
+by full strokes.
+"""
 SLOW_APPROACH = 0.5
 """Who comes closer by less need not reach anybody within a test [m/s]: he follows."""
 
 
 class Reason(StrEnum):
-    """Why a first drive leads to no encounter: the ADS brakes or stands; others leave, or never come."""
+    """Why a first drive leads to no encounter: the ADS brakes or stands; others leave, or never
+    come.
+    """
 
     BRAKES = "brakes"
     LATE = "late"
@@ -45,9 +51,10 @@ def why_no_verdict(system: System) -> str:
 def find_problems(system: System) -> dict[str, Problem]:
     """What keeps the original vehicle from the encounter, by the name of the point.
 
-    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If it does not reach
-    the place of the encounter before the encounter is over, or brakes on its way, the obstacle is not what keeps it
-    from a collision. Neither is it where nothing happens to a vehicle that keeps its speed.
+    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If
+    it does not reach the place of the encounter before the encounter is over, or brakes on its way,
+    the obstacle is not what keeps it from a collision. Neither is it where nothing happens to a
+    vehicle that keeps its speed.
     """
     original = system.characteristics.original[np.newaxis]
     try:
@@ -62,32 +69,44 @@ def find_problems(system: System) -> dict[str, Problem]:
         point.name: problem
         for point, result in zip(points, results, strict=True)
         if not point.scenario.brakes_fully
-        and (problem := _problem(result.runs, result.point.scenario.test_speed, point.scenario.uneventful))
+        and (
+            problem := _problem(
+                result.runs, result.point.scenario.test_speed, point.scenario.uneventful
+            )
+        )
     }
 
 
 def sentence_on(problems: dict[str, Problem], n_points: int) -> str:
-    """The first problem in a sentence, and at how many of the points it is there; "" without one."""
+    """The first problem in a sentence, and at how many of the points it is there; "" without
+    one.
+    """
     if not problems:
         return ""
     point, problem = next(iter(problems.items()))
     count = sum(other.reason is problem.reason for other in problems.values())
     where = f" at {count} of {n_points} points, such as {point}" if n_points > 1 else ""
     return (
-        f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So its drives with "
-        "somebody in sight do not show how it reacts to them: no verdict."
+        f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So"
+        " its drives with somebody in sight do not show how it reacts to them: no verdict."
     )
 
 
-def _problem(runs: SimulationRuns, test_speed: float | None, uneventful: str | None) -> Problem | None:
+def _problem(
+    runs: SimulationRuns, test_speed: float | None, uneventful: str | None
+) -> Problem | None:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road.
 
-    Who still has its test speed at the end, and comes closer to nobody, has driven as it should. Who still has the
-    speed that it began with when the others have left is late.
+    Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
+    Who still has the speed that it began with when the others have left is late.
     """
     trace = runs.trace
-    end = int(np.count_nonzero(trace.active)) + 1  # the sample after the last active one ended the run
-    gap, speed, brake, position = (values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position))
+    end = (
+        int(np.count_nonzero(trace.active)) + 1
+    )  # the sample after the last active one ended the run
+    gap, speed, brake, position = (
+        values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
+    )
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return Problem(Reason.BRAKES, "brakes without an obstacle")
     approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
@@ -100,9 +119,18 @@ def _problem(runs: SimulationRuns, test_speed: float | None, uneventful: str | N
         return Problem(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
-    if runs.outcome[0] == Outcome.PASSED and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH:
+    if (
+        runs.outcome[0] == Outcome.PASSED
+        and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
+    ):
         words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
-        return Problem(Reason.LATE, f"{words}, when it has come {distance:.1f}{of_needed} m at {speed[-1]:.1f} m/s")
-    commanded = f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of the brake"
+        return Problem(
+            Reason.LATE,
+            f"{words}, when it has come {distance:.1f}{of_needed} m at {speed[-1]:.1f} m/s",
+        )
+    commanded = (
+        f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of"
+        " the brake"
+    )
     words = f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"
     return Problem(Reason.STANDS, words)

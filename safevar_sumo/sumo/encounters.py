@@ -1,8 +1,9 @@
-"""Encounters of a study that searches its scenario: each setting has values of its own for some parameters of scenario
-and weather.
+"""Encounters of a study that searches its scenario: each setting has values of its own for some
+parameters of scenario and weather.
 
-A scenario whose parameters are arrays of N values stands for N scenarios. Its scene is a recorded one, in which each
-vehicle starts elsewhere and meets a target that moves otherwise (`Scenario.layout`).
+A scenario whose parameters are arrays of N values stands for N scenarios. Its scene is a recorded
+one, in which each vehicle starts elsewhere and meets a target that moves otherwise
+(`Scenario.layout`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import Quantity
-from safevar_sumo.scenarios import VUT, WEATHER_PARAMETERS, Point, TrackScenario, WorldScenario, searchable_in
+from safevar_sumo.scenarios import (
+    VUT,
+    WEATHER_PARAMETERS,
+    Point,
+    TrackScenario,
+    WorldScenario,
+    searchable_in,
+)
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
@@ -25,8 +33,9 @@ from safevar_sumo.sumo.recording import Recording
 
 
 def check_domains(study: Study, points: tuple[Point, ...]) -> None:
-    """Refuse a searched parameter that a scenario of the study does not have or in which weathers of its matrix differ,
-    a domain that is wider than the scenario's, and domains in which an encounter is impossible.
+    """Refuse a searched parameter that a scenario of the study does not have or in which weathers
+    of its matrix differ, a domain that is wider than the scenario's, and domains in which an
+    encounter is impossible.
     """
     for point in points:
         legal = searchable_in(point.scenario)
@@ -45,7 +54,9 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
             first = points[0].weather
             other = point.weather
             if name in WEATHER_PARAMETERS and getattr(first, name) != getattr(other, name):
-                problem = f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
+                problem = (
+                    f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
+                )
                 raise InputError("", problem, "a domain, or values in the weathers")
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
@@ -58,12 +69,14 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 if isinstance(scenario, TrackScenario):
                     scenario.tracks(np.zeros((1, 1)))
         except InputError as error:
-            raise InputError("", f"scenario.search: {error.problem}", error.legal or "narrower domains") from None
+            raise InputError(
+                "", f"scenario.search: {error.problem}", error.legal or "narrower domains"
+            ) from None
 
 
 def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
-    """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the same object if only
-    the weather varies.
+    """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the
+    same object if only the weather varies.
     """
     of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
     of_scenario = {name: value for name, value in values.items() if name not in of_weather}
@@ -84,7 +97,9 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
         place = frame.point(frame.along(track.motion[[at_lane], :2]), layout.left)
         sign = np.where(layout.backwards, -1.0, 1.0)
         _, _, dir_x, dir_y, _ = track.motion[0]
-        columns = np.broadcast_arrays(np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed)[1:]
+        columns = np.broadcast_arrays(
+            np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed
+        )[1:]
         tracks[layout.pedestrian] = track._replace(motion=np.stack(columns, axis=-1))
     return replace(
         recording,

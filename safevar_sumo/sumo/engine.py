@@ -1,6 +1,7 @@
 """Starts and stops SUMO; no other module imports libsumo or traci.
 
-Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo-gui` through a socket.
+Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo-gui`
+through a socket.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from safevar_sumo.sumo.network import CopiedNetwork, Network, options_of, varied
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
-"""Number of times, once per second, that traci tries to connect to the SUMO process that it has started."""
+"""Number of times, once per second, that traci tries to connect to the SUMO process that it has
+started.
+"""
 
 OWN_OPTIONS = {
     "step-method.ballistic": "true",
@@ -41,13 +44,18 @@ OWN_OPTIONS = {
     "save-state.times": "",
     "save-state.period": "-1",
 }
-"""Options with which SUMO starts, whatever options a network's file has: how far a vehicle comes at its speeds, and
-what a collision is, depends on no user's file, and nobody who collides or waits leaves his place.
+"""Options with which SUMO starts, whatever options a network's file has: how far a vehicle comes at
+its speeds, and what a collision is, depends on no user's file, and nobody who collides or waits
+leaves his place.
 """
 OUTPUT, NO_FILE = re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"), "NUL"
-"""SUMO's options that name a file to write, which would grow beside the user's network; and its name of no file."""
+"""SUMO's options that name a file to write, which would grow beside the user's network; and its
+name of no file.
+"""
 STEP_LENGTH = 0.05
-"""Time step where neither a study nor its network's file names one [s]: SUMO's own, 1 s, is no time to brake in."""
+"""Time step where neither a study nor its network's file names one [s]: SUMO's own, 1 s, is no time
+to brake in.
+"""
 
 
 class Engine(StrEnum):
@@ -90,15 +98,25 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
     SimulationError
         If sumo-gui fails, or its window is closed.
     """
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment")
+    if sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise InputError(
+            "gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment"
+        )
     import sumo
 
     api = traci_api()
     with _open(api, "sumo-gui"):
-        with redirect_stdout(StringIO()), warnings.catch_warnings():  # traci prints that it waits for SUMO
+        with (
+            redirect_stdout(StringIO()),
+            warnings.catch_warnings(),
+        ):  # traci prints that it waits for SUMO
             warnings.simplefilter("ignore")
-            api.start([str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui"), *options], numRetries=CONNECTION_ATTEMPTS)
+            api.start(
+                [str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui"), *options],
+                numRetries=CONNECTION_ATTEMPTS,
+            )
         yield api
 
 
@@ -114,9 +132,9 @@ def open_world(
     create: Callable[[Api, int], SumoWorld] = SumoWorld,
     start: Start = open_in_process,
 ) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by default that of the
-    network; close SUMO at the end, also after an error. `create` makes the world of SUMO's API and the number of
-    copies. Raises the errors of `start`.
+    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by
+    default that of the network; close SUMO at the end, also after an error. `create` makes the
+    world of SUMO's API and the number of copies. Raises the errors of `start`.
     """
     with start(sumo_options(files, step)) as api:
         yield create(api, n)
@@ -130,17 +148,24 @@ def open_varied_world(
     start: Start = open_in_process,
 ) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
-    with varied_network(networks) as files, open_world(files, len(networks), step, create, start) as world:
+    with (
+        varied_network(networks) as files,
+        open_world(files, len(networks), step, create, start) as world,
+    ):
         yield world
 
 
 @contextmanager
 def _open(api: Api, program: str) -> Iterator[None]:
-    """Report the errors of SUMO, and close SUMO at the end, even if it never started or its window was closed."""
+    """Report the errors of SUMO, and close SUMO at the end, even if it never started or its window
+    was closed.
+    """
     try:
         yield
     except (api.TraCIException, api.FatalTraCIError) as error:
-        raise SimulationError(f"{program} failed: {str(error).strip() or 'it closed the connection'}") from None
+        raise SimulationError(
+            f"{program} failed: {str(error).strip() or 'it closed the connection'}"
+        ) from None
     finally:
         with suppress(api.TraCIException, api.FatalTraCIError):
             api.close()
@@ -173,7 +198,9 @@ def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
 
 
 def own_options(stated: Mapping[str, str]) -> dict[str, str]:
-    """The options with which SUMO starts whatever a network's file states: `OWN_OPTIONS`, and no file to write."""
+    """The options with which SUMO starts whatever a network's file states: `OWN_OPTIONS`, and no
+    file to write.
+    """
     return OWN_OPTIONS | {name: NO_FILE for name in stated if OUTPUT.fullmatch(name)}
 
 

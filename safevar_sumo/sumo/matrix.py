@@ -1,4 +1,6 @@
-"""Evaluates settings at the points of a study: its only scenario, or a matrix, of whose points the worst one counts."""
+"""Evaluates settings at the points of a study: its only scenario, or a matrix, of whose points the
+worst one counts.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,14 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.errors import InputError, check_text
 from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, finite_or_none
+from safevar_sumo.records import (
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    Outcome,
+    SimulationRuns,
+    finite_or_none,
+)
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, SAFETY_DEGREE, WORST, Study
@@ -24,15 +33,20 @@ from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.system import System, assemble
 
 MAX_COPIES = 200
-"""Largest number of copies of a network in one simulation; with more, the processor's caches overflow, and each copy
-takes longer.
+"""Largest number of copies of a network in one simulation; with more, the processor's caches
+overflow, and each copy takes longer.
 """
 MAX_VEHICLES = 4000
-"""Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200 MB."""
+"""Largest number of vehicles in recorded scenes at once; 200 steps of these vehicles take about 200
+MB.
+"""
 LONG_RUN = 60.0
-"""Length of a run up to which so many vehicles drive at once [s]; in longer ones there are fewer."""
+"""Length of a run up to which so many vehicles drive at once [s]; in longer ones there are fewer.
+"""
 MAX_LANES = 100_000
-"""Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and gigabytes."""
+"""Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and
+gigabytes.
+"""
 N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
 
@@ -48,15 +62,20 @@ class PointResult(NamedTuple):
 def point_record(result: PointResult) -> JsonObject:
     """Plain values of the first setting of a result; a value is None if it is undefined.
 
-    Keys: the point and the outcome; impact speeds [m/s]; safety degree and gap [m]; the largest deviation from the test
-    speed before the ADS acted [km/h]; the time to collision at the first warning [s]; the side of the contact, and the
-    position along that side [%].
+    Keys: the point and the outcome; impact speeds [m/s]; safety degree and gap [m]; the largest
+    deviation from the test speed before the ADS acted [km/h]; the time to collision at the first
+    warning [s]; the side of the contact, and the position along that side [%].
     """
     evaluations = result.evaluations
     runs = result.runs
     test_speed_error, warning_ttc, side, place = (
         np.broadcast_to(column, len(evaluations))[0]
-        for column in (runs.test_speed_error, runs.warning_ttc, runs.contact.side, runs.contact.place)
+        for column in (
+            runs.test_speed_error,
+            runs.warning_ttc,
+            runs.contact.side,
+            runs.contact.place,
+        )
     )
     values = {
         "impact_speed": evaluations.collision_speed[0],
@@ -65,7 +84,11 @@ def point_record(result: PointResult) -> JsonObject:
         "gap": evaluations.gaps(runs.middles_apart)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
-        **{name: values[0] for name, values in evaluations.metrics.items() if name == STOPPING_DISTANCE.name},
+        **{
+            name: values[0]
+            for name, values in evaluations.metrics.items()
+            if name == STOPPING_DISTANCE.name
+        },
     }
     return {
         "point": result.point.name,
@@ -77,7 +100,9 @@ def point_record(result: PointResult) -> JsonObject:
 
 
 def vehicle_remarks(system: System) -> list[str]:
-    """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted to."""
+    """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted
+    to.
+    """
     fitted_speed = system.vehicle.FITTED_UP_TO
     speeds = [point.scenario.test_speed or 0.0 for point in system.points]
     if max(speeds) <= fitted_speed:
@@ -86,20 +111,25 @@ def vehicle_remarks(system: System) -> list[str]:
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
     return [
-        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at up to "
-        f"{max(speeds) / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the accelerator released, it loses "
-        f"{drag:.1f} m/s^2 at {speed / KMH:.0f} km/h"
+        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at"
+        f" up to {max(speeds) / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the"
+        f" accelerator released, it loses {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h"
     ]
 
 
 def evaluate(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED, *, with_originals: bool = True
+    system: System,
+    settings: FloatArray,
+    engine: Engine = Engine.RECORDED,
+    *,
+    with_originals: bool = True,
 ) -> Evaluations:
     """Simulate filtered settings, shape (N, n), in one batch and score them.
 
-    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a matrix, row i holds
-    the result of setting i at its worst point. In a study that searches its scenario, row i also holds the safety
-    degree of the original vehicle in the encounter of setting i, unless `with_originals` is false.
+    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
+    matrix, row i holds the result of setting i at its worst point. In a study that searches its
+    scenario, row i also holds the safety degree of the original vehicle in the encounter of setting
+    i, unless `with_originals` is false.
     """
     takes_pairs = with_originals and len(system.characteristics.scenario) > 0
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
@@ -123,11 +153,14 @@ def evaluate(
     return replace(variants, metrics={**variants.metrics, ORIGINAL_DEGREE: found.f_safe[1::2]})
 
 
-def evaluate_matrix(system: System, settings: FloatArray, engine: Engine, *, each: bool = False) -> Evaluations:
-    """Evaluate settings, shape (N, n), at every point: at their worst ones; of a rated study also their rating points.
+def evaluate_matrix(
+    system: System, settings: FloatArray, engine: Engine, *, each: bool = False
+) -> Evaluations:
+    """Evaluate settings, shape (N, n), at every point: at their worst ones; of a rated study also
+    their rating points.
 
-    With `each`, the evaluations have the rated results at every point, `cells`. Traces are dropped, as they would take
-    gigabytes.
+    With `each`, the evaluations have the rated results at every point, `cells`. Traces are dropped,
+    as they would take gigabytes.
     """
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
@@ -147,30 +180,39 @@ def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
     if not is_recorded(system, engine):
         return MAX_COPIES
-    if len(system.characteristics.scenario):  # the original vehicle drives beside each; the points one after another
+    if len(
+        system.characteristics.scenario
+    ):  # the original vehicle drives beside each; the points one after another
         return largest_batch(system) // 2
     return max(largest_batch(system) // len(system.points), MAX_COPIES)
 
 
 def largest_batch(system: System) -> int:
-    """Largest number of vehicles in one batch, smaller for long runs and if each has its own FMU."""
+    """Largest number of vehicles in one batch, smaller for long runs and if each has its own
+    FMU.
+    """
     longest = max(float(np.max(point.scenario.duration)) for point in system.points)
     in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
     return min(in_memory, system.ads.max_vehicles or in_memory)
 
 
 def batch_size(system: System, engine: Engine) -> int:
-    """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest network."""
+    """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
+    network.
+    """
     if is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(
-        number_of_lanes(open_network(network)) for network in {point.scenario.network for point in system.points}
+        number_of_lanes(open_network(network))
+        for network in {point.scenario.network for point in system.points}
     )
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
 def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]) -> Evaluations:
-    """The evaluation of each of N settings at its worst point; `at_points` are their evaluations at all points."""
+    """The evaluation of each of N settings at its worst point; `at_points` are their evaluations at
+    all points.
+    """
     numbers = worst_points(system, at_points)
     n = len(at_points[0])
     rows = numbers * n + np.arange(n)
@@ -180,17 +222,23 @@ def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]
 def simulate(system: System, settings: FloatArray) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n).
 
-    In a matrix, all settings run at the worst point of the last one: others may stand before it, such as the original.
-    Raises the errors of `drive_all`.
+    In a matrix, all settings run at the worst point of the last one: others may stand before it,
+    such as the original. Raises the errors of `drive_all`.
     """
     return drive_all(system.at(worst_point(system, settings[-1])), settings)
 
 
-def simulate_all_points(system: System, settings: FloatArray, engine: Engine = Engine.RECORDED) -> list[PointResult]:
-    """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the errors of
-    `drive_all`.
+def simulate_all_points(
+    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
+) -> list[PointResult]:
+    """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the
+    errors of `drive_all`.
     """
-    by_name = {result.point.name: result for group in simulate_groups(system, settings, engine) for result in group}
+    by_name = {
+        result.point.name: result
+        for group in simulate_groups(system, settings, engine)
+        for result in group
+    }
     return [by_name[point.name] for point in system.points]
 
 
@@ -206,7 +254,11 @@ def simulate_groups(
         runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         yield [
-            PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(slice(start, start + n)))
+            PointResult(
+                point,
+                evaluations.take(np.arange(start, start + n)),
+                runs.of(slice(start, start + n)),
+            )
             for point, start in zip(points, range(0, len(points) * n, n), strict=True)
         ]
 
@@ -231,7 +283,9 @@ def at_point(study: Study, name: str) -> Study:
     check_text("point", name)
     points = [point.name for point in assemble(study).matrix]
     if study.matrix is None or name not in points:
-        similar = [point for point in points if name in point] or get_close_matches(name, points, N_SIMILAR_POINTS, 0)
+        similar = [point for point in points if name in point] or get_close_matches(
+            name, points, N_SIMILAR_POINTS, 0
+        )
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
         raise InputError("point", repr(name), legal if points else "a study with a matrix")
     search = study.search
@@ -243,16 +297,19 @@ def at_point(study: Study, name: str) -> Study:
 
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
-    """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose scenarios are
-    tracks around equal vehicles; any other point is alone. Where one batch does not hold all points, those of a batch
-    have equally many bodies: others would carry bodies that they do not have.
+    """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose
+    scenarios are tracks around equal vehicles; any other point is alone. Where one batch does not
+    hold all points, those of a batch have equally many bodies: others would carry bodies that they
+    do not have.
     """
     groups: dict[Hashable, list[Point]] = {}
     for point in system.points:
         one = point.scenario
         key: Hashable = point.name
         if isinstance(one, TrackScenario):
-            n_bodies = 0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))  # at time 0
+            n_bodies = (
+                0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))
+            )  # at time 0
             key = one.vut_length, one.vut_width, one.sensor_setback, n_bodies, one.network
         groups.setdefault(key, []).append(point)
     for group in groups.values():
@@ -262,12 +319,13 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:
-    """The number of each setting's worst point; `at_points` are the evaluations of the settings at all points.
+    """The number of each setting's worst point; `at_points` are the evaluations of the settings at
+    all points.
 
-    It is the point with the least safety degree, or for a setting that collides nowhere the one that is worst by
-    the measure of the study's matrix; of equal points, the first by name. A collision in a valid test always counts.
-    Without a collision, a point with an invalid test counts as the worst, because such a test leaves open
-    whether the setting is safe.
+    It is the point with the least safety degree, or for a setting that collides nowhere the one
+    that is worst by the measure of the study's matrix; of equal points, the first by name. A
+    collision in a valid test always counts. Without a collision, a point with an invalid test
+    counts as the worst, because such a test leaves open whether the setting is safe.
     """
     order = np.argsort([point.name for point in system.points])
     in_order = [at_points[k] for k in order]

@@ -42,14 +42,17 @@ OBJECTIVES_KEY = "search.objectives"
 
 
 class Measuring(NamedTuple):
-    """The measures that are computed, of runs before those of settings, by column; and the scoring."""
+    """The measures that are computed, of runs before those of settings, by column; and the
+    scoring.
+    """
 
     measures: Mapping[str, Measure]
     scoring: Scoring
 
 
 def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
-    """Look up the metrics and objectives that a study names; `has_stops`: one of its scenarios brakes fully.
+    """Look up the metrics and objectives that a study names; `has_stops`: one of its scenarios
+    brakes fully.
 
     Raises
     ------
@@ -67,7 +70,9 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
     shipped = {**metrics, **OBJECTIVES}
-    objectives = [named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives]
+    objectives = [
+        named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives
+    ]
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"
@@ -92,13 +97,17 @@ class _Named:
         self._own = dict[str, Measure]()
 
     def look_up(self, name: str, key: str, shipped: Mapping[str, Measure]) -> Measure:
-        """A measure by the name of a shipped one, of a user's class, or of one that was looked up before."""
+        """A measure by the name of a shipped one, of a user's class, or of one that was looked up
+        before.
+        """
         member = self._lookup.find({**shipped, **self._own}, name, key)
         measure: Measure = member.target
         if member.code is not None:
             measure = checked_measure(member.code)
             if measure.name in self._taken:
-                raise InputError("", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name")
+                raise InputError(
+                    "", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name"
+                )
             self._own |= {name: measure, measure.name: measure}
             self._taken.add(measure.name)
         if measure.function is not None:

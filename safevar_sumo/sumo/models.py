@@ -1,4 +1,6 @@
-"""Creates what a study names: its vehicle, its driving system, its scenario, and the points of its matrix."""
+"""Creates what a study names: its vehicle, its driving system, its scenario, and the points of its
+matrix.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,14 @@ from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds
 from safevar_sumo.errors import InputError, about, check_name, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
-from safevar_sumo.scenarios import SCENARIOS, Point, Scenario, TrackScenario, WorldScenario, weather_of
+from safevar_sumo.scenarios import (
+    SCENARIOS,
+    Point,
+    Scenario,
+    TrackScenario,
+    WorldScenario,
+    weather_of,
+)
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import MatrixTest, ModelTable, Study, VehicleTable, user_code_names
@@ -24,12 +33,17 @@ from safevar_sumo.sumo.network import is_network, is_shipped
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
 from safevar_sumo.vehicles import VEHICLES, Vehicle
 
-CONTROLLER_FORMS = "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that method"
+CONTROLLER_FORMS = (
+    "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that"
+    " method"
+)
 """The legal forms of a controller written for TraCI."""
 
 
 def create_shipped_models(study: Study) -> None:
-    """Create the shipped models of a study, which refuse parameters that they do not have; raises InputError."""
+    """Create the shipped models of a study, which refuse parameters that they do not have; raises
+    InputError.
+    """
     with about(study.source):
         lookup = Lookup.of(study)
         for kind, shipped, table in (
@@ -45,7 +59,9 @@ def create_shipped_models(study: Study) -> None:
 
 
 def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
-    """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class with that method."""
+    """The ADS of a controller written for TraCI: a function `step(traci, vehicle_id)` or a class
+    with that method.
+    """
     name = f"ads.model = {table.model!r}"
     with substitute_traci():
         member = lookup.find({}, table.model, "ads.model")
@@ -54,9 +70,13 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         is_class = inspect.isclass(controller)
         step: Any = getattr(controller, "step", None) if is_class else controller
         try:
-            inspect.signature(step).bind(*[None] * (2 + is_class), **({} if is_class else parameters))
+            inspect.signature(step).bind(
+                *[None] * (2 + is_class), **({} if is_class else parameters)
+            )
         except (TypeError, ValueError) as error:
-            problem = f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
+            problem = (
+                f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
+            )
             raise InputError("", problem, CONTROLLER_FORMS) from None
         create: Callable[[], Controller]
         if is_class:
@@ -95,16 +115,19 @@ def _points_of(test: MatrixTest, study: Study, lookup: Lookup) -> Iterator[Point
         if not study.scenario.search:
             scenario.check()
         for weather in map(weather_of, test.weathers or [study.weather]):
-            name = ", ".join([test.name, *(f"{key} {value}" for key, value in over.items()), weather.name])
+            name = ", ".join(
+                [test.name, *(f"{key} {value}" for key, value in over.items()), weather.name]
+            )
             parameters = {"test": test.name, **over, "weather": weather.name}
             yield Point(scenario, weather, name, tuple(parameters.items()))
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
-    """The scenario with the path of its network, if the network is not shipped but is a folder or file beside the
-    study.
+    """The scenario with the path of its network, if the network is not shipped but is a folder or
+    file beside the study.
 
-    A folder with sources has priority, because a results directory beside the study may have the same name.
+    A folder with sources has priority, because a results directory beside the study may have the
+    same name.
     """
     paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
     if not paths or is_shipped(scenario.network):
@@ -118,9 +141,15 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
 
 
 def _class_and_creator(
-    kind: str, shipped: Mapping[str, type], table: ModelTable | VehicleTable, lookup: Lookup, *bases: type
+    kind: str,
+    shipped: Mapping[str, type],
+    table: ModelTable | VehicleTable,
+    lookup: Lookup,
+    *bases: type,
 ) -> tuple[Member, Callable[[], Any]]:
-    """The class that the table `kind` names, and the function that creates an instance with the table's parameters."""
+    """The class that the table `kind` names, and the function that creates an instance with the
+    table's parameters.
+    """
     traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""
     member = lookup.class_of(shipped, table.model, f"{kind}.model", *bases, otherwise=traci)
     parameters = lookup.with_paths(member, table.parameters, f"{kind}.parameters")
@@ -133,13 +162,17 @@ def create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
     if member.code is not None and not isinstance(getattr(vehicle, "UNITS", None), Mapping):
-        raise member.code.wrong("__init__", "an object without UNITS", "units of the characteristics by name")
+        raise member.code.wrong(
+            "__init__", "an object without UNITS", "units of the characteristics by name"
+        )
     return vehicle
 
 
 def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     """A scenario that a study names, with its parameters; raises an InputError."""
-    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, TrackScenario, WorldScenario)
+    member, create = _class_and_creator(
+        "scenario", SCENARIOS, table, lookup, TrackScenario, WorldScenario
+    )
     scenario: Scenario = create()
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
@@ -155,7 +188,9 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "fmu":
         path = file_beside(table.model, lookup.folders)
         if not path:
-            raise InputError("", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU")
+            raise InputError(
+                "", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU"
+            )
         code = UserCode(f"ads.model = {table.model!r}")
         fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
         fleet.max_vehicles = MAX_INSTANCES

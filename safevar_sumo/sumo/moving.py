@@ -1,4 +1,6 @@
-"""Bodies of a scenario's tracks: what follows from a track alone, at every sample, before any vehicle moves."""
+"""Bodies of a scenario's tracks: what follows from a track alone, at every sample, before any
+vehicle moves.
+"""
 
 from __future__ import annotations
 
@@ -15,33 +17,40 @@ from safevar_sumo.sumo.bodies import Body
 from safevar_sumo.sumo.cast_check import check_motion, check_shapes, check_start
 
 TIE = 1e-6
-"""Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the last bit says."""
+"""Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the
+last bit says.
+"""
 LEAST_SINE = 1e-9
 """Sine of an angle above which a body is rotated against the lane [-]."""
 NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
 """Who stands in for the bodies that other scenarios of the same batch have: far away."""
 Column = TypeVar("Column", FloatArray, BoolArray)
 BESIDE, IN_PATH = 1, 2
-"""Levels of a body that moves beside the vehicle's path, and of one that is ever in it; that of scenery is 0."""
+"""Levels of a body that moves beside the vehicle's path, and of one that is ever in it; that of
+scenery is 0.
+"""
 
 
 class Moving(NamedTuple):
-    """A body at T samples in M encounters; columns have the shapes (T or 1, M or 1): what does not vary has length 1.
+    """A body at T samples in M encounters; columns have the shapes (T or 1, M or 1): what does not
+    vary has length 1.
 
     Attributes
     ----------
     track
         The body's track with such columns.
     edge, far, half_width
-        Position along the lane of the body's rear (of who faces along the lane, of its first point in the vehicle's
-        path) and of its far end; half its extent across the lane [m].
+        Position along the lane of the body's rear (of who faces along the lane, of its first point
+        in the vehicle's path) and of its far end; half its extent across the lane [m].
     vx, vy, least_vx, most_vx
-        Speeds along the lane and to its left; the least and largest speed along it from now on [m/s].
+        Speeds along the lane and to its left; the least and largest speed along it from now on
+        [m/s].
     lateral, lateral_speed
-        Position of its middle across the lane, from the side that the body comes from, and its rate of change [m, m/s].
+        Position of its middle across the lane, from the side that the body comes from, and its rate
+        of change [m, m/s].
     is_in_path, is_cleared, is_avoidable
-        Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so that a vehicle that is
-        never faster again has avoided it.
+        Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so
+        that a vehicle that is never faster again has avoided it.
     level
         `IN_PATH`, `BESIDE` or 0; below 0 for a body that is not met at all.
     is_rotated, faces_along
@@ -67,7 +76,9 @@ class Moving(NamedTuple):
 
     @classmethod
     def of(cls, track: Track, step: float, vehicle_width: float) -> Moving:
-        """What follows from a track with columns; `vehicle_width` is that of the vehicle under test [m]."""
+        """What follows from a track with columns; `vehicle_width` is that of the vehicle under test
+        [m].
+        """
         cosine = np.abs(track.along)
         sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
@@ -79,11 +90,15 @@ class Moving(NamedTuple):
             edge = np.where(is_lengthwise, first_in_strip(track, vehicle_width / 2), rear)
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
-        is_in_path = slim((np.abs(track.y) < vehicle_width / 2 + half_width + TIE) & (track.kind != SCREEN))
+        is_in_path = slim(
+            (np.abs(track.y) < vehicle_width / 2 + half_width + TIE) & (track.kind != SCREEN)
+        )
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
-        level = np.where(is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0))
+        level = np.where(
+            is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0)
+        )
         return cls(
             track=track,
             edge=edge,
@@ -104,7 +119,9 @@ class Moving(NamedTuple):
         )
 
     def covers(self, other: Moving) -> bool:
-        """Whether another body that stands is always inside this one, which then hides all that the other one does."""
+        """Whether another body that stands is always inside this one, which then hides all that the
+        other one does.
+        """
         mine = self.track
         its = other.track
         return (
@@ -135,7 +152,9 @@ def slim(column: Column) -> Column:
 
 
 def row(column: Column, sample: int, group: IntArray | None) -> Column:
-    """A column at a sample: one value for all vehicles, or one for each; `group` is the encounter of each vehicle."""
+    """A column at a sample: one value for all vehicles, or one for each; `group` is the encounter
+    of each vehicle.
+    """
     values: Column = column[sample if len(column) > 1 else 0]
     return values[group] if group is not None and len(values) > 1 else values
 
@@ -143,8 +162,8 @@ def row(column: Column, sample: int, group: IntArray | None) -> Column:
 def cast_of(
     scenarios: Sequence[TrackScenario], times: FloatArray, n_encounters: int, step: float, own: Body
 ) -> list[Track]:
-    """The bodies of K scenarios, or of one in N encounters, with columns; body b is that of all scenarios' bodies b.
-    `own` is the vehicle under test at the start.
+    """The bodies of K scenarios, or of one in N encounters, with columns; body b is that of all
+    scenarios' bodies b. `own` is the vehicle under test at the start.
 
     Raises
     ------

@@ -1,8 +1,9 @@
-"""SUMO networks: their folders, and N copies of a network and its traffic, at the same coordinates and unconnected.
+"""SUMO networks: their folders, and N copies of a network and its traffic, at the same coordinates
+and unconnected.
 
-A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network (`.net.xml`); its
-traffic, and SUMO's options. The user's cache folder keeps the built network and the copies, in folders named by the
-content of the sources.
+A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network
+(`.net.xml`); its traffic, and SUMO's options. The user's cache folder keeps the built network and
+the copies, in folders named by the content of the sources.
 """
 
 from __future__ import annotations
@@ -36,9 +37,13 @@ LEGAL_FOLDERS = (
     f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}"
 )
 NETWORK_KEY = "scenario.parameters.network"
-"""Key of a study that names the network, the source of errors about a network that does not exist."""
-SOURCE_OPTION = re.compile(r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon|additional)-files")
-"""Options of netconvert, and of SUMO beside the network and its traffic, that name files to read."""
+"""Key of a study that names the network, the source of errors about a network that does not exist.
+"""
+SOURCE_OPTION = re.compile(
+    r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon|additional)-files"
+)
+"""Options of netconvert, and of SUMO beside the network and its traffic, that name files to read.
+"""
 DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
 """Numbers of characters of a digest, and of a program's message, that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
@@ -48,9 +53,9 @@ Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 class Network(NamedTuple):
     """A network as its files are now.
 
-    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the recipe's sources, traffic,
-    options and the files that they add, by file name. A scenario's parameters change its lanes once it is built, and
-    its traffic.
+    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the
+    recipe's sources, traffic, options and the files that they add, by file name. A scenario's
+    parameters change its lanes once it is built, and its traffic.
     """
 
     folder: Path
@@ -69,7 +74,8 @@ class Network(NamedTuple):
 
 
 def open_network(network: str) -> Network:
-    """A network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside its traffic.
+    """A network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside
+    its traffic.
 
     Raises
     ------
@@ -91,12 +97,18 @@ def open_network(network: str) -> Network:
     for name in names:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
-    return Network(folder, roads_file, tuple((name, _digest((folder / name).read_bytes())) for name in names))
+    return Network(
+        folder, roads_file, tuple((name, _digest((folder / name).read_bytes())) for name in names)
+    )
 
 
 def is_shipped(network: str) -> bool:
     """Whether a network is given by its name in `sumo_nets/`."""
-    return network not in ("", ".", "..") and Path(network).name == network and is_network(NETWORKS / network)
+    return (
+        network not in ("", ".", "..")
+        and Path(network).name == network
+        and is_network(NETWORKS / network)
+    )
 
 
 def is_network(path: Path) -> bool:
@@ -110,19 +122,32 @@ def is_network(path: Path) -> bool:
 def options_of(file: Path) -> dict[str, str]:
     """The options that a configuration of SUMO or netconvert sets."""
     return {
-        element.tag: element.attrib["value"].strip() for element in parse_xml(file).iter() if "value" in element.attrib
+        element.tag: element.attrib["value"].strip()
+        for element in parse_xml(file).iter()
+        if "value" in element.attrib
     }
 
 
 def _roads_in(folder: Path) -> str:
-    """The recipe in a folder or, without a recipe, its built network; of several the one that SUMO's options name."""
-    recipes, built = (sorted(file.name for file in folder.glob(f"*{end}")) for end in (RECIPE_ENDING, NETWORK_ENDING))
+    """The recipe in a folder or, without a recipe, its built network; of several the one that
+    SUMO's options name.
+    """
+    recipes, built = (
+        sorted(file.name for file in folder.glob(f"*{end}"))
+        for end in (RECIPE_ENDING, NETWORK_ENDING)
+    )
     names = recipes or built
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
-        names = [name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")] or names
+        names = [
+            name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")
+        ] or names
     if len(names) != 1:
         problem = f"has {' and '.join(names) or 'no network'}"
-        raise InputError(folder, problem, f"{LEGAL_FOLDERS}; of several networks, net-file in {OPTIONS_FILE} names one")
+        raise InputError(
+            folder,
+            problem,
+            f"{LEGAL_FOLDERS}; of several networks, net-file in {OPTIONS_FILE} names one",
+        )
     return names[0]
 
 
@@ -130,7 +155,9 @@ def _sources_of(file: Path) -> list[str]:
     """The files that a configuration names; none for a built network."""
     if file.name.endswith(NETWORK_ENDING):
         return []
-    values = [value for option, value in options_of(file).items() if SOURCE_OPTION.fullmatch(option)]
+    values = [
+        value for option, value in options_of(file).items() if SOURCE_OPTION.fullmatch(option)
+    ]
     return [name.strip() for value in values for name in value.split(",")]
 
 
@@ -153,7 +180,9 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
         If netconvert fails for another reason, or the cache cannot be written.
     """
     # Few sizes of networks serve all batches: 1, 2, 5, 10, 20, 50, ...
-    size = next(size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n)
+    size = next(
+        size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n
+    )
     traffic_file = network.path(TRAFFIC_FILE)
 
     def copy_roads(into: Path) -> None:
@@ -165,7 +194,9 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
             write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE)
 
     roads = cache_folder_name(network, size, _road_digests(network))
-    traffic = cache_folder_name(network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)])
+    traffic = cache_folder_name(
+        network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)]
+    )
     return CopiedNetwork(
         ensure_cached(roads, NETWORK_FILE, copy_roads),
         ensure_cached(traffic, TRAFFIC_FILE, copy_traffic),
@@ -175,8 +206,8 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
 
 @contextmanager
 def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
-    """A copy of one network for each of N traffics, whose file exists until the end; raises the errors of
-    `copied_network`.
+    """A copy of one network for each of N traffics, whose file exists until the end; raises the
+    errors of `copied_network`.
     """
     files = copied_network(networks[0], len(networks))
     traffic_file = networks[0].path(TRAFFIC_FILE)
@@ -189,8 +220,8 @@ def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
 
 
 def built_network(network: Network) -> Path:
-    """The file of the network, which netconvert or the user built, with its changes; raises the errors of
-    `copied_network`.
+    """The file of the network, which netconvert or the user built, with its changes; raises the
+    errors of `copied_network`.
     """
     original = network._replace(lane_changes=(), traffic_changes=())
     if not network.lane_changes and network.is_built:
@@ -218,7 +249,9 @@ def sumo_version() -> str:
 
 
 def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:
-    """Name of the folder in the cache for `n` copies of a network whose files have these digests."""
+    """Name of the folder in the cache for `n` copies of a network whose files have these
+    digests.
+    """
     name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)  # SUMO splits file names at commas
     return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
 
@@ -236,7 +269,11 @@ def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
         cwd=folder,
         env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
     )
-    lines = [line.strip() for line in process.stderr.splitlines() if line.strip() and not line.startswith("Quitting")]
+    lines = [
+        line.strip()
+        for line in process.stderr.splitlines()
+        if line.strip() and not line.startswith("Quitting")
+    ]
     return process.returncode, " ".join(lines).removeprefix("Error: ")[:MESSAGE_LENGTH]
 
 
@@ -246,23 +283,38 @@ def _digest(content: bytes) -> str:
 
 @cache
 def _code_digest() -> str:
-    return _digest(b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__)))
+    return _digest(
+        b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
+    )
 
 
 def _road_digests(network: Network) -> list[str]:
-    digests = [digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)]
+    digests = [
+        digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)
+    ]
     return [*digests, repr(network.lane_changes)]
 
 
 def _run_netconvert(network: Network, file: Path) -> None:
     exit_code, errors = run_program(
-        network.folder, "netconvert", "-c", network.roads_file, "-o", str(file), "--no-warnings", "true"
+        network.folder,
+        "netconvert",
+        "-c",
+        network.roads_file,
+        "-o",
+        str(file),
+        "--no-warnings",
+        "true",
     )
     if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
-        raise EnvironmentFault(f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}")
+        raise EnvironmentFault(
+            f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}"
+        )
     if exit_code != 0:
         raise InputError(
-            network.folder, f"netconvert refuses the network: {errors}", "sources that netconvert builds a network from"
+            network.folder,
+            f"netconvert refuses the network: {errors}",
+            "sources that netconvert builds a network from",
         )
 
 
@@ -272,7 +324,8 @@ def stage_network(scenario: Scenario) -> Network:
     Raises
     ------
     InputError
-        If the parameters are impossible, or change an element that the network or the traffic file lacks.
+        If the parameters are impossible, or change an element that the network or the traffic file
+        lacks.
     EnvironmentFault
         If the cache cannot be written.
     """
@@ -280,8 +333,8 @@ def stage_network(scenario: Scenario) -> Network:
 
 
 def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
-    """The networks of several scenarios, whose files are read once per network; raises the errors of
-    `stage_network`.
+    """The networks of several scenarios, whose files are read once per network; raises the errors
+    of `stage_network`.
     """
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
     return [_stage(scenario, networks[scenario.network]) for scenario in scenarios]
@@ -294,7 +347,8 @@ def _stage(scenario: Scenario, network: Network) -> Network:
 
 def _frozen(changes: XmlChanges) -> Changes:
     return tuple(
-        (path, None if attributes is None else tuple(attributes.items())) for path, attributes in changes.items()
+        (path, None if attributes is None else tuple(attributes.items()))
+        for path, attributes in changes.items()
     )
 
 
@@ -314,7 +368,10 @@ class _BuiltRoads:
 
 @lru_cache(maxsize=100)
 def _lane_shapes(network: Network) -> dict[str, str]:
-    return {lane.attrib["id"]: lane.attrib["shape"] for lane in parse_xml(built_network(network)).iter("lane")}
+    return {
+        lane.attrib["id"]: lane.attrib["shape"]
+        for lane in parse_xml(built_network(network)).iter("lane")
+    }
 
 
 def _changed(file: Path, changes: Changes) -> ElementTree.Element:

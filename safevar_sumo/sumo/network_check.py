@@ -1,4 +1,6 @@
-"""Checks of a user's network: SUMO loads it, and further checks refuse what SUMO accepts but studies cannot use."""
+"""Checks of a user's network: SUMO loads it, and further checks refuse what SUMO accepts but
+studies cannot use.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ from safevar_sumo.sumo.network import (
 )
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
-"""SUMO's shortest time step, and the longest step in which a vehicle can still react in time [s]."""
+"""SUMO's shortest time step, and the longest step in which a vehicle can still react in time [s].
+"""
 MAX_SLOPE = 0.005
 """Largest difference in height on a road that counts as level, per length [-]."""
 N_STEPS = 600
@@ -40,18 +43,41 @@ DRIVER_ATTRIBUTES = re.compile(
     "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment"
 )
 """Attributes of SUMO's own driver."""
-SETTING_ATTRIBUTES = ("mass", "accel", "decel", "emergencyDecel", "apparentDecel", "maxSpeed", "tau")
-"""Attributes of the type of the vehicle under test that the vehicle model replaces by values of the setting."""
+SETTING_ATTRIBUTES = (
+    "mass",
+    "accel",
+    "decel",
+    "emergencyDecel",
+    "apparentDecel",
+    "maxSpeed",
+    "tau",
+)
+"""Attributes of the type of the vehicle under test that the vehicle model replaces by values of the
+setting.
+"""
 ACTING_ATTRIBUTES = (
-    *("carFollowModel", "tau", "decel", "emergencyDecel", "minGap", "speedFactor", "desiredMaxSpeed"),
+    *(
+        "carFollowModel",
+        "tau",
+        "decel",
+        "emergencyDecel",
+        "minGap",
+        "speedFactor",
+        "desiredMaxSpeed",
+    ),
     *("actionStepLength", "delta", "stepping"),
 )
-"""Attributes with which SUMO's driver drives under a controller written for TraCI; he never dawdles (sigma)."""
+"""Attributes with which SUMO's driver drives under a controller written for TraCI; he never dawdles
+(sigma).
+"""
 NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
 """Values of attributes of SUMO's own driver that no remark mentions."""
 EXACT_MODELS = ("Krauss", "KraussOrig1", "IDM", "ACC", "CACC")
 """Car-following models of which SUMO's driver under a controller drives as in SUMO."""
-SIGMA_MODELS, DETERMINISTIC_MODELS = ("Krauss", "KraussOrig1", "KraussPS"), ("IDM", "IDMM", "ACC", "CACC")
+SIGMA_MODELS, DETERMINISTIC_MODELS = (
+    ("Krauss", "KraussOrig1", "KraussPS"),
+    ("IDM", "IDMM", "ACC", "CACC"),
+)
 """Car-following models that are random unless sigma is 0, and models that are never random."""
 DEFAULT_OPTIONS = {"step-method.ballistic": "false"}
 """SUMO's default of an option that is overruled, and changes how everybody moves."""
@@ -60,11 +86,17 @@ SWITCHED_OFF = "-1"
 TRUE_VALUES = ("1", "yes", "true", "on", "x", "t")
 """Words for true in SUMO's options."""
 LEGAL_OPTIONS = (
-    f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in {TRAFFIC_FILE}: "
-    "safevar_sumo starts SUMO itself"
+    f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in"
+    f" {TRAFFIC_FILE}: safevar_sumo starts SUMO itself"
 )
-LEGAL_VUT = f"type {VUT!r}, a vType of its own, which each setting changes; depart 0; no stops: its ADS drives it"
-LEGAL_ROAD = "a level road of friction 1: the scenario's `grade` sets a slope, the weather's `road_friction` a friction"
+LEGAL_VUT = (
+    f"type {VUT!r}, a vType of its own, which each setting changes; depart 0; no stops: its ADS"
+    " drives it"
+)
+LEGAL_ROAD = (
+    "a level road of friction 1: the scenario's `grade` sets a slope, the weather's `road_friction`"
+    " a friction"
+)
 
 
 def check_network(name: str) -> None:
@@ -84,10 +116,11 @@ def check_network(name: str) -> None:
 
 
 def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
-    """Remarks on attributes of a user's traffic and on options that the simulation does not use, and SUMO's warnings;
-    none on shipped networks.
+    """Remarks on attributes of a user's traffic and on options that the simulation does not use,
+    and SUMO's warnings; none on shipped networks.
 
-    `acting` are the attributes of SUMO's own driver that act, as with a controller written for TraCI.
+    `acting` are the attributes of SUMO's own driver that act, as with a controller written for
+    TraCI.
     """
     if is_shipped(name):
         return []
@@ -103,16 +136,27 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     ]
     remarks = []
     if unused_attributes:
-        unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
+        unused = (
+            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
+        )
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
-    model = next((vtype.get("carFollowModel", "") for vtype in parse_xml(file).findall(f"vType[@id='{VUT}']")), "")
+    model = next(
+        (
+            vtype.get("carFollowModel", "")
+            for vtype in parse_xml(file).findall(f"vType[@id='{VUT}']")
+        ),
+        "",
+    )
     if acting and model not in ("", *EXACT_MODELS):
-        remarks.append(f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone")
+        remarks.append(
+            f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone"
+        )
     options_file = network.path(OPTIONS_FILE)
     stated = DEFAULT_OPTIONS | options_of(options_file)
     if "step-length" not in stated:
         remarks.append(
-            f"{options_file} has no step-length: {STEP_LENGTH:g} s unless the study has `step_length` (SUMO: 1 s)"
+            f"{options_file} has no step-length: {STEP_LENGTH:g} s unless the study has"
+            " `step_length` (SUMO: 1 s)"
         )
     overruled = [
         f"{option} = {stated[option]} ({value or 'none'} counts)"
@@ -120,8 +164,14 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         if option in stated and not _is_same(stated[option], value)
     ]
     if overruled:
-        reason = "how vehicles move, what a collision is, and that nobody is teleported and nothing written"
-        remarks.append(f"{options_file}: no effect: {', '.join(overruled)}: {reason}, is the same in every study")
+        reason = (
+            "how vehicles move, what a collision is, and that nobody is teleported and nothing"
+            " written"
+        )
+        remarks.append(
+            f"{options_file}: no effect: {', '.join(overruled)}: {reason}, is the same in every"
+            " study"
+        )
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
     return remarks
@@ -139,17 +189,30 @@ def _is_same(stated: str, own: str) -> bool:
 
 @lru_cache(maxsize=100)
 def _check_files(network: Network) -> None:
-    options = {"step-length": str(STEP_LENGTH), "route-files": TRAFFIC_FILE, **options_of(network.path(OPTIONS_FILE))}
+    options = {
+        "step-length": str(STEP_LENGTH),
+        "route-files": TRAFFIC_FILE,
+        **options_of(network.path(OPTIONS_FILE)),
+    }
     is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
     if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
-        names = ("remote-port", "step-length", "route-files")  # SUMO would wait for a client at the port
+        names = (
+            "remote-port",
+            "step-length",
+            "route-files",
+        )  # SUMO would wait for a client at the port
         stated = ", ".join(f"{name} = {options[name]!r}" for name in names if name in options)
         raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
-    vut = next((actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT), None)
+    vut = next(
+        (actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT),
+        None,
+    )
     if vut is None:
-        raise InputError(file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>')
+        raise InputError(
+            file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>'
+        )
     routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
     type_name = vut.get("type")
     depart = vut.get("depart", "")
@@ -163,64 +226,95 @@ def _check_files(network: Network) -> None:
     _warnings_file(network)
 
 
-def _check_lanes(file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element) -> None:
+def _check_lanes(
+    file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element
+) -> None:
     """Refuse a sloping or slippery road of the vehicle under test."""
-    names = " ".join(route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")).split()
-    for lane in (lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")):
-        coordinates = [(*point.split(","), "0") for point in lane.get("shape", "").split()]  # x,y or x,y,z
+    names = " ".join(
+        route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")
+    ).split()
+    for lane in (
+        lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")
+    ):
+        coordinates = [
+            (*point.split(","), "0") for point in lane.get("shape", "").split()
+        ]  # x,y or x,y,z
         heights = [float(z) for _, _, z, *_ in coordinates]
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         friction = float(lane.get("friction", 1))
-        problem = f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction {friction:g}"
+        problem = (
+            f"drives on lane {lane.get('id')!r}, which rises {climb:.2f} m and has friction"
+            f" {friction:g}"
+        )
         if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
             raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
 
 
 def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
-    """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may not show it yet."""
-    names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {VUT}
+    """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may
+    not show it yet.
+    """
+    names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {
+        VUT
+    }
     for vtype in (vtype for vtype in traffic.findall("vType") if vtype.get("id") in names):
         model = vtype.get("carFollowModel", "Krauss")
         speed_dev = vtype.get("speedDev", "0.1")
         sigma = vtype.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
-        problem = f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma}, {model}"
+        problem = (
+            f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma},"
+            f" {model}"
+        )
         if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
             legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
             raise InputError(file, problem, legal)
 
 
 def _warnings_file(network: Network) -> Path:
-    """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of `check_network`."""
+    """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of
+    `check_network`.
+    """
     folder = cache_folder_name(network, 0, [digest for _, digest in network.digests])
     return ensure_cached(f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network))
 
 
 def _try_network(network: Network, into: Path) -> None:
-    """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of two copies."""
+    """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of
+    two copies.
+    """
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     own = own_options(options_of(network.path(OPTIONS_FILE)))
     only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
-    exit_code, messages = run_program(network.folder, "sumo", *files, *only_load, *as_arguments(own))
+    exit_code, messages = run_program(
+        network.folder, "sumo", *files, *only_load, *as_arguments(own)
+    )
     if exit_code != 0:
-        problem = f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}: {messages or f'exit code {exit_code}'}"
+        problem = (
+            f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
+            f" {messages or f'exit code {exit_code}'}"
+        )
         raise InputError(network.folder, problem, legal)
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:
-        raise InputError(network.folder, f"SUMO refuses copies of the network: {error}", legal) from None
+        raise InputError(
+            network.folder, f"SUMO refuses copies of the network: {error}", legal
+        ) from None
     if actor:
         raise InputError(
             network.path(TRAFFIC_FILE),
             f"{actor!r} moves at random: two copies of it differ at {time:g} s",
-            'traffic without random numbers: vTypes with speedDev="0" and sigma="0", no probabilities and '
-            f"distributions, and pedestrian.striping.dawdling 0 in {OPTIONS_FILE}",
+            'traffic without random numbers: vTypes with speedDev="0" and sigma="0", no'
+            " probabilities and distributions, and pedestrian.striping.dawdling 0 in"
+            f" {OPTIONS_FILE}",
         )
     (into / WARNINGS_FILE).write_text(messages, encoding="utf-8")
 
 
 def _first_difference(network: Network) -> tuple[str, float]:
-    """The first actor that moves differently in two copies, and the time [s]; "" and 0 if there is none.
+    """The first actor that moves differently in two copies, and the time [s]; "" and 0 if there is
+    none.
 
     The vehicle under test stays at its start.
     """

@@ -8,7 +8,16 @@ from typing import Protocol
 import numpy as np
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Observation, Quantity, Trace
+from safevar_sumo.records import (
+    ALL_TRUE,
+    BoolArray,
+    Encounter,
+    FloatArray,
+    IntArray,
+    Observation,
+    Quantity,
+    Trace,
+)
 from safevar_sumo.scenarios import Scene, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
@@ -44,11 +53,15 @@ class Perception:
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []
         if np.ndim(delays) == 0:
-            self._lines.append((slice(None), DelayLine.by(float(delays), step)))  # faster than indices
+            self._lines.append(
+                (slice(None), DelayLine.by(float(delays), step))
+            )  # faster than indices
             return
         steps, fractions = DelayLine.parts(delays, step)
         groups = [np.flatnonzero(steps == count) for count in np.unique(steps)]
-        self._lines += [(group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups]
+        self._lines += [
+            (group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups
+        ]
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step.
@@ -67,7 +80,13 @@ class Perception:
             self._lines[k] = vehicles, next_line
         obstacle = dict(zip(OCCLUDED, seen[:-1], strict=True))
         closing_speed = seen[-1] - obstacle["obstacle_speed"]
-        return Observation(time=time, speed=speed, closing_speed=closing_speed, visibility=self._visibility, **obstacle)
+        return Observation(
+            time=time,
+            speed=speed,
+            closing_speed=closing_speed,
+            visibility=self._visibility,
+            **obstacle,
+        )
 
 
 class SceneObserver:
@@ -83,7 +102,9 @@ class SceneObserver:
         if not self._has_begun:
             self._memory = self.world.begin(self._scenario)
             self._has_begun = True
-        scene, self._memory = self._scenario.observe(self.world, self.world.step_length, self._memory)
+        scene, self._memory = self._scenario.observe(
+            self.world, self.world.step_length, self._memory
+        )
         return scene
 
     def encounter(self, trace: Trace) -> Encounter:
@@ -91,8 +112,8 @@ class SceneObserver:
 
 
 def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
-    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value, or that of the only
-    point, if all are equal.
+    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value,
+    or that of the only point, if all are equal.
     """
     is_shared = len(values) == 1 or all(value == values[0] for value in values)
     return values[0] if is_shared else np.repeat(values, size)

@@ -1,8 +1,9 @@
 """Vehicles that drive in a recorded scene, without SUMO.
 
-The vehicles move along the scene's lanes by SUMO's ballistic update, and collide where bodies overlap. Their positions
-equal SUMO's to the last bit, because this module repeats the operations of `MSVehicle::updateState`,
-`MSLane::interpolateLanePosToGeometryPos` and `PositionVector::positionAtOffset` in the same order.
+The vehicles move along the scene's lanes by SUMO's ballistic update, and collide where bodies
+overlap. Their positions equal SUMO's to the last bit, because this module repeats the operations of
+`MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
+`PositionVector::positionAtOffset` in the same order.
 """
 
 from __future__ import annotations
@@ -24,11 +25,15 @@ from safevar_sumo.vehicles import SumoType
 NUMERICAL_EPS = 0.001
 """SUMO's tolerance for positions on lanes [m] (utils/common/StdDefs.h)."""
 PARALLEL_COSINE = 1 - 1e-9
-"""Smallest absolute cosine of the angle between two parallel vehicles, which may drive in opposite directions."""
+"""Smallest absolute cosine of the angle between two parallel vehicles, which may drive in opposite
+directions.
+"""
 
 
 class _Moment(NamedTuple):
-    """Fronts of the vehicles [m], their speeds [m/s], and whether SUMO looks for collisions with persons there."""
+    """Fronts of the vehicles [m], their speeds [m/s], and whether SUMO looks for collisions with
+    persons there.
+    """
 
     fronts: FloatArray
     speeds: FloatArray
@@ -38,8 +43,8 @@ class _Moment(NamedTuple):
 class RecordedWorld:
     """A recorded scene with `size` vehicles; a `World` in which other actors move as recorded.
 
-    The scene may stand for K scenes with `size` vehicles in each: then its `start`, `speed` and tracks are arrays with
-    one value for each (`encounters.py`).
+    The scene may stand for K scenes with `size` vehicles in each: then its `start`, `speed` and
+    tracks are arrays with one value for each (`encounters.py`).
     """
 
     def __init__(self, recording: Recording, size: int) -> None:
@@ -52,13 +57,21 @@ class RecordedWorld:
         self._sizes = np.array([(film.length, film.width) for film in films]).reshape(-1, 2)
         self._motion = np.full((n_samples, n_scenes, len(films), 5), np.nan)
         for actor, film in enumerate(films):
-            self._motion[: len(film.motion), :, actor] = film.motion.reshape(len(film.motion), -1, 5)
+            self._motion[: len(film.motion), :, actor] = film.motion.reshape(
+                len(film.motion), -1, 5
+            )
         self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (self._sizes[:, :1] / 2)
-        self._reach = np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
-        """Largest distances of the middles of a vehicle and of each actor that touch, along the way and across [m]."""
+        self._reach = (
+            np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
+        )
+        """Largest distances of the middles of a vehicle and of each actor that touch, along the way
+        and across [m].
+        """
         begins = (self._middles @ recording.along - self._reach[0]).reshape(n_samples, -1)
         self._begins = np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
-        """The first position along the way, at every sample, of a front that may touch somebody [m]."""
+        """The first position along the way, at every sample, of a front that may touch somebody
+        [m].
+        """
         self.n = size * n_scenes
         self.step_length = recording.step_length
         self.sample = 0
@@ -75,7 +88,8 @@ class RecordedWorld:
         return self._moved(np.ones(self.n, dtype=bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
-        """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a constant acceleration.
+        """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a
+        constant acceleration.
 
         Raises
         ------
@@ -91,15 +105,21 @@ class RecordedWorld:
         self.sample += 1
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
             if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
-                raise SimulationError("SUMO failed: a vehicle under test drives beyond the end of its route")
-            self._lane_position = np.where(is_beyond, self._lane_position - self._lanes.end, self._lane_position)
+                raise SimulationError(
+                    "SUMO failed: a vehicle under test drives beyond the end of its route"
+                )
+            self._lane_position = np.where(
+                is_beyond, self._lane_position - self._lanes.end, self._lane_position
+            )
             self._lane_number = self._lane_number + is_beyond
             self._lanes = self._scene.way.at(self._lane_number)
         self._now = self._moment(speeds)
         return self._moved(is_open)
 
     def _moment(self, speeds: FloatArray) -> _Moment:
-        return _Moment(self._lanes.positions(self._lane_position), speeds, self._lanes.meets_persons != 0)
+        return _Moment(
+            self._lanes.positions(self._lane_position), speeds, self._lanes.meets_persons != 0
+        )
 
     def _moved(self, is_open: BoolArray) -> Motion:
         return Motion(self._now.fronts, self._now.speeds, self._hits(is_open))
@@ -116,7 +136,9 @@ class RecordedWorld:
             return self._now.fronts
         motion = self._scene.tracks[actor].motion
         places = motion[self.sample, ..., :2]
-        return np.full((self.n, 2), places) if motion.ndim == 2 else places.repeat(self._size, axis=0)
+        return (
+            np.full((self.n, 2), places) if motion.ndim == 2 else places.repeat(self._size, axis=0)
+        )
 
     person_positions = vehicle_positions
 
@@ -146,11 +168,13 @@ class RecordedWorld:
     turn_back = walk
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
-        """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle number.
+        """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle
+        number.
 
-        SUMO checks twice in a step: after persons have moved but before vehicles have, and after vehicles have
-        moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`). Persons who cross a junction are checked
-        against vehicles whose front is on it (`MSLane::detectCollisions`).
+        SUMO checks twice in a step: after persons have moved but before vehicles have, and after
+        vehicles have moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`). Persons
+        who cross a junction are checked against vehicles whose front is on it
+        (`MSLane::detectCollisions`).
         """
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
@@ -159,8 +183,12 @@ class RecordedWorld:
         if not len(vehicles):
             return {}
         persons = self._is_person[actors]
-        early = self._overlaps(self._before, vehicles, actors, persons & self._before.meets_persons[vehicles])
-        late = self._overlaps(self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles])
+        early = self._overlaps(
+            self._before, vehicles, actors, persons & self._before.meets_persons[vehicles]
+        )
+        late = self._overlaps(
+            self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles]
+        )
         pairs = np.flatnonzero(early | late)
         struck, first = np.unique(vehicles[pairs], return_index=True)
         pairs = pairs[first]
@@ -177,11 +205,15 @@ class RecordedWorld:
         along = np.abs(dx * east + dy * north)
         across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
-        return np.asarray((across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis]))
+        return np.asarray(
+            (across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis])
+        )
 
-    def _overlaps(self, moment: _Moment, vehicles: IntArray, actors: IntArray, is_checked: BoolArray) -> BoolArray:
-        """Which vehicles overlap their actor among the pairs that are checked. Two parallel vehicles must overlap by
-        more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+    def _overlaps(
+        self, moment: _Moment, vehicles: IntArray, actors: IntArray, is_checked: BoolArray
+    ) -> BoolArray:
+        """Which vehicles overlap their actor among the pairs that are checked. Two parallel
+        vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         overlaps = np.zeros(len(vehicles), dtype=bool)
         (pairs,) = np.nonzero(is_checked)

@@ -1,7 +1,8 @@
-"""Scenes that SUMO plays once, as all other actors move identically in every simulation if nobody reacts to the vehicle
-under test.
+"""Scenes that SUMO plays once, as all other actors move identically in every simulation if nobody
+reacts to the vehicle under test.
 
-While SUMO plays a scene, this vehicle stays at its start; `recorded_world.py` moves vehicles in the recorded scene.
+While SUMO plays a scene, this vehicle stays at its start; `recorded_world.py` moves vehicles in the
+recorded scene.
 """
 
 from __future__ import annotations
@@ -41,18 +42,26 @@ SCENE_FILE = "scene.msgpack"
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 STRAIGHTNESS = 1e-6
-"""Largest difference, on a straight line, between directions of lanes [-] or between an end and the next start [m]."""
+"""Largest difference, on a straight line, between directions of lanes [-] or between an end and the
+next start [m].
+"""
 NEXT_LANE, INTERNAL_LANE = 0, 4
-"""Positions in a link of `getLinks`: the lane that it leads to, and the lane on the junction, "" if there is none."""
-NOT_STRAIGHT = "the vehicle under test does not depart in the middle of a lane and drive straight on"
+"""Positions in a link of `getLinks`: the lane that it leads to, and the lane on the junction, "" if
+there is none.
+"""
+NOT_STRAIGHT = (
+    "the vehicle under test does not depart in the middle of a lane and drive straight on"
+)
 
 
 class LaneSequence(NamedTuple):
-    """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or (L, 2) [m].
+    """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or
+    (L, 2) [m].
 
-    A lane's shape leads from `first` along `vector`, over `shape_length`. SUMO counts positions on the lane from 0 to
-    `end`; `stretch` is `shape_length` / `end`. `meets_persons` is 1 where SUMO looks for collisions with persons: on
-    the lanes of junctions, which persons cross, or everywhere if there is no junction; else 0.
+    A lane's shape leads from `first` along `vector`, over `shape_length`. SUMO counts positions on
+    the lane from 0 to `end`; `stretch` is `shape_length` / `end`. `meets_persons` is 1 where SUMO
+    looks for collisions with persons: on the lanes of junctions, which persons cross, or everywhere
+    if there is no junction; else 0.
     """
 
     first: FloatArray
@@ -67,8 +76,8 @@ class LaneSequence(NamedTuple):
         return LaneSequence._make(column[lane] for column in self)
 
     def positions(self, lane_position: FloatArray) -> FloatArray:
-        """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their lanes, shape (N,)
-        [m].
+        """Coordinates of the front bumpers, shape (N, 2) [m], of vehicles at positions on their
+        lanes, shape (N,) [m].
         """
         share = lane_position * self.stretch / self.shape_length
         return self.first + self.vector * share[:, np.newaxis]
@@ -78,9 +87,9 @@ class LaneSequence(NamedTuple):
 class Recording:
     """A recorded scene of T samples.
 
-    The vehicle under test departs at position `start` on the first lane of its `way` [m], at `speed` [m/s]; `length`
-    and `width` are its size [m], `along` is the direction of its way. `lanes` are the shapes of all lanes,
-    `first_lanes` each vehicle's first lane.
+    The vehicle under test departs at position `start` on the first lane of its `way` [m], at
+    `speed` [m/s]; `length` and `width` are its size [m], `along` is the direction of its way.
+    `lanes` are the shapes of all lanes, `first_lanes` each vehicle's first lane.
     """
 
     step_length: float
@@ -100,8 +109,8 @@ class Recording:
 
 
 class Scenes:
-    """The scenes of a study, each recorded when it is first needed, with the study's time step [s] (None: that of the
-    network).
+    """The scenes of a study, each recorded when it is first needed, with the study's time step [s]
+    (None: that of the network).
     """
 
     def __init__(self, step_length: float | None = None) -> None:
@@ -116,7 +125,8 @@ class Scenes:
     def of(self, scenario: WorldScenario) -> Recording | str:
         """A scenario's scene, or the reason why SUMO must simulate it.
 
-        SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache folder.
+        SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache
+        folder.
 
         Raises
         ------
@@ -131,8 +141,12 @@ class Scenes:
         return self._recorded[scenario]
 
     def reason_for_sumo(self, points: Sequence[Point]) -> str:
-        """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; "" if scenes suffice."""
-        scenes = (self.of(point.scenario) for point in points if isinstance(point.scenario, WorldScenario))
+        """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; ""
+        if scenes suffice.
+        """
+        scenes = (
+            self.of(point.scenario) for point in points if isinstance(point.scenario, WorldScenario)
+        )
         return next((scene for scene in scenes if isinstance(scene, str)), "")
 
 
@@ -142,7 +156,9 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
         return "an actor of the scenario may react to the vehicle under test"
     # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
     if not scenario.is_user_code and not is_shipped(scenario.network):
-        return f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
+        return (
+            f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
+        )
     network = stage_network(scenario)
     if scenario.is_user_code:
         return _play(scenario, network, step)
@@ -150,7 +166,9 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
     def build(folder: Path) -> None:
-        (folder / SCENE_FILE).write_bytes(msgpack.encode(_play(scenario, network, step), enc_hook=_packed_array))
+        (folder / SCENE_FILE).write_bytes(
+            msgpack.encode(_play(scenario, network, step), enc_hook=_packed_array)
+        )
 
     file = ensure_cached(f"scene-{digest.hexdigest()[:16]}", SCENE_FILE, build)
     return msgpack.decode(file.read_bytes(), type=Recording | str, dec_hook=_unpacked_array)
@@ -158,8 +176,12 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
 
 @cache
 def _code_bytes() -> bytes:
-    """SUMO's version and the code that plays scenes: a scene depends on them and on its scenario."""
-    files = sorted(file for folder in ("sumo", "scenarios") for file in (PACKAGE / folder).glob("*.*"))
+    """SUMO's version and the code that plays scenes: a scene depends on them and on its
+    scenario.
+    """
+    files = sorted(
+        file for folder in ("sumo", "scenarios") for file in (PACKAGE / folder).glob("*.*")
+    )
     return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
 
 
@@ -182,7 +204,10 @@ def _play(scenario: WorldScenario, network: Network, step: float | None) -> Reco
         way = _way_of(api, vut)
         if way is None:
             return NOT_STRAIGHT
-        lane_of = {copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1] for id_ in vehicle.getIDList()}
+        lane_of = {
+            copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1]
+            for id_ in vehicle.getIDList()
+        }
         return Recording(
             step_length=world.step_length,
             start=float(vehicle.getLanePosition(vut)),
@@ -191,7 +216,9 @@ def _play(scenario: WorldScenario, network: Network, step: float | None) -> Reco
             width=float(vehicle.getWidth(vut)),
             way=way,
             along=direction_of(vehicle.getAngle(vut)),
-            lanes={copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()},
+            lanes={
+                copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()
+            },
             first_lanes=lane_of,
             tracks=_tracks(scenario, world),  # last: it advances the world
         )
@@ -207,16 +234,24 @@ def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
         _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
             world.step(np.zeros(1), np.ones(1, dtype=bool))
-    return {name: track._replace(motion=track.motion[:, 0]) for name, track in tracks.items() if name != VUT}
+    return {
+        name: track._replace(motion=track.motion[:, 0])
+        for name, track in tracks.items()
+        if name != VUT
+    }
 
 
 def _way_of(api: Api, vut: str) -> LaneSequence | None:
-    """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane, or the lanes do not
-    form a straight line.
+    """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane,
+    or the lanes do not form a straight line.
     """
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
-        links = [link for link in api.lane.getLinks(lanes[-1]) if api.lane.getEdgeID(link[NEXT_LANE]) == edge]
+        links = [
+            link
+            for link in api.lane.getLinks(lanes[-1])
+            if api.lane.getEdgeID(link[NEXT_LANE]) == edge
+        ]
         if len(links) != 1:
             return None
         next_lane = links[0][NEXT_LANE]

@@ -1,4 +1,6 @@
-"""What vehicles under test see, meet and hit: once for all scenarios, from the geometry of bodies."""
+"""What vehicles under test see, meet and hit: once for all scenarios, from the geometry of
+bodies.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +9,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import ALL_TRUE, BoolArray, Encounter, FloatArray, IntArray, Quantity, Trace
+from safevar_sumo.records import (
+    ALL_TRUE,
+    BoolArray,
+    Encounter,
+    FloatArray,
+    IntArray,
+    Quantity,
+    Trace,
+)
 from safevar_sumo.scenarios import Scene, Track, TrackScenario
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import SCREEN
-from safevar_sumo.sumo.bodies import TOUCH, Body, BodyPairs, Motion, distance_between, distance_covered, find_overlaps
+from safevar_sumo.sumo.bodies import (
+    TOUCH,
+    Body,
+    BodyPairs,
+    Motion,
+    distance_between,
+    distance_covered,
+    find_overlaps,
+)
 from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
 from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
-"""Closing speed above which a vehicle approaches a body ahead [m/s]; once the vehicle cannot be faster than the body
-again, it has avoided it.
+"""Closing speed above which a vehicle approaches a body ahead [m/s]; once the vehicle cannot be
+faster than the body again, it has avoided it.
 """
 LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
@@ -30,17 +48,21 @@ BLOCK = 16_384
 NOBODY = -1
 """In place of the number of a body that a vehicle has struck."""
 OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
-"""What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden, passed, or scenery."""
+"""What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden,
+passed, or scenery.
+"""
 
 
 class Stage:
     """The bodies around N vehicles.
 
-    `group`, shape (N,), is the number of each vehicle's scenario; or, where the only one has arrays as parameters, the
-    number of its encounter.
+    `group`, shape (N,), is the number of each vehicle's scenario; or, where the only one has arrays
+    as parameters, the number of its encounter.
     """
 
-    def __init__(self, scenarios: Sequence[TrackScenario], group: IntArray, *, n_samples: int, step: float) -> None:
+    def __init__(
+        self, scenarios: Sequence[TrackScenario], group: IntArray, *, n_samples: int, step: float
+    ) -> None:
         first = scenarios[0]
         self.length = first.vut_length
         self.width = first.vut_width
@@ -58,7 +80,9 @@ class Stage:
         highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
-        self._met = [k for k, body in enumerate(bodies) if body.level.max() >= min(highest_level.max(), 1)]
+        self._met = [
+            k for k, body in enumerate(bodies) if body.level.max() >= min(highest_level.max(), 1)
+        ]
         self._bodies = bodies
         screens = [body for body in bodies if body.track.kind == SCREEN]
         self._hides = [
@@ -77,7 +101,9 @@ class Stage:
         return row(column, self._sample if sample is None else sample, self.group)
 
     def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
-        """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches a body sees it."""
+        """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
+        a body sees it.
+        """
         front = motion.fronts[:, 0]
         speed = motion.speeds
         over = ALL_TRUE
@@ -86,12 +112,16 @@ class Stage:
             body = self._bodies[k]
             gap = self._row(body.edge) - front
             closing = speed - self._row(body.vx)
-            is_passed = (self._row(body.far) < front - self.length) & (speed >= self._row(body.most_vx))
+            is_passed = (self._row(body.far) < front - self.length) & (
+                speed >= self._row(body.most_vx)
+            )
             ended = np.asarray(is_passed | self._row(body.is_cleared))
             if self._is_avoidable[k]:
                 self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)
                 is_never_faster = (gap > 0) & (speed <= self._row(body.least_vx))
-                ended = ended | (self._approached[k] & self._row(body.is_avoidable) & is_never_faster)
+                ended = ended | (
+                    self._approached[k] & self._row(body.is_avoidable) & is_never_faster
+                )
             self._ended[k, self._sample] = ended
             counts: BoolArray = self._row(self._counts[k])
             over = over & (ended | ~counts)
@@ -108,8 +138,12 @@ class Stage:
                 visible = visible & ~self._blocks(self._bodies[k], *line)
         return visible
 
-    def _blocks(self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity) -> BoolArray:
-        """Whether a body is on the line between two points: the slab test in the body's own axes."""
+    def _blocks(
+        self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity
+    ) -> BoolArray:
+        """Whether a body is on the line between two points: the slab test in the body's own
+        axes.
+        """
         dx = to_x - x
         dy = to_y - y
         rx = x - self._row(other.track.x)
@@ -144,21 +178,31 @@ class Stage:
         )
 
     def _nearest(self, seen: Sequence[_Seen], over: BoolArray) -> Scene:
-        """The scene of the nearest visible body that is or comes into the way; without one, of the nearest other."""
+        """The scene of the nearest visible body that is or comes into the way; without one, of the
+        nearest other.
+        """
         ranks = []
         for one in seen:
             body = self._bodies[one.body]
             counts: BoolArray = self._row(self._counts[one.body])
-            time_to_arrival = np.maximum(one.gap, 0.0) / np.maximum(one.closing, LEAST_CLOSING_SPEED)
+            time_to_arrival = np.maximum(one.gap, 0.0) / np.maximum(
+                one.closing, LEAST_CLOSING_SPEED
+            )
             lateral = self._row(body.track.y)
             drift = self._row(body.vy)
             lateral_at_arrival = lateral + drift * np.where(one.closing > 0, time_to_arrival, 0.0)
-            comes = (one.closing > 0) & (np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width))
+            comes = (one.closing > 0) & (
+                np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width)
+            )
             # A leader at the vehicle's speed who makes way is nobody to brake for.
             leaves = (np.sign(lateral) * drift > 0) & (one.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
-                one.gap + OFF_THE_WAY * ~is_in_way + HIDDEN * ~one.visible + PASSED * one.is_passed + NOT_MET * ~counts
+                one.gap
+                + OFF_THE_WAY * ~is_in_way
+                + HIDDEN * ~one.visible
+                + PASSED * one.is_passed
+                + NOT_MET * ~counts
             )
             ranks.append(np.where(self._struck == one.body, -np.inf, rank))
         chosen = np.argmin(np.stack(ranks), axis=0)
@@ -169,8 +213,12 @@ class Stage:
             scene = Scene(*(np.where(chosen == number, new, old) for old, new in columns))
         return scene
 
-    def hits(self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray) -> dict[int, float]:
-        """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is that of `observe`."""
+    def hits(
+        self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray
+    ) -> dict[int, float]:
+        """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is
+        that of `observe`.
+        """
         self._sample = sample
         self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
@@ -179,10 +227,16 @@ class Stage:
             body = self._bodies[k]
             if foremost <= row(body.edge, sample, None).min():
                 continue
-            is_beside = (front > self._row(body.edge)) & (rear < self._row(body.far)) & self._row(body.is_in_path)
+            is_beside = (
+                (front > self._row(body.edge))
+                & (rear < self._row(body.far))
+                & self._row(body.is_in_path)
+            )
             vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
             if vehicles.size:
-                overlaps = find_overlaps(self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles))
+                overlaps = find_overlaps(
+                    self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles)
+                )
                 self._struck[vehicles[overlaps > TOUCH]] = k
         touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
@@ -192,7 +246,10 @@ class Stage:
         numbers = np.asarray(vehicles)
         others = [self._body(k, numbers) for k in range(len(self._bodies))]
         struck = self._struck[numbers]
-        columns = (np.stack(column)[struck, np.arange(len(numbers))] for column in zip(*others, strict=True))
+        columns = (
+            np.stack(column)[struck, np.arange(len(numbers))]
+            for column in zip(*others, strict=True)
+        )
         return BodyPairs(numbers, self._own(front[numbers], speed[numbers]), Body(*columns))
 
     def _own(self, front: FloatArray, speed: FloatArray) -> Body:
@@ -213,11 +270,13 @@ class Stage:
             values[group] if len(values) > 1 else values.repeat(len(vehicles)) for values in columns
         )
         drift = vy if body.faces_along else np.zeros_like(vy)
-        return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed, drift)
+        return Body(
+            np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed, drift
+        )
 
     def encounter(self, trace: Trace) -> Encounter:
-        """The distance to the nearest body that still counts, and how fast it shrinks, at all samples of a trace whose
-        positions are those of the vehicles' fronts.
+        """The distance to the nearest body that still counts, and how fast it shrinks, at all
+        samples of a trace whose positions are those of the vehicles' fronts.
         """
         shape = trace.speed.shape
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
@@ -233,7 +292,9 @@ class Stage:
                 np.copyto(distance[samples], apart, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts
-        return Encounter(separation=distance, distance=distance, closing_speed=closing, in_conflict=in_conflict)
+        return Encounter(
+            separation=distance, distance=distance, closing_speed=closing, in_conflict=in_conflict
+        )
 
     def _apart(
         self, number: int, samples: slice, front: FloatArray, speed: FloatArray
@@ -252,7 +313,9 @@ class Stage:
         approach = (speed - vx) * np.where(ahead > behind, dx, -dx) - np.sign(y) * vy * dy
         rate = approach / np.maximum(apart, LEAST_DISTANCE)
         if body.is_rotated:
-            track = Track(*body.track[:2], *(self._table(column, samples) for column in body.track[2:]))
+            track = Track(
+                *body.track[:2], *(self._table(column, samples) for column in body.track[2:])
+            )
             apart = distance_between(track, front - self.length / 2, self.length, self.width)
         return apart, rate
 
@@ -263,8 +326,8 @@ class Stage:
 
 
 class _Seen(NamedTuple):
-    """A body as N vehicles meet it at a sample: its number, gap [m] and closing speed [m/s], and whether it is passed
-    and visible.
+    """A body as N vehicles meet it at a sample: its number, gap [m] and closing speed [m/s], and
+    whether it is passed and visible.
     """
 
     body: int

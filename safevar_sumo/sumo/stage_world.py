@@ -1,6 +1,8 @@
-"""A stage in SUMO: its bodies are put where their tracks say, and the vehicles under test drive among them.
+"""A stage in SUMO: its bodies are put where their tracks say, and the vehicles under test drive
+among them.
 
-SUMO's own word on collisions is not taken: it misses contacts at the side between lanes, and calls others too early.
+SUMO's own word on collisions is not taken: it misses contacts at the side between lanes, and calls
+others too early.
 """
 
 from __future__ import annotations
@@ -25,20 +27,31 @@ from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 
 PLACE_TOLERANCE = 1e-6
-"""Largest distance in SUMO of an actor from its track, and of a vehicle from where it has driven to [m]."""
-ANY_PLACE, ANY_LANE = 1 + 2 + 4, -1
-"""Values of `moveToXY`: SUMO looks for the lane on the actor's own route, whoever may use it, and allows places beside
-every road. Elsewhere it would look at the lanes of all copies, which are in the same place.
+"""Largest distance in SUMO of an actor from its track, and of a vehicle from where it has driven to
+[m].
 """
-SHAPES = {"adult": "pedestrian", "child": "pedestrian", "cyclist": "bicycle", "motorcyclist": "motorcycle"}
-"""Shapes that sumo-gui draws, by kind; of all others the one whose corners SUMO does not cut off."""
+ANY_PLACE, ANY_LANE = 1 + 2 + 4, -1
+"""Values of `moveToXY`: SUMO looks for the lane on the actor's own route, whoever may use it, and
+allows places beside every road. Elsewhere it would look at the lanes of all copies, which are in
+the same place.
+"""
+SHAPES = {
+    "adult": "pedestrian",
+    "child": "pedestrian",
+    "cyclist": "bicycle",
+    "motorcyclist": "motorcycle",
+}
+"""Shapes that sumo-gui draws, by kind; of all others the one whose corners SUMO does not cut off.
+"""
 WAIT = 1e6
 """How long persons wait to be put somewhere [s]."""
 
 
 @lru_cache(maxsize=100)
 def start_frame(network: Network, step: float | None) -> Frame:
-    """The coordinates of the lane on which the vehicle under test departs, with their origin at its front."""
+    """The coordinates of the lane on which the vehicle under test departs, with their origin at its
+    front.
+    """
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         x, y = world.vehicle_positions(VUT)[0].tolist()
@@ -46,8 +59,9 @@ def start_frame(network: Network, step: float | None) -> Frame:
 
 
 class Placed(NamedTuple):
-    """An actor in SUMO: its ids in the copies, whether it is a person, and at every sample the place of its front or,
-    of a person, of its middle [m], and its angle [degrees clockwise from north], in columns as `Moving` has them.
+    """An actor in SUMO: its ids in the copies, whether it is a person, and at every sample the
+    place of its front or, of a person, of its middle [m], and its angle [degrees clockwise from
+    north], in columns as `Moving` has them.
     """
 
     track: Track
@@ -70,19 +84,30 @@ class Placed(NamedTuple):
 class StageWorld(SumoWorld):
     """N copies of a road in SUMO with the bodies of a stage.
 
-    Vehicles are where they are on `lane`, in its coordinates, to the last bit: SUMO must have them at the same places.
+    Vehicles are where they are on `lane`, in its coordinates, to the last bit: SUMO must have them
+    at the same places.
     """
 
-    def __init__(self, api: Api, n: int, stage: Stage, start_speeds: FloatArray, start: Frame) -> None:
+    def __init__(
+        self, api: Api, n: int, stage: Stage, start_speeds: FloatArray, start: Frame
+    ) -> None:
         super().__init__(api, n)
         self._stage = stage
         self._start = start
         self._sample = 0
         self._lane = LaneWorld(stage, start_speeds, self.step_length)
-        self._actors = [Placed.of(track, self.ids(track.name), start) for track in stage.cast if track.kind != SCREEN]
+        self._actors = [
+            Placed.of(track, self.ids(track.name), start)
+            for track in stage.cast
+            if track.kind != SCREEN
+        ]
         self._move_person, self._move_vehicle, self._set_previous_speed = (
             function_of(api, *name)
-            for name in (("person", "moveToXY"), ("vehicle", "moveToXY"), ("vehicle", "setPreviousSpeed"))
+            for name in (
+                ("person", "moveToXY"),
+                ("vehicle", "moveToXY"),
+                ("vehicle", "setPreviousSpeed"),
+            )
         )
         self._routes = [api.vehicle.getRoute(id_) for id_ in self.ids(VUT)]
         self._edges = [str(route[0]) for route in self._routes]
@@ -159,7 +184,9 @@ class StageWorld(SumoWorld):
         return values if len(values) == self.n else np.repeat(values, self.n)
 
     def _checked(self, motion: Motion) -> Motion:
-        """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor elsewhere."""
+        """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor
+        elsewhere.
+        """
         front = np.stack(self._start.point(motion.fronts[:, 0], 0.0), axis=1)
         driving = [*self.driving.values()]
         wanted = {"vehicle under test": (front[driving], self._fronts[driving])}
@@ -171,5 +198,7 @@ class StageWorld(SumoWorld):
             if not (np.abs(there - here) <= PLACE_TOLERANCE).all():
                 off = np.abs(there - here).max()
                 time = self._sample * self.step_length
-                raise SimulationError(f"SUMO has the {name} {off:.2g} m beside its track at {time:g} s")
+                raise SimulationError(
+                    f"SUMO has the {name} {off:.2g} m beside its track at {time:g} s"
+                )
         return motion

@@ -1,4 +1,6 @@
-"""A study's parts, ready to simulate: models, points, measures and constraints, which fit each other."""
+"""A study's parts, ready to simulate: models, points, measures and constraints, which fit each
+other.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,14 @@ from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
-from safevar_sumo.vehicles import VEHICLES, CharacteristicSet, FeasibleRegion, Vehicle, calibration_drive, region_of
+from safevar_sumo.vehicles import (
+    VEHICLES,
+    CharacteristicSet,
+    FeasibleRegion,
+    Vehicle,
+    calibration_drive,
+    region_of,
+)
 from safevar_sumo.vehicles.base import Prepared
 
 _ONE_AT_A_TIME = RLock()
@@ -36,8 +45,9 @@ _ONE_AT_A_TIME = RLock()
 
 
 UNKNOWN_TO_DRIVER = (
-    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel and minGap of the "
-    "traffic file. He knows neither the delays of the vehicle and its sensors nor its brakes: that can make him collide"
+    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel"
+    " and minGap of the traffic file. He knows neither the delays of the vehicle and its sensors"
+    " nor its brakes: that can make him collide"
 )
 """Remark on a controller written for TraCI."""
 
@@ -50,7 +60,8 @@ class System:
     - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
     - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
-    - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which point is worst.
+    - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
+      point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
@@ -74,7 +85,9 @@ class System:
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """Points at which a setting is simulated: the points of the matrix, or the study's only scenario."""
+        """Points at which a setting is simulated: the points of the matrix, or the study's only
+        scenario.
+        """
         return self.matrix or (Point(self.scenario, self.weather),)
 
     @property
@@ -84,7 +97,9 @@ class System:
 
     @cached_property
     def contact(self) -> float:
-        """The safety degree at which bodies touch [m]: 0, or half of both lengths between middles."""
+        """The safety degree at which bodies touch [m]: 0, or half of both lengths between
+        middles.
+        """
         scenario = self.points[0].scenario
         if not scenario.centre_to_centre:
             return 0.0
@@ -102,8 +117,9 @@ class System:
             return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
     def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
-        """The system at the encounters of N settings, shape (N, n): its only point, with arrays as the parameters that
-        the study searches; and the settings of the vehicles. Both are as they were if the study searches none.
+        """The system at the encounters of N settings, shape (N, n): its only point, with arrays as
+        the parameters that the study searches; and the settings of the vehicles. Both are as they
+        were if the study searches none.
         """
         if not len(self.characteristics.scenario):
             return self, settings
@@ -111,22 +127,31 @@ class System:
         of_vehicle = self.characteristics.of_vehicle
         columns = np.ascontiguousarray(settings[:, ~of_vehicle].T)
         values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
-        system = replace(self.at(encounter(point, values)), characteristics=self.characteristics.vehicle)
+        system = replace(
+            self.at(encounter(point, values)), characteristics=self.characteristics.vehicle
+        )
         return system, settings[:, of_vehicle]
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
         return replace(self, scenario=point.scenario, weather=point.weather, matrix=(), rater=None)
 
-    def check_feasible(self, settings: FloatArray, *, filtered: bool, switch: str = "beyond=True") -> None:
-        """Refuse settings, shape (M, n), that violate a constraint; raises the errors of `FeasibleRegion.check`."""
+    def check_feasible(
+        self, settings: FloatArray, *, filtered: bool, switch: str = "beyond=True"
+    ) -> None:
+        """Refuse settings, shape (M, n), that violate a constraint; raises the errors of
+        `FeasibleRegion.check`.
+        """
         self.region.check(
-            self.characteristics.filter(settings) if filtered else settings, otherwise=f", or any with {switch}"
+            self.characteristics.filter(settings) if filtered else settings,
+            otherwise=f", or any with {switch}",
         )
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks for the user on parts of networks and weathers that are not used or have no effect."""
+        """Remarks for the user on parts of networks and weathers that are not used or have no
+        effect.
+        """
         uses_traci = isinstance(self.ads, TraciController)
         remarks = [
             remark
@@ -138,19 +163,22 @@ class System:
         for weather in {point.weather.name: point.weather for point in self.points}.values():
             if weather.visibility != 1 and uses_traci and not self._has_limited_range():
                 remarks.append(
-                    f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect: the vehicle has no "
-                    "sensor range, so a controller written for TraCI sees everything"
+                    f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect:"
+                    " the vehicle has no sensor range, so a controller written for TraCI sees"
+                    " everything"
                 )
             if equals_clear(weather) and not (self.ads.recognition_delay or self.ads.hesitation):
                 remarks.append(
-                    f"weather {weather.name!r} has no effect: its road and its visibility are those of clear weather, "
-                    "and no key of [ads.parameters] delays the ADS in it"
+                    f"weather {weather.name!r} has no effect: its road and its visibility are those"
+                    " of clear weather, and no key of [ads.parameters] delays the ADS in it"
                 )
         return remarks
 
     @property
     def _acting_attributes(self) -> set[str]:
-        """Attributes of the traffic file with which SUMO's driver drives under a controller written for TraCI."""
+        """Attributes of the traffic file with which SUMO's driver drives under a controller written
+        for TraCI.
+        """
         return {*ACTING_ATTRIBUTES} - ({"tau"} if self._has_tau else set())
 
     @property
@@ -165,9 +193,16 @@ class System:
             return []
         name = self.ads.tau_parameter
         if not name:
-            return ["tau has no effect: it is the headway of SUMO's driver, and the study has another ADS"]
+            return [
+                "tau has no effect: it is the headway of SUMO's driver, and the study has"
+                " another ADS"
+            ]
         is_default = getattr(self.ads, name) == getattr(type(self.ads)(), name)
-        return [] if is_default else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
+        return (
+            []
+            if is_default
+            else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
+        )
 
     def _has_limited_range(self) -> bool:
         sensors = self.vehicle.sensors(self._prepared_original())
@@ -193,7 +228,8 @@ def assemble(study: Study) -> System:
 
 
 def _assemble(study: Study) -> System:
-    unload_user_modules()  # so that each system has the code as it is now, and no state of another one
+    # Each system has the code as it is now, and no state of another one.
+    unload_user_modules()
     lookup = Lookup.of(study)
     vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
     ads = create_ads(study.ads, lookup)
@@ -202,12 +238,18 @@ def _assemble(study: Study) -> System:
     is_shipped_vehicle = study.vehicle.model in VEHICLES
     check_units(study, vehicle)
     check_plausible(study, vehicle)
-    if isinstance(ads, TraciController) and not is_shipped_vehicle and type(vehicle).sensors is Vehicle.sensors:
+    if (
+        isinstance(ads, TraciController)
+        and not is_shipped_vehicle
+        and type(vehicle).sensors is Vehicle.sensors
+    ):
         problem = (
-            f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of TraCI bypasses sense"
+            f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of"
+            " TraCI bypasses sense"
         )
         expected = (
-            "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach, scale), or None"
+            "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach,"
+            " scale), or None"
         )
         raise InputError("", problem, expected)
     rater = rater_of(study)

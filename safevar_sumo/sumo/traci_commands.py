@@ -1,5 +1,5 @@
-"""The functions that a controller which was written for SUMO may call, its commands among them, and the acceleration
-that SUMO's vehicle would then choose.
+"""The functions that a controller which was written for SUMO may call, its commands among them, and
+the acceleration that SUMO's vehicle would then choose.
 """
 
 from __future__ import annotations
@@ -34,7 +34,14 @@ LISTS = ("getIDList", "getIDCount")
 POSITIONS = ("getPosition", "getPosition3D")
 MOTION = (*POSITIONS, "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
 SENSED: Mapping[str, tuple[str, ...]] = {
-    "vehicle": (*MOTION, "getLaneIndex", "getAcceleration", "getLateralSpeed", "getLateralLanePosition", "getSignals"),
+    "vehicle": (
+        *MOTION,
+        "getLaneIndex",
+        "getAcceleration",
+        "getLateralSpeed",
+        "getLateralLanePosition",
+        "getSignals",
+    ),
     "person": MOTION,
 }
 """Functions, by domain, that return values of other actors that sensors can measure."""
@@ -52,7 +59,9 @@ TYPE_PROPERTIES = (
     "getMass",
 )
 CONSTANT = ("getTypeID", *TYPE_PROPERTIES)
-"""Functions that return properties of actors that are visible at once or follow from the actor's type."""
+"""Functions that return properties of actors that are visible at once or follow from the actor's
+type.
+"""
 OWN = (
     "getLeader",
     "getRoute",
@@ -137,7 +146,8 @@ DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
 LEGAL_NUMBERS = (
-    "a finite number from 0 on; any acceleration; a whole mode up to 127; speed or mode -1 for SUMO's driver"
+    "a finite number from 0 on; any acceleration; a whole mode up to 127; speed or mode -1 for"
+    " SUMO's driver"
 )
 OWN_LANE_CHANGES = 0b11111111
 """Bits of a lane change mode with which SUMO's driver changes lanes of his own accord."""
@@ -146,10 +156,12 @@ TICKS = 1000
 
 
 class CommandedSpeed:
-    """A controller's commands, and the acceleration that results from them under SUMO's speed modes.
+    """A controller's commands, and the acceleration that results from them under SUMO's speed
+    modes.
 
-    A command holds until the next one (`MSVehicle::Influencer`): from `setSpeed` on the speed is `_target`; with
-    `setAcceleration` and `slowDown` it changes evenly, by `_rate`, until `_end`. Then SUMO's own driver takes over.
+    A command holds until the next one (`MSVehicle::Influencer`): from `setSpeed` on the speed is
+    `_target`; with `setAcceleration` and `slowDown` it changes evenly, by `_rate`, until `_end`.
+    Then SUMO's own driver takes over.
     """
 
     LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
@@ -163,18 +175,28 @@ class CommandedSpeed:
         self._end = -math.inf
 
     def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
-        """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no legal number."""
+        """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no
+        legal number.
+        """
         for argument, number in zip(COMMANDS[name], values, strict=True):
             returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
-            is_legal = math.isfinite(number) and (number >= 0 or argument == "acceleration" or returns_control)
+            is_legal = math.isfinite(number) and (
+                number >= 0 or argument == "acceleration" or returns_control
+            )
             if not is_legal or (name == "setSpeedMode" and number not in range(-1, 128)):
                 raise InputError(f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS)
         value, *durations = map(float, values)
         if name == "setImperfection" and value:
-            raise InputError("traci.vehicle.setImperfection", f"imperfection = {value:g} makes results random", "0")
+            raise InputError(
+                "traci.vehicle.setImperfection",
+                f"imperfection = {value:g} makes results random",
+                "0",
+            )
         if name == "setLaneChangeMode" and int(value) & OWN_LANE_CHANGES:
             problem = f"mode = {value:g}: the vehicle keeps its lane"
-            raise InputError("traci.vehicle.setLaneChangeMode", problem, "0, 256 or 512, without changes of lane")
+            raise InputError(
+                "traci.vehicle.setLaneChangeMode", problem, "0, 256 or 512, without changes of lane"
+            )
         if name == "setSpeedMode":
             self.mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
         elif name == "setSpeed":
@@ -187,10 +209,13 @@ class CommandedSpeed:
             self._rate = abs(self._target - speed) / max(duration, self._step)
             self._end = time + duration
 
-    def acceleration(self, speed: float, time: float, sumo_speed: float, accel: float, decel: float) -> float:
+    def acceleration(
+        self, speed: float, time: float, sumo_speed: float, accel: float, decel: float
+    ) -> float:
         """The acceleration by the commands [m/s^2].
 
-        SUMO's own driver would choose `sumo_speed` next [m/s]; `accel` and `decel` are its limits [m/s^2].
+        SUMO's own driver would choose `sumo_speed` next [m/s]; `accel` and `decel` are its limits
+        [m/s^2].
         """
         change = self._target - speed
         if time > self._end + 0.5 / TICKS:

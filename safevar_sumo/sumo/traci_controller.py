@@ -1,8 +1,10 @@
-"""A controller that was written for SUMO: it reads the running simulation and commands the vehicle through TraCI.
+"""A controller that was written for SUMO: it reads the running simulation and commands the vehicle
+through TraCI.
 
-The controller's `step(traci, vehicle_id)` sees one copy of the network, with the ids of the traffic file, and other
-actors through the vehicle's sensors. Queries of the vehicle's type return the values of the original vehicle. Commanded
-speeds and accelerations are converted to pedal positions of the vehicle model.
+The controller's `step(traci, vehicle_id)` sees one copy of the network, with the ids of the traffic
+file, and other actors through the vehicle's sensors. Queries of the vehicle's type return the
+values of the original vehicle. Commanded speeds and accelerations are converted to pedal positions
+of the vehicle model.
 """
 
 from __future__ import annotations
@@ -24,16 +26,26 @@ from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.bodies import World
-from safevar_sumo.sumo.traci_view import OWN_LOOP, SensedTraffic, TraciView, Value, real_traci, refused
+from safevar_sumo.sumo.traci_view import (
+    OWN_LOOP,
+    SensedTraffic,
+    TraciView,
+    Value,
+    real_traci,
+    refused,
+)
 from safevar_sumo.sumo.world import SumoWorld
 from safevar_sumo.vehicles import Sensors, SumoType
 
 Controller = Callable[..., None]
-"""A user's function `step(traci, vehicle_id)`, or an object with such a method and, perhaps, `start`."""
+"""A user's function `step(traci, vehicle_id)`, or an object with such a method and, perhaps,
+`start`.
+"""
 
 
 class TraciController(Ads):
-    """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)`, or a class with `step`.
+    """Drives each vehicle with a controller of its own: a function `step(traci, vehicle_id)`, or a
+    class with `step`.
 
     Parameters
     ----------
@@ -69,8 +81,12 @@ class TraciController(Ads):
 
     @staticmethod
     def known_types(nominal: Nominal, types: SumoType) -> SumoType:
-        """The types that controllers may know: those of the original vehicle, with the headways of SUMO's drivers."""
-        mass, accel, decel, max_speed, lag = (np.full_like(types.mass, value) for value in nominal[:5])
+        """The types that controllers may know: those of the original vehicle, with the headways of
+        SUMO's drivers.
+        """
+        mass, accel, decel, max_speed, lag = (
+            np.full_like(types.mass, value) for value in nominal[:5]
+        )
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
@@ -103,8 +119,8 @@ class TraciController(Ads):
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the sensed traffic, each vehicle's view and step function, and the initial trim, which is
-    None before the first step.
+    """The original vehicle, the sensed traffic, each vehicle's view and step function, and the
+    initial trim, which is None before the first step.
     """
 
     nominal: Nominal
@@ -119,7 +135,9 @@ _active_view: TraciView | None = None
 
 @contextmanager
 def substitute_traci() -> Iterator[None]:
-    """Context in which `import traci` and `import libsumo` import the substitute for controllers."""
+    """Context in which `import traci` and `import libsumo` import the substitute for
+    controllers.
+    """
     real_traci()
     modules = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
     sys.modules.update(dict.fromkeys(modules, traci_module()))
@@ -140,8 +158,8 @@ def traci_module() -> ModuleType:
 
 
 class _Substitute(ModuleType):
-    """A substitute for traci, or for a domain of it: traci's constants and classes, and functions that answer for the
-    driven vehicle.
+    """A substitute for traci, or for a domain of it: traci's constants and classes, and functions
+    that answer for the driven vehicle.
     """
 
     def __init__(self, real: Value, domain: str = "") -> None:
@@ -159,7 +177,11 @@ class _Substitute(ModuleType):
         real = getattr(self._real, name)
         if hasattr(real, "getIDList") or name in ("simulation", "gui"):
             return _Substitute(real, name)
-        return partial(_call, self._domain, name) if callable(real) and not isinstance(real, type) else real
+        return (
+            partial(_call, self._domain, name)
+            if callable(real) and not isinstance(real, type)
+            else real
+        )
 
 
 def _call(domain: str, name: str, /, *arguments: Value, **named: Value) -> Value:

@@ -1,4 +1,6 @@
-"""TraCI as one controller sees it: one copy of the network, ids of the traffic file, other actors through sensors."""
+"""TraCI as one controller sees it: one copy of the network, ids of the traffic file, other actors
+through sensors.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ Arguments = tuple[Value, ...]
 Values = dict[str, Value]
 """What TraCI's functions return of an actor, by function; its length, too."""
 Variables = dict[int, tuple[str, Arguments]]
-"""Requested variables, each with its function and that function's arguments after the actor's id."""
+"""Requested variables, each with its function and that function's arguments after the actor's id.
+"""
 
 INVALID_NUMBER = -1073741824
 """Value that SUMO returns for a property of an actor that is not on the road."""
@@ -49,7 +52,9 @@ BYPASS = "it would bypass the vehicle's model or its sensors"
 
 @cache
 def real_traci() -> Api:
-    """The original module traci, not its substitute for controllers; must be called before controllers run."""
+    """The original module traci, not its substitute for controllers; must be called before
+    controllers run.
+    """
     return traci_api()
 
 
@@ -59,15 +64,19 @@ def refused(domain: str, name: str, problem: str) -> InputError:
     if function == "traci.vehicle.setType":
         problem = "makes it another vehicle, but the study's vehicle drives"
         return InputError(function, problem, ", ".join(DRIVER_COMMANDS))
-    body = "the body of your script's loop, without this call, as a function step(traci, vehicle_id)"
-    return InputError(function, problem, f"{body}, with calls of {', '.join(CALLS.get(domain, CALLS))}")
+    body = (
+        "the body of your script's loop, without this call, as a function step(traci, vehicle_id)"
+    )
+    return InputError(
+        function, problem, f"{body}, with calls of {', '.join(CALLS.get(domain, CALLS))}"
+    )
 
 
 class Snapshot(NamedTuple):
     """The traffic at one time.
 
-    `own` are the values of the vehicle under test, empty once it has left the road; `actors` those of other actors, by
-    domain and name; `leader` is the leader with its gap [m].
+    `own` are the values of the vehicle under test, empty once it has left the road; `actors` those
+    of other actors, by domain and name; `leader` is the leader with its gap [m].
     """
 
     own: Values
@@ -76,9 +85,11 @@ class Snapshot(NamedTuple):
 
 
 class SensedTraffic:
-    """The traffic around N vehicles in their copies of the network, delayed and limited by the vehicles' sensors.
+    """The traffic around N vehicles in their copies of the network, delayed and limited by the
+    vehicles' sensors.
 
-    `seen` is what the sensors of each vehicle report now: the first snapshot until the latency is over.
+    `seen` is what the sensors of each vehicle report now: the first snapshot until the latency is
+    over.
     """
 
     def __init__(self, world: SumoWorld, sensors: Sensors, step: float) -> None:
@@ -114,21 +125,27 @@ class SensedTraffic:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
         actors: dict[str, dict[str, Values]] = {}
         for domain, functions in SENSED.items():
-            getters = {name: getattr(getattr(api, domain), name) for name in (*functions, "getLength")}
+            getters = {
+                name: getattr(getattr(api, domain), name) for name in (*functions, "getLength")
+            }
             actors[domain] = {}
             for actor in names[copy, domain]:
                 id_ = copied_id(copy, actor)
                 actors[domain][actor] = {name: get(id_) for name, get in getters.items()}
         own = actors["vehicle"].pop(VUT)
         leader = api.vehicle.getLeader(vut, LEADER_RANGE)
-        if not leader or not leader[0]:  # without a leader, libsumo and traci return None or ("", -1)
+        if (
+            not leader or not leader[0]
+        ):  # without a leader, libsumo and traci return None or ("", -1)
             return Snapshot(own, actors, None)
         leader_id, gap = leader
         return Snapshot(own, actors, (copy_and_name(leader_id)[1], float(gap)))
 
 
 def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
-    """The snapshot without actors beyond the sensors' range, and with distances multiplied by the sensors' scale."""
+    """The snapshot without actors beyond the sensors' range, and with distances multiplied by the
+    sensors' scale.
+    """
     own = snapshot.own
     if not own or (reach == math.inf and scale == 1):
         return snapshot
@@ -152,7 +169,9 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
 
 
 def _positions_in_scale(own: Values, values: Values, scale: float) -> Values:
-    """The positions of an actor, with distances from the vehicle itself multiplied by the sensors' scale."""
+    """The positions of an actor, with distances from the vehicle itself multiplied by the sensors'
+    scale.
+    """
     if scale == 1:
         return {}
     positions = {}
@@ -180,10 +199,14 @@ class TraciView:
         """The last error raised to the controller, even if the controller caught it."""
 
     def commanded_acceleration(self, speed: float) -> float:
-        """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle [m/s^2]."""
+        """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle
+        [m/s^2].
+        """
         accel = self._api.vehicle.getAccel(self._vut)
         decel = self._api.vehicle.getDecel(self._vut)
-        sumo_speed = 2 * speed - self._last_speed  # between two actions the driver keeps his acceleration
+        sumo_speed = (
+            2 * speed - self._last_speed
+        )  # between two actions the driver keeps his acceleration
         self._last_speed = speed
         steps = round(self.time / self._step)
         is_action = steps % self._steps_of_action == 0
@@ -192,7 +215,9 @@ class TraciView:
         return self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
 
     def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
-        """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the leader [m/s]."""
+        """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the
+        leader [m/s].
+        """
         vehicle = self._api.vehicle
         vut = self._vut
         _, actors, leader = self._traffic.seen[self._copy]
@@ -203,11 +228,15 @@ class TraciView:
             name, gap = leader
             id_ = copied_id(self._copy, name)
             leader_speed = actors["vehicle"][name]["getSpeed"]
-            follow_speed = vehicle.getFollowSpeed(vut, speed, gap, leader_speed, vehicle.getApparentDecel(id_), id_)
+            follow_speed = vehicle.getFollowSpeed(
+                vut, speed, gap, leader_speed, vehicle.getApparentDecel(id_), id_
+            )
             sumo_speed = min(sumo_speed, follow_speed)
         return float(sumo_speed)
 
-    def call(self, domain: str, name: str, arguments: Arguments, named: Mapping[str, Value]) -> Value:
+    def call(
+        self, domain: str, name: str, arguments: Arguments, named: Mapping[str, Value]
+    ) -> Value:
         """Call a TraCI function in this copy.
 
         Raises
@@ -240,14 +269,18 @@ class TraciView:
 
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:
-            raise refused(domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}")
-        self._commands.command(name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values)
+            raise refused(
+                domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
+            )
+        self._commands.command(
+            name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values
+        )
         if name in DRIVER_COMMANDS:
             self._sumo_value(domain, name, VUT, *values)
 
     def _query(self, domain: str, name: str, *arguments: Value) -> Value:
-        """The value of a function that only reads: of other actors what the sensors report, of all else what SUMO
-        knows.
+        """The value of a function that only reads: of other actors what the sensors report, of all
+        else what SUMO knows.
         """
         if name == "getIDList":
             return self._ids(domain)
@@ -262,11 +295,13 @@ class TraciView:
         return self._sumo_value(domain, name, *arguments)
 
     def _sensed_value(self, domain: str, name: str, actor: str, *others: Value) -> Value:
-        """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO reports one that is
-        not on the road.
+        """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO
+        reports one that is not on the road.
         """
         if name not in SENSED[domain]:
-            raise refused(domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures")
+            raise refused(
+                domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures"
+            )
         actors = self._traffic.seen[self._copy].actors[domain]
         if actor in actors:
             return _original_ids(actors[actor][name])
@@ -278,7 +313,9 @@ class TraciView:
         return type(value)(INVALID_NUMBER)  # an int or a float, as SUMO has it
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        """The ids of the actors that the sensors see, the vehicle under test first, or of the network's parts."""
+        """The ids of the actors that the sensors see, the vehicle under test first, or of the
+        network's parts.
+        """
         if domain not in SENSED:
             of_all_copies = getattr(self._api, domain).getIDList()
             return tuple(dict.fromkeys(map(_original_ids, of_all_copies)))
@@ -286,7 +323,9 @@ class TraciView:
         return (*own, *self._traffic.seen[self._copy].actors[domain])
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
-        """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping distance."""
+        """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping
+        distance.
+        """
         vehicle = self._api.vehicle
         vut = self._vut
         dist = dist or vehicle.getSpeed(vut) ** 2 / (2 * vehicle.getDecel(vut))
@@ -309,24 +348,31 @@ class TraciView:
                 raise refused(domain, "subscribe", problem)
             more = (parameters or {}).get(number, ())
             # TraCI's tuples begin with the type of what follows.
-            variables[number] = (functions[number], more[1:] if isinstance(more, tuple) else (more,))
+            variables[number] = (
+                functions[number],
+                more[1:] if isinstance(more, tuple) else (more,),
+            )
         self._subscriptions[domain, actor] = variables
 
     def _subscribed_values(self, domain: str, actor: str | None = None) -> Value:
-        """The variables of an actor, by default of all actors, as the sensors report them; none of one that they do not
-        see.
+        """The variables of an actor, by default of all actors, as the sensors report them; none of
+        one that they do not see.
         """
         values: dict[str, dict[int, Value]] = {}
         ids = self._ids(domain)
         for (of_domain, id_), variables in self._subscriptions.items():
             if of_domain == domain and id_ in ids:
                 items = variables.items()
-                values[id_] = {number: self._query(domain, name, id_, *more) for number, (name, more) in items}
+                values[id_] = {
+                    number: self._query(domain, name, id_, *more) for number, (name, more) in items
+                }
         return values if actor is None else values.get(actor, {})
 
 
 def _copied_ids(copy: int, value: Value) -> Value:
-    """Arguments for a copy: every text is an id; default types of SUMO are the same in all copies."""
+    """Arguments for a copy: every text is an id; default types of SUMO are the same in all
+    copies.
+    """
     if isinstance(value, str):
         return re.sub(r"^(?!DEFAULT_)([:!]?)(?=.)", rf"\g<1>{copy}.", value)
     if isinstance(value, list | tuple):

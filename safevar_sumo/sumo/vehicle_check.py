@@ -1,4 +1,6 @@
-"""Checks of the vehicle of a study: its characteristics, their units, and values that are plausible in these units."""
+"""Checks of the vehicle of a study: its characteristics, their units, and values that are plausible
+in these units.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from safevar_sumo.vehicles import Vehicle
 from safevar_sumo.vehicles.base import Plausible
 
 MIN_HEADWAY = 0.5
-"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was in older studies."""
+"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was
+in older studies.
+"""
 
 
 def check_units(study: Study, vehicle: Vehicle) -> None:
@@ -27,17 +31,27 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
         and ("actuatorLag" not in table or table["tau"].original < MIN_HEADWAY)
     ):
         problem = (
-            f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway of SUMO's driver"
+            f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway"
+            " of SUMO's driver"
         )
-        legal = f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is vehicle.characteristics.actuatorLag"
+        legal = (
+            f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is"
+            " vehicle.characteristics.actuatorLag"
+        )
         raise InputError("", problem, legal)
     for name, entry in table.items():
         key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:
-            raise InputError("", f"{key}: the name is a column of results", f"none of {', '.join(RESULT_COLUMNS)}")
+            raise InputError(
+                "",
+                f"{key}: the name is a column of results",
+                f"none of {', '.join(RESULT_COLUMNS)}",
+            )
         check_name("", f"{key}: {study.vehicle.model} has no such characteristic", name, units)
         if entry.original == 0 and name not in vehicle.OPTIONAL:
-            raise InputError("", f"{key}: original = 0", "a value other than 0: changes are relative to it")
+            raise InputError(
+                "", f"{key}: original = 0", "a value other than 0: changes are relative to it"
+            )
         if entry.unit != units[name]:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     for name in units:
@@ -47,12 +61,16 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:
-    """Refuse values of characteristics and parameters that the vehicle calls implausible, as in another unit."""
+    """Refuse values of characteristics and parameters that the vehicle calls implausible, as in
+    another unit.
+    """
     try:
         ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])
     except msgspec.ValidationError as error:
         problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}"
-        raise InputError("", problem, "(lowest, highest) or (lowest, highest, unit) by name") from None
+        raise InputError(
+            "", problem, "(lowest, highest) or (lowest, highest, unit) by name"
+        ) from None
     for name, (lowest, highest, own_unit) in ranges.items():
         entry = study.vehicle.characteristics.get(name)
         if entry is None and name in vehicle.OPTIONAL:

@@ -1,4 +1,6 @@
-"""Driven speeds once more in SUMO: what was recorded must be what SUMO simulates, and pictures show all actors."""
+"""Driven speeds once more in SUMO: what was recorded must be what SUMO simulates, and pictures show
+all actors.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,9 @@ def drive_again(
 ) -> dict[str, FloatArray]:
     """Drive N settings at the system's only point in SUMO, with the speeds of `runs`.
 
-    Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s], NaN without a
-    collision, shape (T, N). `watch` is called with SUMO's world at every sample; `start` may open a window.
+    Returns the quantities that `COMPARED` names, shape (T, N), and the `collision` speeds [m/s],
+    NaN without a collision, shape (T, N). `watch` is called with SUMO's world at every sample;
+    `start` may open a window.
     """
     trace = runs.trace
     n = len(runs.outcome)
@@ -67,13 +70,15 @@ def drive_again(
 
 
 def verify_in_sumo(system: System, settings: FloatArray) -> str:
-    """Drive settings, shape (M, n), in recorded scenes, and with the same speeds in SUMO, at every point or, of a
-    rating, at some. Returns why SUMO could not simulate some of them, "" if it could.
+    """Drive settings, shape (M, n), in recorded scenes, and with the same speeds in SUMO, at every
+    point or, of a rating, at some. Returns why SUMO could not simulate some of them, "" if it
+    could.
 
     Raises
     ------
     InputError
-        If a place or a collision is another one in SUMO, with the first such setting and both values.
+        If a place or a collision is another one in SUMO, with the first such setting and both
+        values.
     """
     points = system.points
     if system.rater is not None:
@@ -93,7 +98,9 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
 
 
 def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
-    """Verify runs at the only point; runs of similar length together, so that few copies wait for the longest."""
+    """Verify runs at the only point; runs of similar length together, so that few copies wait for
+    the longest.
+    """
     order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
     size = batch_size(system, Engine.LIBSUMO)
     for start in range(0, len(order), size):
@@ -103,8 +110,12 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
         _compare(system, settings[rows], chosen, in_sumo)
 
 
-def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]) -> None:
-    """Compare the quantities of N recorded runs, shape (T, N), with those in SUMO; raises the first difference."""
+def _compare(
+    system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]
+) -> None:
+    """Compare the quantities of N recorded runs, shape (T, N), with those in SUMO; raises the first
+    difference.
+    """
     trace = runs.trace
     last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
     collision = np.full(trace.speed.shape, np.nan)
@@ -112,7 +123,9 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo
     recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
     recorded["collision"] = collision
     for name, values in recorded.items():
-        differs = trace.active & ~np.isclose(in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True)
+        differs = trace.active & ~np.isclose(
+            in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True
+        )
         if name == "collision":  # an invalid test has none
             differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():
@@ -121,7 +134,9 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns, in_sumo
             setting = ", ".join(f"{key} = {value:.17g}" for key, value in pairs)
             raise InputError(
                 system.source,
-                f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g} in the recorded "
-                f"scene and {in_sumo[name][sample, row]:.9g} in SUMO, with {setting}",
-                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or `engine=sumo`",
+                f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g}"
+                f" in the recorded scene and {in_sumo[name][sample, row]:.9g} in SUMO, with"
+                f" {setting}",
+                "scenario: reactive_actors = True, if anybody reacts to the vehicle under test; or"
+                " `engine=sumo`",
             )

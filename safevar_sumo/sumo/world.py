@@ -19,18 +19,19 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
 INSERTION_DECELERATION = 9.0
-"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that could stop before every
-obstacle.
+"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that
+could stop before every obstacle.
 """
 MAX_DEPARTURE_SPEED = 200.0
 """Highest speed at which a vehicle may depart while a scene is recorded [m/s]."""
-# TraCI "set speed mode", bit 5: SUMO obeys every speed that is set, and its vehicle yields to nobody on a junction.
+# TraCI "set speed mode", bit 5: SUMO obeys every speed that is set, and its vehicle yields to
+# nobody on a junction.
 SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
 LANE_CHANGE_MODE = 0
 CUT_SHAPE, FULL_SHAPE = "passenger", "evehicle"
-"""Shapes of vehicles that SUMO draws alike; of the first it cuts the front corners off, also where it looks for
-collisions.
+"""Shapes of vehicles that SUMO draws alike; of the first it cuts the front corners off, also where
+it looks for collisions.
 """
 
 Api = Any
@@ -38,7 +39,9 @@ Api = Any
 
 
 class SumoWorld:
-    """N copies of a network in a running simulation, created by `open_world`. Arrays have shape (N,) or (N, 2)."""
+    """N copies of a network in a running simulation, created by `open_world`. Arrays have shape
+    (N,) or (N, 2).
+    """
 
     def __init__(self, api: Api, n: int) -> None:
         self.api = api
@@ -53,9 +56,12 @@ class SumoWorld:
         """Copies whose vehicle under test is on the road, by the vehicle's id."""
         self._speeds = np.zeros(n)
         self._fronts = np.zeros((n, 2))
-        """Speeds and fronts of the vehicles under test; the last ones of those that have left the road."""
+        """Speeds and fronts of the vehicles under test; the last ones of those that have left the
+        road.
+        """
         self._persons: dict[str, FloatArray] = {}
-        """Places of persons by actor; beside vehicles that have left the road the last ones, if a person has left, too.
+        """Places of persons by actor; beside vehicles that have left the road the last ones, if a
+        person has left, too.
         """
         self._commanded_speeds = np.full(n, np.nan)
         self._struck_ids: dict[int, str] = {}
@@ -66,7 +72,9 @@ class SumoWorld:
         return _copied_ids(name, self.n)
 
     def _set_decelerations(self, decel: FloatArray, emergency_decel: FloatArray) -> None:
-        """Set the largest decelerations of the vehicles under test, usually and in emergencies [m/s^2]."""
+        """Set the largest decelerations of the vehicles under test, usually and in emergencies
+        [m/s^2].
+        """
         self._set(self.api.vehicletype.setDecel, decel)
         self._set(self.api.vehicletype.setEmergencyDecel, emergency_decel)
 
@@ -87,7 +95,9 @@ class SumoWorld:
         least = np.full(self.n, INSERTION_DECELERATION)
         decelerations = (least if types is None else types.decel,) * 2
         if keeps_drivers:
-            planned = [(vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids]
+            planned = [
+                (vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids
+            ]
             decelerations = tuple(np.array(planned).T)
         if types is None:
             self._set(vehicletype.setMaxSpeed, np.full(self.n, MAX_DEPARTURE_SPEED))
@@ -106,7 +116,9 @@ class SumoWorld:
         return self._motion(np.ones(self.n, dtype=bool))
 
     def _depart(self) -> None:
-        """Insert all actors, whose bodies are rectangles, and take control of the vehicles under test."""
+        """Insert all actors, whose bodies are rectangles, and take control of the vehicles under
+        test.
+        """
         vehicletype = self.api.vehicletype
         for type_id in vehicletype.getIDList():
             if vehicletype.getShapeClass(type_id).startswith(CUT_SHAPE):
@@ -115,7 +127,9 @@ class SumoWorld:
         departed = set(self.api.vehicle.getIDList())
         for id_ in self.ids(VUT):
             if id_ not in departed:
-                raise SimulationError(f"SUMO could not insert vehicle {id_!r}; check the network's traffic file")
+                raise SimulationError(
+                    f"SUMO could not insert vehicle {id_!r}; check the network's traffic file"
+                )
             self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
             self.api.vehicle.setLaneChangeMode(id_, LANE_CHANGE_MODE)
 
@@ -158,8 +172,8 @@ class SumoWorld:
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
-        On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`): the vehicle under
-        test may be either.
+        On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`):
+        the vehicle under test may be either.
         """
         self._struck_ids = {}
         speeds = {}
@@ -185,14 +199,18 @@ class SumoWorld:
         """Vehicles under test by their copy, each with an actor by its id."""
         own = Body.columns([self._body_of(self.ids(VUT)[copy]) for copy, _ in pairs])
         return BodyPairs(
-            np.array([copy for copy, _ in pairs]), own, Body.columns([self._body_of(id_) for _, id_ in pairs])
+            np.array([copy for copy, _ in pairs]),
+            own,
+            Body.columns([self._body_of(id_) for _, id_ in pairs]),
         )
 
     def _body_of(self, id_: str) -> Body:
         domain = self._domain_of(id_)
         front = np.array(domain.getPosition(id_))
         along = direction_of(domain.getAngle(id_))
-        return Body.behind(front, along, domain.getLength(id_), domain.getWidth(id_), domain.getSpeed(id_))
+        return Body.behind(
+            front, along, domain.getLength(id_), domain.getWidth(id_), domain.getSpeed(id_)
+        )
 
     def _domain_of(self, id_: str) -> Api:
         return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
@@ -218,12 +236,14 @@ class SumoWorld:
         return positions
 
     def actor_poses(self) -> dict[str, tuple[tuple[float, float], float]]:
-        """All actors on the road, by id: the place of the front, or of a person [m], and the heading clockwise from
-        north [degrees].
+        """All actors on the road, by id: the place of the front, or of a person [m], and the
+        heading clockwise from north [degrees].
         """
         domains = (self.api.vehicle, self.api.person)
         return {
-            id_: (domain.getPosition(id_), domain.getAngle(id_)) for domain in domains for id_ in domain.getIDList()
+            id_: (domain.getPosition(id_), domain.getAngle(id_))
+            for domain in domains
+            for id_ in domain.getIDList()
         }
 
     def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
@@ -233,7 +253,9 @@ class SumoWorld:
             domain = self._domain_of(id_)
             if name not in tracks:
                 motion = np.full((length, self.n, 5), np.nan)
-                tracks[name] = Film(motion, domain is self.api.person, domain.getLength(id_), domain.getWidth(id_))
+                tracks[name] = Film(
+                    motion, domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
+                )
             tracks[name].motion[sample, copy] = *place, *direction_of(angle), domain.getSpeed(id_)
 
     def vehicle_length(self, actor: str) -> float:
@@ -257,7 +279,9 @@ class SumoWorld:
         return float(self.api.person.getWidth(self.ids(actor)[0]))
 
     def walk(self, person: str, speed: float | FloatArray) -> None:
-        for id_, value in zip(self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True):
+        for id_, value in zip(
+            self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True
+        ):
             self.api.person.setSpeed(id_, value)
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
@@ -280,7 +304,11 @@ def direction_of(angle: float) -> FloatArray:
 
 
 def function_of(api: Api, domain: str, name: str) -> Callable[..., Any]:
-    """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the function itself."""
+    """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the
+    function itself.
+    """
     compiled = getattr(api, "_libsumo", None)
-    function: Callable[..., Any] = getattr(compiled or getattr(api, domain), f"{domain}_{name}" if compiled else name)
+    function: Callable[..., Any] = getattr(
+        compiled or getattr(api, domain), f"{domain}_{name}" if compiled else name
+    )
     return function

@@ -1,4 +1,6 @@
-"""Vehicle models by name; and the calibration drive of the original vehicle, from which an ADS knows its pedals."""
+"""Vehicle models by name; and the calibration drive of the original vehicle, from which an ADS
+knows its pedals.
+"""
 
 from collections.abc import Mapping
 from functools import cache, lru_cache, partial
@@ -25,7 +27,12 @@ from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
-VEHICLES: Mapping[str, type[Any]] = {"carla": Carla, "lgsvl": Lgsvl, "sumo": SumoVehicle, "worn": WornVehicle}
+VEHICLES: Mapping[str, type[Any]] = {
+    "carla": Carla,
+    "lgsvl": Lgsvl,
+    "sumo": SumoVehicle,
+    "worn": WornVehicle,
+}
 
 DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
@@ -35,26 +42,42 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
     """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
-    types = vehicle.sumo_type(vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP))
+    types = vehicle.sumo_type(
+        vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
+    )
     simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types[:5])
-    return Nominal(mass=mass, accel=accel, decel=decel, max_speed=max_speed, actuator_lag=lag, tables=simulate_tables)
+    return Nominal(
+        mass=mass,
+        accel=accel,
+        decel=decel,
+        max_speed=max_speed,
+        actuator_lag=lag,
+        tables=simulate_tables,
+    )
 
 
 def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
-    return {characteristic.name: np.full(1, float(characteristic.original)) for characteristic in characteristics}
+    return {
+        characteristic.name: np.full(1, float(characteristic.original))
+        for characteristic in characteristics
+    }
 
 
 @lru_cache(maxsize=4)
 def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
-    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one drive and brake lightly
-    in another.
+    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one
+    drive and brake lightly in another.
     """
     prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     rest = vehicle.at_rest(prepared)
 
-    def drive(state: VehicleState, throttle: float, brake: float) -> tuple[list[float], VehicleState]:
-        """The speed after each step [m/s], until it leaves the range of the tables; and the last state."""
+    def drive(
+        state: VehicleState, throttle: float, brake: float
+    ) -> tuple[list[float], VehicleState]:
+        """The speed after each step [m/s], until it leaves the range of the tables; and the last
+        state.
+        """
         speeds = [float(state.speed[0])]
         command = Command(np.full(1, throttle), np.full(1, brake))
         for _ in range(round(LONGEST_DRIVE / STEP)):
@@ -85,7 +108,8 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
 def _accelerations(speeds: list[float]) -> FloatArray:
     """Acceleration from each of `SPEEDS` to the next, in a drive that gains speed [m/s^2].
 
-    Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has acceleration 0.
+    Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has
+    acceleration 0.
     """
     distinct_speeds, samples = np.unique(np.maximum.accumulate(np.array(speeds)), return_index=True)
     reached = np.flatnonzero((distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS))
@@ -93,4 +117,6 @@ def _accelerations(speeds: list[float]) -> FloatArray:
         return np.zeros(len(SPEEDS))
     times = np.interp(SPEEDS[reached], distinct_speeds, samples * STEP)
     accelerations = np.diff(SPEEDS[reached]) / np.diff(times)
-    return np.asarray(accelerations[np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)])
+    return np.asarray(
+        accelerations[np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)]
+    )

@@ -19,8 +19,8 @@ Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
 class Plausible(NamedTuple):
-    """The plausible values of a characteristic, in its unit, or of a parameter, in `unit`: wide enough for every road
-    vehicle, too narrow for another unit.
+    """The plausible values of a characteristic, in its unit, or of a parameter, in `unit`: wide
+    enough for every road vehicle, too narrow for another unit.
     """
 
     lowest: float
@@ -37,8 +37,8 @@ SECONDS = Plausible(1e-12, 20, "s")
 
 
 class Slope(NamedTuple):
-    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel, negative downhill;
-    `down` onto the road.
+    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel,
+    negative downhill; `down` onto the road.
     """
 
     back: float | FloatArray
@@ -62,9 +62,10 @@ Characteristics = Mapping[str, FloatArray]
 class SumoType(NamedTuple):
     """N vehicles as SUMO and driving systems see them; every column has shape (N,).
 
-    Mass [kg], largest acceleration and deceleration [m/s^2] and top speed [m/s] are those of a SUMO vehicle type.
-    `actuator_lag` is the time constant with which the wheels follow the pedals [s]. `tau` is the time headway that
-    SUMO's driver of the vehicle keeps [s]; None if it is not among the characteristics.
+    Mass [kg], largest acceleration and deceleration [m/s^2] and top speed [m/s] are those of a SUMO
+    vehicle type. `actuator_lag` is the time constant with which the wheels follow the pedals [s].
+    `tau` is the time headway that SUMO's driver of the vehicle keeps [s]; None if it is not among
+    the characteristics.
     """
 
     mass: FloatArray
@@ -76,10 +77,11 @@ class SumoType(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear weather [m], factor on
-    distances [-].
+    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear
+    weather [m], factor on distances [-].
 
-    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to an observation.
+    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to
+    an observation.
     """
 
     latency: FloatArray
@@ -100,7 +102,12 @@ State = Any
 
 HIGHEST_SPEED = 1000.0
 """Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
-LEGAL_STATE = {"speed": Legal(0.0, HIGHEST_SPEED), "throttle": SHARE, "brake": SHARE, "gear": FINITE}
+LEGAL_STATE = {
+    "speed": Legal(0.0, HIGHEST_SPEED),
+    "throttle": SHARE,
+    "brake": SHARE,
+    "gear": FINITE,
+}
 LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
 LEGAL_OBSERVATION = {
     **dict.fromkeys(Observation._fields, Legal(scalar=True)),
@@ -109,7 +116,9 @@ LEGAL_OBSERVATION = {
 
 
 class VehicleState(Protocol):
-    """The columns that every model's state has, each of shape (N,): speed [m/s]; throttle, brake and gear [-]."""
+    """The columns that every model's state has, each of shape (N,): speed [m/s]; throttle, brake
+    and gear [-].
+    """
 
     @property
     def speed(self) -> FloatArray: ...
@@ -125,18 +134,20 @@ class Vehicle:
     """A vehicle model. Its fields are the parameters of `vehicle.parameters`.
 
     Every method is a pure function over arrays of N vehicles: element i of a result depends only on
-    element i of the arguments, bit for bit. So methods use only + - * / and square roots, comparisons,
-    minima and maxima: these operations give the same bits on every machine and for every N.
+    element i of the arguments, bit for bit. So methods use only + - * / and square roots,
+    comparisons, minima and maxima: these operations give the same bits on every machine and for
+    every N.
 
     Attributes
     ----------
     UNITS
         Units of the characteristics by name.
     OPTIONAL
-        Characteristics that a study may leave out: then they are 0, which may be their original value, too.
+        Characteristics that a study may leave out: then they are 0, which may be their original
+        value, too.
     PLAUSIBLE
-        Plausible values of characteristics and parameters by name; a study with others is refused. A name may be
-        missing.
+        Plausible values of characteristics and parameters by name; a study with others is refused.
+        A name may be missing.
     FITTED_UP_TO
         Highest speed at which the parameters were identified [m/s].
     remarks
@@ -163,7 +174,9 @@ class Vehicle:
     remarks: Sequence[str] = ()
 
     def seeded(self, seed: int) -> Vehicle:
-        """The vehicle with the study's seed, for what is random in it, the same for all vehicles; most need none."""
+        """The vehicle with the study's seed, for what is random in it, the same for all vehicles;
+        most need none.
+        """
         return self
 
     @abstractmethod
@@ -177,9 +190,9 @@ class Vehicle:
     ) -> Prepared:
         """Constants of a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; the depth of the `water` [mm] is for models that
-        compute its effect, for which `road_friction` is that of the road without it. `slope` and `water` are passed
-        only on roads that have a slope or are wet.
+        `road_friction` is the weather's factor on the tyres' friction; the depth of the `water`
+        [mm] is for models that compute its effect, for which `road_friction` is that of the road
+        without it. `slope` and `water` are passed only on roads that have a slope or are wet.
         """
 
     @abstractmethod
@@ -194,37 +207,46 @@ class Vehicle:
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
         raise InputError(
             type(self).__name__,
-            "has no method at_speed(prepared, speed), and the traffic puts it onto the road in motion",
+            "has no method at_speed(prepared, speed), and the traffic puts it onto the road in"
+            " motion",
             "a vehicle with that method, or traffic that departs with speed 0",
         )
 
     def at_start(self, prepared: Prepared, speed: FloatArray) -> State:
-        """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the steady state."""
+        """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the
+        steady state.
+        """
         rest = self.at_rest(prepared)
         is_rolling = speed > 0
         if not is_rolling.any():
             return rest
-        steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))  # any speed for those that stand
+        steady = self.at_speed(
+            prepared, np.where(is_rolling, speed, 1.0)
+        )  # any speed for those that stand
         return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
 
     def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
-        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for the robot of tests."""
+        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for
+        the robot of tests.
+        """
         return state
 
     def sensors(self, prepared: Prepared) -> Sensors | None:
-        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None if they see
-        everything at once.
+        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None
+        if they see everything at once.
         """
         return None
 
     def compile(self, *, only_load: bool = False) -> bool:
-        """Compile what `advance` calls, or with `only_load` take it only from an earlier process; returns whether it is
-        ready.
+        """Compile what `advance` calls, or with `only_load` take it only from an earlier process;
+        returns whether it is ready.
         """
         return True
 
     @abstractmethod
-    def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
+    def sense(
+        self, prepared: Prepared, state: State, seen: Observation
+    ) -> tuple[Observation, State]:
         """What the vehicles' sensors report of an observation, and the state after it."""
 
     @abstractmethod
@@ -233,7 +255,9 @@ class Vehicle:
 
 
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
-    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist of states."""
+    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
+    of states.
+    """
     if hasattr(steady, "where"):
         return steady.where(is_rolling, rest)
     if isinstance(steady, tuple):

@@ -1,9 +1,9 @@
 """LincolnMkz2017 of CARLA 0.9.10: NVIDIA PhysX 3.4, PxVehicleDrive4W, along its path.
 
 The equations and the order of integration, in `carla_step.py`, come from `PxVehicleUpdate.cpp` and
-`PxVehicleDefaultTireShader` (PhysX 3.4). One equivalent wheel represents the four. A step computes the tyre force from
-the slip at its beginning, then engine, clutch and wheels implicitly and in closed form, so that the stiff clutch does
-not limit the step.
+`PxVehicleDefaultTireShader` (PhysX 3.4). One equivalent wheel represents the four. A step computes
+the tyre force from the slip at its beginning, then engine, clutch and wheels implicitly and in
+closed form, so that the stiff clutch does not limit the step.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 Share = Annotated[float, Meta(gt=0, le=1)]
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
-# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over max_rpm.
+# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over
+# max_rpm.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
 # Relative to the maximum engine speed; the falling line extends to 1.
 PEAK_SPEED, END_SPEED = 1890 / 5800, 5730 / 5800
@@ -55,8 +56,8 @@ NEWTON_STEPS = 8  # from 1 to a cube root near 1; the last steps change nothing
 class _Prepared(NamedTuple):
     """Constants of a run, SI; arrays of shape (N,).
 
-    `rows` are the fields of `car`, shape (16, N). The slope pulls with `pull` [N]. `assumed_height` is the camera's
-    assumed height over its actual height [-].
+    `rows` are the fields of `car`, shape (16, N). The slope pulls with `pull` [N]. `assumed_height`
+    is the camera's assumed height over its actual height [-].
     """
 
     substeps: int
@@ -86,12 +87,14 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     throttle_rise, throttle_fall, brake_rise, brake_fall
         Rates of the pedals [1/s] (PxVehiclePadSmoothingData: 6 up, 10 down).
     shift_up, shift_down
-        Engine speeds over max_rpm above and below which the gearbox shifts [-] (PxVehicleAutoBoxData: 0.65 and 0.5).
+        Engine speeds over max_rpm above and below which the gearbox shifts [-]
+        (PxVehicleAutoBoxData: 0.65 and 0.5).
     shift_latency
         Minimum time between the beginnings of two shifts [s] (PxVehicleAutoBoxData: 2).
     camera_height, camera_design_radius
-        Height of the camera above the road [m] with wheels of the design radius [m]. Wheels of another radius change
-        the height, and measured gaps scale by the assumed height over the actual height.
+        Height of the camera above the road [m] with wheels of the design radius [m]. Wheels of
+        another radius change the height, and measured gaps scale by the assumed height over the
+        actual height.
     """
 
     UNITS = {
@@ -123,7 +126,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         "maxBrakeTorque": Plausible(20, 50_000),
         "shift_latency": SECONDS,
     }
-    FITTED_UP_TO: ClassVar[float] = 6.5  # m/s; highest speed in simulations of the published settings of sun and rain
+    FITTED_UP_TO: ClassVar[float] = (
+        6.5  # m/s; highest speed in simulations of the published settings of sun and rain
+    )
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive
@@ -147,7 +152,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: float | FloatArray = 0.0,
     ) -> _Prepared:
-        from safevar_sumo.vehicles.carla_step import TYRE_STEPS, Car  # Numba takes longer to load than a simulation
+        from safevar_sumo.vehicles.carla_step import (
+            TYRE_STEPS,
+            Car,
+        )  # Numba takes longer to load than a simulation
 
         c = characteristics
         radius = c["radius"] / 100
@@ -186,7 +194,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             mass=c["mass"],
             shift_time=c["gearSwitchTime"],
             pull=pull,
-            assumed_height=self.camera_height / (self.camera_height + (radius - self.camera_design_radius)),
+            assumed_height=self.camera_height
+            / (self.camera_height + (radius - self.camera_design_radius)),
         )
 
     def _law(self, substep: float, tyre_step: float) -> Law:
@@ -232,10 +241,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return CarlaState(*np.zeros((len(CarlaState._fields), len(prepared.mass))))
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> CarlaState:
-        """The steady state, with the pedals that hold the speed: in every equation of `roll` the rate of change is 0.
+        """The steady state, with the pedals that hold the speed: in every equation of `roll` the
+        rate of change is 0.
 
-        The gearbox has shifted up to the gear for this speed. Where it would now shift down, its last shift has just
-        ended, so that it must wait.
+        The gearbox has shifted up to the gear for this speed. Where it would now shift down, its
+        last shift has just ended, so that it must wait.
         """
         from safevar_sumo.vehicles.carla_step import CarlaState, full_torque
 
@@ -246,49 +256,69 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         resistance = p.wheel_damping * wheel_speed + p.radius * force
 
         def engine_in(ratio: float | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Torque through the clutch and torque that remains for the brake [N m], and engine speed [rad/s]."""
-            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c with the clutch
-            # torque m = -c_e w_e.
-            engine_drag = -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+            """Torque through the clutch and torque that remains for the brake [N m], and engine
+            speed [rad/s].
+            """
+            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c
+            # with the clutch torque m = -c_e w_e.
+            engine_drag = (
+                -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+            )
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
-            engine_speed = np.minimum(ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit)
+            engine_speed = np.minimum(
+                ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit
+            )
             return clutch_torque, ratio * (engine_drag - resistance / ratio), engine_speed
 
         gear = np.ones_like(speed)
         for ratio in OVERALL_RATIOS[1:-1]:
             _, _, engine_speed = engine_in(ratio)
             gear += engine_speed > self.shift_up * p.engine_limit
-        clutch_torque, brake_torque, engine_speed = engine_in(np.take(OVERALL_RATIOS, gear.astype(np.intp)))
+        clutch_torque, brake_torque, engine_speed = engine_in(
+            np.take(OVERALL_RATIOS, gear.astype(np.intp))
+        )
         brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
-        throttle_torque = full_torque(p, law, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
-        throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(throttle_torque, 1.0)
+        throttle_torque = (
+            full_torque(p, law, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
+        )
+        throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(
+            throttle_torque, 1.0
+        )
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         shifts_down = (gear > 1) & (engine_speed < self.shift_down * p.engine_limit)
         since_shift = np.where(shifts_down, prepared.shift_time, self.shift_latency)
-        return CarlaState(speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake)
+        return CarlaState(
+            speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake
+        )
 
     def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does. It may change as soon as it is
-        released.
+        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does. It may change
+        as soon as it is released.
         """
         since_shift = np.where(state.since_shift < 0, self.shift_latency, state.since_shift)
         return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
 
     def _rim_at(self, p: Car, pull: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rim speed at which the tyre force balances air drag and slope [m/s], and that force [N]."""
+        """Rim speed at which the tyre force balances air drag and slope [m/s], and that force
+        [N].
+        """
         force = np.minimum(np.maximum(p.air_drag * speed * speed + pull, -p.grip), p.grip)
         grip_share = np.abs(force) / p.grip
         root = np.ones_like(speed)
         for _ in range(NEWTON_STEPS):  # root^3 = 1 - force / grip; see `tyre_force`
             root = root - (root * root * root - 1 + grip_share) / (3 * root * root)
-        driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (p.slip_stiffness - 1 + root)
+        driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (
+            p.slip_stiffness - 1 + root
+        )
         braking_rim = speed - (speed + self.slip_offset) * (1 - root) / p.slip_stiffness
         return np.where(force < 0, braking_rim, driving_rim), force
 
     def sensors(self, prepared: _Prepared) -> Sensors:
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
 
-    def sense(self, prepared: _Prepared, state: CarlaState, seen: Observation) -> tuple[Observation, CarlaState]:
+    def sense(
+        self, prepared: _Prepared, state: CarlaState, seen: Observation
+    ) -> tuple[Observation, CarlaState]:
         """The gap as the camera measures it: the wheel radius sets the height of the camera."""
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 

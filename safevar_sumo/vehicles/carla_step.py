@@ -1,7 +1,9 @@
-"""One step of vehicle `carla`: the equations of one vehicle, compiled by Numba for many vehicles side by side.
+"""One step of vehicle `carla`: the equations of one vehicle, compiled by Numba for many vehicles
+side by side.
 
-No operation is fused or reordered: a vehicle gets the bits that Python's own floats give, whatever unit computes it.
-Numba's cache notices changes in this file alone, so records are defined here and constants are arguments.
+No operation is fused or reordered: a vehicle gets the bits that Python's own floats give, whatever
+unit computes it. Numba's cache notices changes in this file alone, so records are defined here and
+constants are arguments.
 """
 
 from __future__ import annotations
@@ -14,7 +16,9 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles.compiled import compiled, equation
 
 BLOCK = 64
-"""Number of vehicles side by side: LLVM computes several at once, and a block stays in the processor's first cache."""
+"""Number of vehicles side by side: LLVM computes several at once, and a block stays in the
+processor's first cache.
+"""
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
 NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
@@ -25,9 +29,9 @@ Number = float | FloatArray
 class Car(NamedTuple):
     """Constants of a vehicle, SI.
 
-    Inertias are divided by the tyre step, in which the speed changes by `speed_by_force` per unit of force, and by
-    `speed_by_slope` on a slope. `grip` is the largest tyre force [N]. A shift ends after `shift_end` [s]. Below the
-    speed `standstill` the tyres hold a braked vehicle.
+    Inertias are divided by the tyre step, in which the speed changes by `speed_by_force` per unit
+    of force, and by `speed_by_slope` on a slope. `grip` is the largest tyre force [N]. A shift ends
+    after `shift_end` [s]. Below the speed `standstill` the tyres hold a braked vehicle.
     """
 
     radius: Number
@@ -49,10 +53,11 @@ class Car(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Constants of all vehicles: the substep [s], in which pedals rise and fall so much, engine and gearbox, tyres.
+    """Constants of all vehicles: the substep [s], in which pedals rise and fall so much, engine and
+    gearbox, tyres.
 
-    Torque at full throttle is the lower of two lines over the engine's share of its highest speed: it rises from
-    `torque_idle`, and it falls through `torque_peak` at `peak_share` [N m].
+    Torque at full throttle is the lower of two lines over the engine's share of its highest speed:
+    it rises from `torque_idle`, and it falls through `torque_peak` at `peak_share` [N m].
     """
 
     substep: float
@@ -75,9 +80,11 @@ class Law(NamedTuple):
 
 
 class CarlaState(NamedTuple):
-    """A vehicle's speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began [s], pedals [-].
+    """A vehicle's speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began
+    [s], pedals [-].
 
-    `gear` is neutral during a shift to `target_gear`. `since_shift` is minus infinity while the gear is held.
+    `gear` is neutral during a shift to `target_gear`. `since_shift` is minus infinity while the
+    gear is held.
     """
 
     speed: Number
@@ -139,7 +146,9 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
     speed_share = s.engine_speed / car.engine_limit
     is_ready = s.since_shift >= law.shift_latency
     sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
-    up = sets_off | (is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR))
+    up = sets_off | (
+        is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+    )
     down = is_ready & (speed_share < law.shift_down) & (s.gear > FIRST_GEAR)
     target = s.target_gear + (1.0 if up else 0.0) - (1.0 if down else 0.0)
     since_shift = 0.0 if up | down else s.since_shift + law.substep
@@ -149,28 +158,33 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
 
 @equation
 def tyre_force(car: Car, law: Law, speed: Number, rim: Number) -> Number:
-    """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral slip).
+    """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral
+    slip).
 
     With slip = (rim - speed) / (max(rim, speed) + offset) and K = C |slip| / (mu load):
     F = mu load (K - K^2 / 3 + K^3 / 27) = mu load (1 - (1 - K / 3)^3) up to K = 3, mu load beyond.
     """
     slip_speed = rim - speed
     denominator = np.maximum(rim, speed) + law.slip_offset
-    rest = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator  # 1 - K / 3
+    rest = (
+        np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
+    )  # 1 - K / 3
     return np.copysign(car.grip - car.grip * rest * rest * rest, slip_speed)
 
 
 @equation
-def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brake: Number) -> Speeds:
+def roll(
+    car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brake: Number
+) -> Speeds:
     """Engine, clutch, wheels, tyres and body over one substep.
 
     I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
     I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
     m dv/dt = F - D v |v| - m g sin
 
-    Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are damping rates,
-    D is the air drag. The tyre force F is explicit. It may end the slip within a step but never reverse it, so the
-    slip cannot oscillate.
+    Index e is the engine, w the wheels; G is the gear ratio, k_c the clutch strength, c_e and d are
+    damping rates, D is the air drag. The tyre force F is explicit. It may end the slip within a
+    step but never reverse it, so the slip cannot oscillate.
     """
     ratio = ratio_of(law, gear)
     clutch = car.clutch if gear > NEUTRAL else 0.0
@@ -178,8 +192,11 @@ def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brak
     clutch_by_ratio = ratio * clutch
     # Inertias with everything that is implicit:
     engine = law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
-    wheel = car.wheel_inertia + car.wheel_damping + clutch_by_ratio * ratio * (1.0 - clutch / engine)
-    # Coefficients of a tyre step: x_by_y is the change of x for a unit of y; the rim's speed stands for the wheel's.
+    wheel = (
+        car.wheel_inertia + car.wheel_damping + clutch_by_ratio * ratio * (1.0 - clutch / engine)
+    )
+    # Coefficients of a tyre step: x_by_y is the change of x for a unit of y; the rim's speed stands
+    # for the wheel's.
     engine_share = law.engine_inertia / engine
     engine_gain = throttle * _full_torque(car, law, s.engine_speed) / engine
     rim_by_torque = car.radius / wheel
@@ -208,7 +225,9 @@ def roll(car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brak
 
 
 @equation
-def move(car: Car, law: Law, s: CarlaState, throttle_command: Number, brake_command: Number) -> CarlaState:
+def move(
+    car: Car, law: Law, s: CarlaState, throttle_command: Number, brake_command: Number
+) -> CarlaState:
     """The state of a vehicle one substep later."""
     throttle = pedal_position(throttle_command, s.throttle, law.throttle_fall, law.throttle_rise)
     brake = pedal_position(brake_command, s.brake, law.brake_fall, law.brake_rise)
@@ -232,16 +251,22 @@ def car_in(t: FloatArray, i: int) -> Car:
 @equation
 def state_in(t: FloatArray, i: int) -> CarlaState:
     """The state in column i of a block."""
-    return CarlaState(t[16, i], t[17, i], t[18, i], t[19, i], t[20, i], t[21, i], t[22, i], t[23, i])
+    return CarlaState(
+        t[16, i], t[17, i], t[18, i], t[19, i], t[20, i], t[21, i], t[22, i], t[23, i]
+    )
 
 
 @compiled
-def advance(cars: FloatArray, law: Law, states: FloatArray, commands: FloatArray, substeps: int) -> None:
-    """Move N vehicles: rows of `cars` are those of `Car`, shape (16, N), of `states`, which changes, those of
-    `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
+def advance(
+    cars: FloatArray, law: Law, states: FloatArray, commands: FloatArray, substeps: int
+) -> None:
+    """Move N vehicles: rows of `cars` are those of `Car`, shape (16, N), of `states`, which
+    changes, those of `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
     """
     n = states.shape[1]
-    t = np.ones((26, BLOCK))  # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1
+    t = np.ones(
+        (26, BLOCK)
+    )  # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
         t[:16, :count] = cars[:, start : start + count]

@@ -1,5 +1,5 @@
-"""Vehicle characteristics, and parameters of the scenario that a study searches with them: their domains, the filter of
-small changes, and measures of change.
+"""Vehicle characteristics, and parameters of the scenario that a study searches with them: their
+domains, the filter of small changes, and measures of change.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from safevar_sumo.study import Study, plain_values, unit_text
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
 ROUNDING = 1e-6
-"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors."""
+"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors.
+"""
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
-"""Pairs of the smallest width of a domain, and the share beta of the width above which the filter keeps changes (method
-section 2).
+"""Pairs of the smallest width of a domain, and the share beta of the width above which the filter
+keeps changes (method section 2).
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
-    """One characteristic of the vehicle under test, or a searched parameter of the scenario (`is_scenario`); all
-    quantities are in `unit`.
+    """One characteristic of the vehicle under test, or a searched parameter of the scenario
+    (`is_scenario`); all quantities are in `unit`.
 
-    A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names the part of a real
-    vehicle that determines it; both may be empty.
+    A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names
+    the part of a real vehicle that determines it; both may be empty.
     """
 
     name: str
@@ -49,8 +50,8 @@ class Characteristic:
 
     @property
     def short_name(self) -> str:
-        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the study gives no
-        meaning.
+        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the
+        study gives no meaning.
         """
         return re.split(r"[,;(]", self.meaning)[0].strip() or self.name
 
@@ -62,8 +63,8 @@ class Characteristic:
 
     @property
     def threshold(self) -> float:
-        """Largest change that the filter removes: Th = beta (u - l) (method section 2); 0 for a parameter of the
-        scenario, of which any value is an encounter.
+        """Largest change that the filter removes: Th = beta (u - l) (method section 2); 0 for a
+        parameter of the scenario, of which any value is an encounter.
         """
         return 0.0 if self.is_scenario else self.resolution
 
@@ -71,7 +72,10 @@ class Characteristic:
     def resolution(self) -> float:
         """A change that matters little: beta (u - l) (method section 2)."""
         width = self.upper - self.lower
-        return next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width) * width
+        return (
+            next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width)
+            * width
+        )
 
     @property
     def largest_plausible(self) -> float:
@@ -79,7 +83,9 @@ class Characteristic:
         return PLAUSIBLE_MULTIPLE * max(abs(self.lower), abs(self.upper))
 
     def text(self, value: float) -> str:
-        """A value as text, rounded so that one unit of its last digit is at most a quarter of `resolution`."""
+        """A value as text, rounded so that one unit of its last digit is at most a quarter of
+        `resolution`.
+        """
         return f"{value:.{self.digits}f}"
 
     @property
@@ -88,7 +94,9 @@ class Characteristic:
         return max(0, math.ceil(-math.log10(self.resolution / 4)))
 
     def rounded(self, value: float, *, upwards: bool) -> float:
-        """A limit rounded to the digits of `text`, upwards or downwards; never beyond the original."""
+        """A limit rounded to the digits of `text`, upwards or downwards; never beyond the
+        original.
+        """
         scaled = value * 10**self.digits
         original = self.original
         up = math.ceil(scaled - ROUNDING)
@@ -110,11 +118,18 @@ class Characteristic:
         """The unit as text after a number; empty without a unit."""
         return unit_text(self.unit)
 
-    def check(self, value: float, *, beyond: bool = False, otherwise: str = "", switch: str = "beyond=True") -> None:
+    def check(
+        self,
+        value: float,
+        *,
+        beyond: bool = False,
+        otherwise: str = "",
+        switch: str = "beyond=True",
+    ) -> None:
         """Refuse a value that is not a number or not legal (`is_legal`).
 
-        `otherwise` describes further legal values; `switch` is the option that allows values beyond the domain, empty
-        if there is none.
+        `otherwise` describes further legal values; `switch` is the option that allows values beyond
+        the domain, empty if there is none.
 
         Raises
         ------
@@ -128,7 +143,9 @@ class Characteristic:
                 if beyond
                 else f"a number in [{self.lower:g}, {self.upper:g}]"
             )
-            is_outside_domain = not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            is_outside_domain = (
+                not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
+            )
             hint = f", or any with {switch}" if is_outside_domain and switch else ""
             raise InputError(
                 "",
@@ -137,21 +154,24 @@ class Characteristic:
             )
 
     def is_legal(self, values: Quantity, *, beyond: bool) -> Quantity:
-        """Whether values, a number or an array, are in the domain; with `beyond`, whether they are plausible.
+        """Whether values, a number or an array, are in the domain; with `beyond`, whether they are
+        plausible.
 
-        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0 if the domain is,
-        and never below 0 in the scenario.
+        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0
+        if the domain is, and never below 0 in the scenario.
         """
         if beyond:
-            is_positive = (values > 0) | (self.lower <= 0) & ((values >= 0) | (not self.is_scenario))
+            is_positive = (values > 0) | (self.lower <= 0) & (
+                (values >= 0) | (not self.is_scenario)
+            )
             return (np.abs(values) <= self.largest_plausible) & is_positive
         return (values >= self.lower) & (values <= self.upper)
 
 
 @dataclass(frozen=True)
 class CharacteristicSet:
-    """The n characteristics C_1..C_n of a study, those of the vehicle before the parameters of its scenario; N settings
-    are an array of shape (N, n).
+    """The n characteristics C_1..C_n of a study, those of the vehicle before the parameters of its
+    scenario; N settings are an array of shape (N, n).
     """
 
     members: tuple[Characteristic, ...]
@@ -161,7 +181,11 @@ class CharacteristicSet:
         """The characteristics of a study, in its order."""
         return cls(
             tuple(
-                Characteristic(name=name, is_scenario=name in study.scenario.search, **msgspec.structs.asdict(row))
+                Characteristic(
+                    name=name,
+                    is_scenario=name in study.scenario.search,
+                    **msgspec.structs.asdict(row),
+                )
                 for name, row in study.domains.items()
             )
         )
@@ -217,12 +241,16 @@ class CharacteristicSet:
 
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
-        values = np.array([getattr(characteristic, attribute) for characteristic in self.members], dtype=float)
+        values = np.array(
+            [getattr(characteristic, attribute) for characteristic in self.members], dtype=float
+        )
         values.flags.writeable = False
         return values
 
     def filter(self, settings: FloatArray) -> FloatArray:
-        """Reset each value that differs from the original by no more than the threshold (method section 2)."""
+        """Reset each value that differs from the original by no more than the threshold (method
+        section 2).
+        """
         return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
 
     def changed(self, filtered: FloatArray) -> BoolArray:
@@ -230,21 +258,28 @@ class CharacteristicSet:
         return np.asarray(filtered != self.original)
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w (method section 3,
-        where w = 1), of the vehicle's characteristics; the domain's width stands for an original of 0.
+        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w
+        (method section 3, where w = 1), of the vehicle's characteristics; the domain's width stands
+        for an original of 0.
         """
         vehicle = self.vehicle
-        scale = np.where(vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original))
+        scale = np.where(
+            vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
+        )
         change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
         return np.asarray(np.max(vehicle.weight * change, axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
-        """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method section 3)."""
-        return np.asarray(np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float)
+        """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method
+        section 3).
+        """
+        return np.asarray(
+            np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float
+        )
 
     def setting(self, values: Mapping[str, float], *, beyond: bool = False) -> FloatArray:
-        """The original setting with some values replaced, shape (n,); with `beyond`, plausible values outside the
-        domain are legal.
+        """The original setting with some values replaced, shape (n,); with `beyond`, plausible
+        values outside the domain are legal.
 
         Raises
         ------
@@ -253,7 +288,11 @@ class CharacteristicSet:
         """
         values = plain_values(values)
         if not isinstance(values, Mapping):
-            raise InputError("", f"is a {type(values).__name__}", "values by characteristic, such as {'mass': 2500}")
+            raise InputError(
+                "",
+                f"is a {type(values).__name__}",
+                "values by characteristic, such as {'mass': 2500}",
+            )
         setting = self.original.copy()
         for name, value in values.items():
             check_name("", f"there is no characteristic {name!r}", name, self.names)

@@ -1,6 +1,7 @@
 """Equations compiled by Numba: kept in its cache for later processes, where that can be written.
 
-No operation is fused or reordered, so results have the bits of Python's own floats, whatever unit computes them.
+No operation is fused or reordered, so results have the bits of Python's own floats, whatever unit
+computes them.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ def equation(function: Function) -> Function:
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function when it is first called with arguments of new types, unless the cache has it."""
+    """Compile a function when it is first called with arguments of new types, unless the cache has
+    it.
+    """
     try:
         made: Any = numba.njit(error_model="numpy", cache=True)(function)
     except RuntimeError:  # no folder for a cache can be written
@@ -43,7 +46,9 @@ def compiled(function: Function) -> Function:
 
 
 def is_compiled(call: Callable[[], object]) -> bool:
-    """Call compiled functions, and say whether all were compiled before; the call ends where one was not."""
+    """Call compiled functions, and say whether all were compiled before; the call ends where one
+    was not.
+    """
     try:
         with event.install_listener("numba:compile", _Refuser()):
             call()

@@ -1,8 +1,8 @@
 """Lincoln2017MKZ of LGSVL 2021.1: VehicleSMI on Unity's WheelColliders, along its path.
 
-The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's WheelCollider. One equivalent
-wheel represents the four. In a substep, wheel and body form one linear system with the secant stiffness of the tyre.
-Its implicit solution has a closed form.
+The equations come from the simulator's `VehicleSMI.cs` and from the friction of Unity's
+WheelCollider. One equivalent wheel represents the four. In a substep, wheel and body form one
+linear system with the secant stiffness of the tyre. Its implicit solution has a closed form.
 """
 
 from __future__ import annotations
@@ -14,10 +14,19 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, Observation
-from safevar_sumo.vehicles.base import LEVEL, MASS, SECONDS, Characteristics, Plausible, Slope, SumoType, Vehicle
+from safevar_sumo.vehicles.base import (
+    LEVEL,
+    MASS,
+    SECONDS,
+    Characteristics,
+    Plausible,
+    Slope,
+    SumoType,
+    Vehicle,
+)
 
-# Constants used with arrays in every step are arrays themselves: numpy would convert a float each time, which doubles
-# the cost.
+# Constants used with arrays in every step are arrays themselves: numpy would convert a float each
+# time, which doubles the cost.
 ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
 RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
@@ -28,8 +37,12 @@ FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
 RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
-TRACTION_START = 1 - 0.675  # share of maxMotorTorque that the traction control allows at the start; VehicleSMI
-TRACTION_RATE = 6.75 / 0.02  # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz
+TRACTION_START = (
+    1 - 0.675
+)  # share of maxMotorTorque that the traction control allows at the start; VehicleSMI
+TRACTION_RATE = (
+    6.75 / 0.02
+)  # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
@@ -39,7 +52,8 @@ SLIP_FLOOR = np.array(4.0)  # m/s, smallest denominator of a slip (assumption, a
 LEAST_RIM_SPEED = np.array(1e-3)  # m/s, smallest rim speed that a slip limit is relative to
 HOLD_SPEED = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
 WHEELBASE = np.array(2.85)  # m
-# Initial errors for the lane keeping to correct (assumption), so that the steering angle has an effect.
+# Initial errors for the lane keeping to correct (assumption), so that the steering angle has an
+# effect.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
 LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
 TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
@@ -74,9 +88,9 @@ class _Prepared(NamedTuple):
 
 
 class LgsvlState(NamedTuple):
-    """State of N vehicles: speeds of vehicle [m/s], wheels [rad/s] and engine [r/min]; gear and gear ratios [-]; time
-    since the last shift [s]; torque that the traction control allows [N m]; lateral position [m]; heading [rad];
-    pedals [-].
+    """State of N vehicles: speeds of vehicle [m/s], wheels [rad/s] and engine [r/min]; gear and
+    gear ratios [-]; time since the last shift [s]; torque that the traction control allows [N m];
+    lateral position [m]; heading [rad]; pedals [-].
     """
 
     speed: FloatArray
@@ -103,7 +117,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     wheel_mass_share
         Share of the four wheels' mass that is added to the mass of the body [-].
     wheel_damping_share
-        Share of wheelDamping that acts on a rolling wheel [-]; the published data show little damping.
+        Share of wheelDamping that acts on a rolling wheel [-]; the published data show little
+        damping.
     steering_design_angle
         maxSteeringAngle of the vehicle for which the lane keeping was designed [deg].
     """
@@ -176,7 +191,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             friction=np.asarray(FRICTION * road_friction),
         )
         creep_speed = _rim_at(
-            prepared, np.zeros_like(prepared.mass), np.abs(prepared.body * prepared.slope_deceleration)
+            prepared,
+            np.zeros_like(prepared.mass),
+            np.abs(prepared.body * prepared.slope_deceleration),
         )
         return prepared._replace(standstill=HOLD_SPEED + creep_speed)
 
@@ -214,7 +231,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
         """The steady state at a speed: every equation with its rate of change set to zero.
 
-        The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this speed.
+        The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this
+        speed.
         """
         p = prepared
         zeros = np.zeros_like(prepared.mass)
@@ -247,13 +265,17 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             brake=brake,
         )
 
-    def sense(self, prepared: _Prepared, state: LgsvlState, seen: Observation) -> tuple[Observation, LgsvlState]:
+    def sense(
+        self, prepared: _Prepared, state: LgsvlState, seen: Observation
+    ) -> tuple[Observation, LgsvlState]:
         return seen, state
 
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
-        pedal_share = p.step / (p.step + self.pedal_lag)  # of its error that a pedal makes up in a step
+        pedal_share = p.step / (
+            p.step + self.pedal_lag
+        )  # of its error that a pedal makes up in a step
         state = _shift(p, state)._replace(
             throttle=state.throttle + (command.throttle - state.throttle) * pedal_share,
             brake=state.brake + (command.brake - state.brake) * pedal_share,
@@ -266,12 +288,15 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return state._replace(since_shift=state.since_shift + p.step)
 
     def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and cornering drag [N s/m].
+        """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and
+        cornering drag [N s/m].
 
-        The lane keeping commands a share of the full steering angle; the share suits the vehicle for which it was
-        designed.
+        The lane keeping commands a share of the full steering angle; the share suits the vehicle
+        for which it was designed.
         """
-        share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (self.steering_design_angle * RADIANS)
+        share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (
+            self.steering_design_angle * RADIANS
+        )
         angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
         curvature = angle / WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
@@ -281,8 +306,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from the old one to the
-    new one.
+    """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from
+    the old one to the new one.
     """
     rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
@@ -302,12 +327,16 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     """The gear ratio in use."""
-    return np.asarray(s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE))
+    return np.asarray(
+        s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
+    )
 
 
-def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: FloatArray) -> LgsvlState:
-    """One implicit Euler step of engine speed, wheel and body, linear in the new speeds; the wheel's equation is solved
-    with the body's speed eliminated.
+def _roll(
+    p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: FloatArray
+) -> LgsvlState:
+    """One implicit Euler step of engine speed, wheel and body, linear in the new speeds; the
+    wheel's equation is solved with the body's speed eliminated.
 
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
@@ -320,14 +349,18 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
     is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
-    traction_torque = s.traction_torque + np.where(is_spinning, -TRACTION_RATE * h, TRACTION_RATE * h)
+    traction_torque = s.traction_torque + np.where(
+        is_spinning, -TRACTION_RATE * h, TRACTION_RATE * h
+    )
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = h * p.radius * stiffness
     damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
     slope_speed = s.speed - p.slope_deceleration * h
     wheel_momentum = (
-        p.inertia * s.wheel_speed + h * (drive - s.brake * p.brake_torque) + pull * p.body * slope_speed / damped_mass
+        p.inertia * s.wheel_speed
+        + h * (drive - s.brake * p.brake_torque)
+        + pull * p.body * slope_speed / damped_mass
     )
     wheel_speed = np.maximum(wheel_momentum, ZERO) / (
         p.inertia + h * p.damping + pull * p.radius - pull * pull / damped_mass
@@ -345,8 +378,8 @@ def _roll(p: _Prepared, s: LgsvlState, gearing: FloatArray, cornering_drag: Floa
 
 
 def _torque_share(rpm_share: FloatArray) -> FloatArray:
-    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola below 1, zero from 1
-    on (assumption).
+    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola
+    below 1, zero from 1 on (assumption).
     """
     torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (ONE - rpm_share)
     is_overspeed = rpm_share >= ONE
@@ -356,19 +389,27 @@ def _torque_share(rpm_share: FloatArray) -> FloatArray:
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
-    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness` solved for the rim
-    speed.
+    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness`
+    solved for the rim speed.
     """
-    grip_share = np.minimum(np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0)
-    slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))  # grip_share = x (2 - x), x = slip / PEAK_SLIP
+    grip_share = np.minimum(
+        np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0
+    )
+    slip = (
+        PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
+    )  # grip_share = x (2 - x), x = slip / PEAK_SLIP
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
-    return np.asarray(np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim))
+    return np.asarray(
+        np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim)
+    )
 
 
-def _tyre_stiffness(p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed: FloatArray) -> FloatArray:
-    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum, then a line to the
-    asymptote.
+def _tyre_stiffness(
+    p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed: FloatArray
+) -> FloatArray:
+    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum,
+    then a line to the asymptote.
     """
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator

@@ -14,7 +14,9 @@ from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""Tolerated violation of a bound, as a share of the range of the quantity in the domains [-]; covers rounding."""
+"""Tolerated violation of a bound, as a share of the range of the quantity in the domains [-];
+covers rounding.
+"""
 N_REPAIR_SHARES = 64
 """Number of settings that a repair tries between an infeasible setting and the original."""
 REJECTIONS = 1000
@@ -22,12 +24,15 @@ REJECTIONS = 1000
 LARGEST_DRAW = 10_000
 """Largest number of settings that are drawn at once, unless more are missing."""
 N_PROBES, LEAST_SHARE = 10_000, 0.002
-"""Number of random settings of which at least this share has to be feasible, so that random settings can be drawn."""
+"""Number of random settings of which at least this share has to be feasible, so that random
+settings can be drawn.
+"""
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: the `weights` of characteristics by their numbers, the size `width` of the sum's
-    range in the domains, its bounds, and the bounds and unit in words, `condition` and `suffix`.
+    """A constraint as a computation: the `weights` of characteristics by their numbers, the size
+    `width` of the sum's range in the domains, its bounds, and the bounds and unit in words,
+    `condition` and `suffix`.
     """
 
     constraint: Constraint
@@ -39,11 +44,15 @@ class _Bounds(NamedTuple):
     suffix: str
 
     @classmethod
-    def of(cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet) -> _Bounds:
+    def of(
+        cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet
+    ) -> _Bounds:
         """The computation of a study's constraint."""
         table = study.domains
         widths = characteristics.upper - characteristics.lower
-        weights = tuple((characteristics.names.index(name), weight) for name, weight in constraint.sum.items())
+        weights = tuple(
+            (characteristics.names.index(name), weight) for name, weight in constraint.sum.items()
+        )
         return cls(
             constraint,
             weights,
@@ -55,7 +64,9 @@ class _Bounds(NamedTuple):
         )
 
     def quantity(self, settings: FloatArray) -> FloatArray:
-        """The weighted sum, shape (N,), added term by term so that it does not depend on the number of settings."""
+        """The weighted sum, shape (N,), added term by term so that it does not depend on the number
+        of settings.
+        """
         total = np.zeros(len(settings))
         for column, weight in self.weights:
             total = total + weight * settings[:, column]
@@ -64,7 +75,9 @@ class _Bounds(NamedTuple):
     def excess(self, settings: FloatArray) -> FloatArray:
         """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
         values = self.quantity(settings)
-        return np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width
+        return (
+            np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width
+        )
 
     def __str__(self) -> str:
         return f"{self.constraint.quantity} {self.condition}"
@@ -84,8 +97,8 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum of a setting's violations, each as a share of the range of the constraint's quantity, shape (N,); 0 if
-        feasible.
+        """Sum of a setting's violations, each as a share of the range of the constraint's quantity,
+        shape (N,); 0 if feasible.
         """
         excess = np.zeros(len(settings))
         for bound in self.bounds:
@@ -102,11 +115,14 @@ class FeasibleRegion:
         Raises
         ------
         InputError
-            Naming the constraint that the first infeasible setting violates, and the values of that setting.
+            Naming the constraint that the first infeasible setting violates, and the values of that
+            setting.
         """
         for setting in settings[~self.feasible(settings)][:1]:  # the first one, if any
             row = setting[np.newaxis]
-            bound = next(bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds))
+            bound = next(
+                bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds)
+            )
             values = ", ".join(
                 f"{characteristic.name} = {value:g}{characteristic.suffix}"
                 for characteristic, value in zip(self.characteristics, setting, strict=True)
@@ -117,7 +133,9 @@ class FeasibleRegion:
             raise InputError("", problem, bound.condition + otherwise)
 
     def repaired(self, settings: FloatArray) -> FloatArray:
-        """Settings moved towards the original until they are feasible after the filter, shape (N, n)."""
+        """Settings moved towards the original until they are feasible after the filter, shape (N,
+        n).
+        """
         repaired = settings.copy()
         original = self.characteristics.original
         infeasible = np.flatnonzero(~self._are_accepted(settings, filtered=True))
@@ -128,9 +146,11 @@ class FeasibleRegion:
             infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered=True)]
         return repaired
 
-    def draw_feasible(self, draw: Callable[[int], FloatArray], number: int, *, filtered: bool = False) -> FloatArray:
-        """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`, feasible after the
-        filter. They are fewer if `REJECTIONS` draws for each do not suffice.
+    def draw_feasible(
+        self, draw: Callable[[int], FloatArray], number: int, *, filtered: bool = False
+    ) -> FloatArray:
+        """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`,
+        feasible after the filter. They are fewer if `REJECTIONS` draws for each do not suffice.
         """
         batches = [np.zeros((0, len(self.characteristics)))]
         draws = 0
@@ -153,7 +173,9 @@ def region_of(study: Study) -> FeasibleRegion:
         If the original vehicle or nearly every other setting is infeasible.
     """
     characteristics = CharacteristicSet.of(study)
-    bounds = tuple(_Bounds.of(constraint, study, characteristics) for constraint in study.constraints)
+    bounds = tuple(
+        _Bounds.of(constraint, study, characteristics) for constraint in study.constraints
+    )
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:
         return region
@@ -163,6 +185,11 @@ def region_of(study: Study) -> FeasibleRegion:
     shape = (N_PROBES, len(characteristics))
     probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
     if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
-        problem = f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them: {region}"
-        raise InputError("", problem, "narrower domains, or constraints that leave more than an equation does")
+        problem = (
+            f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
+            f" {region}"
+        )
+        raise InputError(
+            "", problem, "narrower domains, or constraints that leave more than an equation does"
+        )
     return region

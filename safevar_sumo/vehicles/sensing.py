@@ -1,7 +1,7 @@
 """Vehicles with delayed sensors and brakes.
 
-`SumoVehicle` has the parameters of a SUMO vType; `WornVehicle` is a car with worn tyres and brakes, a payload and
-degraded sensors.
+`SumoVehicle` has the parameters of a SUMO vType; `WornVehicle` is a car with worn tyres and brakes,
+a payload and degraded sensors.
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_frictio
 TANGENT_DECIMALS = 12
 """Decimals to which a tangent is rounded: its last bits differ between machines."""
 RELEASED_BRAKE = 1e-6
-"""Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command that fades out between
-two steps must not hold the engine off.
+"""Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command
+that fades out between two steps must not hold the engine off.
 """
 
 
 class _PreparedSumo(NamedTuple):
-    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the largest acceleration by the tyres."""
+    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the largest acceleration
+    by the tyres.
+    """
 
     step: float
     mass: FloatArray
@@ -65,7 +67,8 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     reference_mass
         Mass to which accel and decel refer [kg]; at another mass the forces stay the same.
     tyre_friction
-        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this coefficient times g.
+        Friction coefficient of the tyres on a dry road [-]; no acceleration exceeds this
+        coefficient times g.
     """
 
     UNITS = {
@@ -138,7 +141,9 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         is_braking = brake > RELEASED_BRAKE
         commanded = np.where(is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive)
         target = np.minimum(np.maximum(commanded, -p.grip), p.grip)
-        acceleration = state.acceleration + (target - state.acceleration) * (p.step / (p.actuator_lag + p.step))
+        acceleration = state.acceleration + (target - state.acceleration) * (
+            p.step / (p.actuator_lag + p.step)
+        )
         # Braking ends a positive acceleration at once, without lag.
         return np.where(is_braking, np.minimum(acceleration, 0.0), acceleration)
 
@@ -146,9 +151,10 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 class _PreparedWorn(NamedTuple):
     """Constants of a run, SI, shape (N,); see `SensingVehicle`.
 
-    `grip` is the friction coefficient at rest, `lift` its fall with speed (wet_road.py) [s^2/m^2]; `front_load` and
-    `rear_load` are the axles' shares of the weight at rest [-]. `tangent` is that of the sensors' angle, `dropout` the
-    share of lost frames [-]; None if the study does not have them.
+    `grip` is the friction coefficient at rest, `lift` its fall with speed (wet_road.py) [s^2/m^2];
+    `front_load` and `rear_load` are the axles' shares of the weight at rest [-]. `tangent` is that
+    of the sensors' angle, `dropout` the share of lost frames [-]; None if the study does not have
+    them.
     """
 
     step: float
@@ -169,19 +175,22 @@ class _PreparedWorn(NamedTuple):
 
 
 class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A car with two axles that never lock: each axle brakes up to the friction that its load allows.
+    """A car with two axles that never lock: each axle brakes up to the friction that its load
+    allows.
 
     Parameters
     ----------
     kerb_mass, kerb_centre, wheelbase, centre_height
-        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase, height of the centre of
-        mass [m].
+        The empty car: mass [kg], distance of the centre of mass from the front axle, wheelbase,
+        height of the centre of mass [m].
     drive_force, brake_force, front_share
         Largest forces of engine and brakes [N], and the front axle's share of the brake force [-].
     tyre_friction
-        Friction coefficient on a dry road of new and worn tyres [-]: the mean of the roads of published stops.
+        Friction coefficient on a dry road of new and worn tyres [-]: the mean of the roads of
+        published stops.
     water_lift, road_texture
-        Constants a [s^2/m^2 mm^0.5] and b [mm] of the friction on a wet road (wet_road.py), fitted to published stops.
+        Constants a [s^2/m^2 mm^0.5] and b [mm] of the friction on a wet road (wet_road.py), fitted
+        to published stops.
     max_speed
         Top speed [m/s].
     frame_seed
@@ -189,20 +198,22 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 
     Notes
     -----
-    With a `sensorAngle` the lateral place of what is seen is off by its gap times the tangent of the angle, above 0
-    away from the side that it comes from. Of the sensors' frames the share `sensorDropout` is lost, the same frames in
-    all vehicles: then the driving system sees the last one again.
+    With a `sensorAngle` the lateral place of what is seen is off by its gap times the tangent of
+    the angle, above 0 away from the side that it comes from. Of the sensors' frames the share
+    `sensorDropout` is lost, the same frames in all vehicles: then the driving system sees the last
+    one again.
 
-    The friction coefficient mu on a dry road is `tyre_friction` times the weather's `road_friction`, whatever the
-    tread. Under water this is the grip at rest, and mu falls with speed, water and lost tread, step by step
-    (wet_road.py).
+    The friction coefficient mu on a dry road is `tyre_friction` times the weather's
+    `road_friction`, whatever the tread. Under water this is the grip at rest, and mu falls with
+    speed, water and lost tread, step by step (wet_road.py).
 
-    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is the smallest of F /
-    m (brake force and mass), mu g, and, for each axle, the a at which that axle reaches its limit while the other axle
-    brakes with its share. With the centre of mass at the height h and the distance x behind the front axle, and the
-    wheelbase L, the limits are mu m (g (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle.
-    On a slope, g stands for the component of gravity onto the road, and the component along the road acts in addition
-    to a. The vehicle never rolls back.
+    Brakes act on the command of `brakeResponse` ago, a dead time without lag. The deceleration a is
+    the smallest of F / m (brake force and mass), mu g, and, for each axle, the a at which that axle
+    reaches its limit while the other axle brakes with its share. With the centre of mass at the
+    height h and the distance x behind the front axle, and the wheelbase L, the limits are mu m (g
+    (L - x) + a h) / L at the front axle and mu m (g x - a h) / L at the rear axle. On a slope, g
+    stands for the component of gravity onto the road, and the component along the road acts in
+    addition to a. The vehicle never rolls back.
     """
 
     UNITS = {
@@ -264,11 +275,17 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     ) -> _PreparedWorn:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
-        rear_load = (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]) / mass / self.wheelbase
+        rear_load = (
+            (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"])
+            / mass
+            / self.wheelbase
+        )
         tread = np.maximum(c["treadDepth"], 0.0)
         tangent: FloatArray | None = None
         if "sensorAngle" in c:
-            tangent = np.asarray(np.round(np.tan(np.radians(c["sensorAngle"])), TANGENT_DECIMALS), dtype=float)
+            tangent = np.asarray(
+                np.round(np.tan(np.radians(c["sensorAngle"])), TANGENT_DECIMALS), dtype=float
+            )
         return _PreparedWorn(
             step=step,
             mass=mass,
@@ -287,7 +304,9 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             dropout=c.get("sensorDropout"),
         )
 
-    def sense(self, prepared: Prepared, state: SensingState, seen: Observation) -> tuple[Observation, SensingState]:
+    def sense(
+        self, prepared: Prepared, state: SensingState, seen: Observation
+    ) -> tuple[Observation, SensingState]:
         """What sensors see that look aside and lose frames."""
         sensed, state = SensingVehicle.sense(self, prepared, state, seen)
         if prepared.tangent is not None:
@@ -300,7 +319,9 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             number = round(seen.time / prepared.step)
             is_lost = np.random.default_rng([self.frame_seed, number]).random() < prepared.dropout
             frame = np.where(is_lost, state.frame, frame)
-        return sensed._replace(**dict(zip(DELAYED, frame, strict=True))), state._replace(frame=frame)
+        return sensed._replace(**dict(zip(DELAYED, frame, strict=True))), state._replace(
+            frame=frame
+        )
 
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
         p = prepared
@@ -319,7 +340,9 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         return np.where(brake > 0, -self._deceleration(p, brake, grip), drive)
 
     def _deceleration(self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray) -> FloatArray:
-        """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction coefficient now."""
+        """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction
+        coefficient now.
+        """
         demand = pedal * p.brake
         grip_limit = grip * p.slope.down
         lever = grip * (self.centre_height / self.wheelbase)

@@ -1,4 +1,6 @@
-"""Sensors that report the past, brakes that follow late: delayed signals, and the base of vehicles that have them."""
+"""Sensors that report the past, brakes that follow late: delayed signals, and the base of vehicles
+that have them.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +22,25 @@ SPARE = 32
 
 
 class DelayedSignal:
-    """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and an older one.
+    """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and
+    an older one.
 
     Attributes
     ----------
     samples
         The last L samples, newest first, shape (L, ..., N).
     newer
-        For every value of a sample, its index in `samples.ravel()` where that is the newer sample, shape (..., N).
+        For every value of a sample, its index in `samples.ravel()` where that is the newer sample,
+        shape (..., N).
     share
         The older sample's share, shape (N,).
     """
 
     __slots__ = ("_begin", "_room", "newer", "samples", "share")
 
-    def __init__(self, samples: FloatArray, newer: IntArray, share: FloatArray, room: _Room | None = None) -> None:
+    def __init__(
+        self, samples: FloatArray, newer: IntArray, share: FloatArray, room: _Room | None = None
+    ) -> None:
         if room is None:
             room = _Room(samples)
         self._room = room
@@ -55,13 +61,21 @@ class DelayedSignal:
         longest = float(np.max(delay))
         age = delay / step
         if not longest <= LONGEST_DELAY:
-            raise InputError("vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s")
+            raise InputError(
+                "vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s"
+            )
         whole_steps = np.floor(age)
-        newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(sample.shape)
-        return cls(np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps)
+        newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(
+            sample.shape
+        )
+        return cls(
+            np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps
+        )
 
     def where(self, chosen: BoolArray, other: DelayedSignal) -> DelayedSignal:
-        """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of all others."""
+        """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of
+        all others.
+        """
         samples = np.where(chosen, self.samples, other.samples)
         newer = np.where(chosen, self.newer, other.newer)
         return DelayedSignal(samples, newer, np.where(chosen, self.share, other.share))
@@ -69,17 +83,23 @@ class DelayedSignal:
     def extended(self, sample: FloatArray) -> DelayedSignal:
         """The history with a new sample at its front and the oldest one dropped."""
         room = self._room
-        if room.begin != self._begin or not room.begin:  # another history goes on there, or it is full
+        if (
+            room.begin != self._begin or not room.begin
+        ):  # another history goes on there, or it is full
             room = _Room(self.samples)
         room.begin -= 1
         room.samples[room.begin] = sample
         return DelayedSignal(self.samples, self.newer, self.share, room)
 
     def delayed(self) -> FloatArray:
-        """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (..., N)."""
+        """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (...,
+        N).
+        """
         newer = self.samples.take(self.newer)
         older = self.samples[1:].take(self.newer)
-        with np.errstate(invalid="ignore"):  # a signal is infinite while out of sight, finite a step later
+        with np.errstate(
+            invalid="ignore"
+        ):  # a signal is infinite while out of sight, finite a step later
             signal = newer * (1 - self.share) + older * self.share
         np.copyto(signal, newer, where=np.isnan(signal))
         return signal
@@ -96,15 +116,27 @@ class _Room:
         self.samples[SPARE:] = samples
 
 
-DELAYED = ("gap", "closing_speed", "lateral", "lateral_speed", "obstacle_speed", "obstacle_width", "obstacle")
+DELAYED = (
+    "gap",
+    "closing_speed",
+    "lateral",
+    "lateral_speed",
+    "obstacle_speed",
+    "obstacle_width",
+    "obstacle",
+)
 """What sensors report of an obstacle."""
 
 
 def sensed_observation(
-    seen: Observation, past: DelayedSignal | None, latency: FloatArray, reach: FloatArray, step: float
+    seen: Observation,
+    past: DelayedSignal | None,
+    latency: FloatArray,
+    reach: FloatArray,
+    step: float,
 ) -> tuple[Observation, DelayedSignal]:
-    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility; and the history for
-    the next call.
+    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility;
+    and the history for the next call.
     """
     sample = np.empty((len(DELAYED), *seen.gap.shape))
     for row, name in enumerate(DELAYED):
@@ -117,10 +149,12 @@ def sensed_observation(
 
 
 class SensingState(NamedTuple):
-    """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the wheels [m/s^2].
+    """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the
+    wheels [m/s^2].
 
-    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation. `frame` is what the
-    sensors last reported, in the order of `DELAYED`, in vehicles whose sensors may lose frames.
+    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation.
+    `frame` is what the sensors last reported, in the order of `DELAYED`, in vehicles whose sensors
+    may lose frames.
     """
 
     speed: FloatArray
@@ -136,9 +170,10 @@ class SensingState(NamedTuple):
 class SensingVehicle(Vehicle):
     """A vehicle with delayed sensors of limited range and a delayed brake.
 
-    Its constants, which `prepare` returns, have a `step` [s], the vehicle's `mass` [kg], the accelerations `drive` and
-    `brake` by full pedals [m/s^2], the dead time `brake_delay` of the brake [s], `max_speed` [m/s], the sensors'
-    `latency` [s] and `sensor_range` [m], and the `slope`.
+    Its constants, which `prepare` returns, have a `step` [s], the vehicle's `mass` [kg], the
+    accelerations `drive` and `brake` by full pedals [m/s^2], the dead time `brake_delay` of the
+    brake [s], `max_speed` [m/s], the sensors' `latency` [s] and `sensor_range` [m], and the
+    `slope`.
     """
 
     __slots__ = ()
@@ -146,9 +181,15 @@ class SensingVehicle(Vehicle):
     def sensors(self, prepared: Prepared) -> Sensors:
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
-    def sense(self, prepared: Prepared, state: SensingState, seen: Observation) -> tuple[Observation, SensingState]:
-        """Sensors report the scene as it was one latency ago, and nothing beyond their range times the visibility."""
-        sensed, past = sensed_observation(seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step)
+    def sense(
+        self, prepared: Prepared, state: SensingState, seen: Observation
+    ) -> tuple[Observation, SensingState]:
+        """Sensors report the scene as it was one latency ago, and nothing beyond their range times
+        the visibility.
+        """
+        sensed, past = sensed_observation(
+            seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step
+        )
         return sensed, state._replace(seen=past)
 
     def at_rest(self, prepared: Prepared) -> SensingState:
@@ -176,7 +217,9 @@ class SensingVehicle(Vehicle):
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
         highest_speed = np.maximum(p.max_speed, state.speed)  # who is faster is not slowed down
-        speed = np.minimum(np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed)
+        speed = np.minimum(
+            np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed
+        )
         return state._replace(
             speed=speed,
             acceleration=(speed - state.speed) / p.step + p.slope.back,
@@ -186,5 +229,7 @@ class SensingVehicle(Vehicle):
         )
 
     @abstractmethod
-    def _acceleration(self, p: Prepared, state: SensingState, throttle: FloatArray, brake: FloatArray) -> FloatArray:
+    def _acceleration(
+        self, p: Prepared, state: SensingState, throttle: FloatArray, brake: FloatArray
+    ) -> FloatArray:
         """Acceleration by the wheels with these positions of the pedals [m/s^2]."""

@@ -1,5 +1,5 @@
-"""Every ADS: vehicles are independent, pedals are in range, a scalar ADS has an instance per vehicle; warnings.
-Commands of the shipped ADSs are those of their formulas.
+"""Every ADS: vehicles are independent, pedals are in range, a scalar ADS has an instance per
+vehicle; warnings. Commands of the shipped ADSs are those of their formulas.
 """
 
 from __future__ import annotations
@@ -21,7 +21,14 @@ from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.published import Apollo, WorldOnRails
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation, PedalTables, SimulationRuns
+from safevar_sumo.records import (
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+    PedalTables,
+    SimulationRuns,
+)
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, load_study, study_names
 from safevar_sumo.sumo.system import assemble
@@ -33,9 +40,18 @@ STEP = 0.05
 STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names()}
 NATIVE = load_study("native")
 SYSTEMS = {
-    name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))) for name in ADS
+    name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name))))
+    for name in ADS
 }
-TAKE_OVER = {"aeb", "autoware_aeb", "competent_driver", "full_braking", "fuzzy_safety", "r157", "rss"}
+TAKE_OVER = {
+    "aeb",
+    "autoware_aeb",
+    "competent_driver",
+    "full_braking",
+    "fuzzy_safety",
+    "r157",
+    "rss",
+}
 """ADSs that keep the initial speed."""
 FAR = 1e6
 COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
@@ -61,25 +77,39 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
-    """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals are."""
+    """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals
+    are.
+    """
     memory = ads.start(len(speed), nominal, STEP)
     pedals = []
     for step in range(80):
-        command, memory = ads.drive(seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8), memory)
+        command, memory = ads.drive(
+            seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8), memory
+        )
         pedals.append(np.stack(command))
     return np.stack(pedals)
 
 
 @pytest.mark.slow
 @settings(max_examples=8)
-@given(speed=arrays(float, 6, elements=st.floats(0, 15)), gap=arrays(float, 6, elements=st.floats(0.5, 80)))
-def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(speed: FloatArray, gap: FloatArray) -> None:
+@given(
+    speed=arrays(float, 6, elements=st.floats(0, 15)),
+    gap=arrays(float, 6, elements=st.floats(0.5, 80)),
+)
+def test_pedals_stay_in_range_and_no_vehicle_knows_of_another(
+    speed: FloatArray, gap: FloatArray
+) -> None:
     for system in SYSTEMS.values():
         nominal = system.nominal
         together = approach(system.ads, nominal, speed, gap)
         assert np.all((together >= 0) & (together <= 1))
-        assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), "no vehicle accelerates and brakes at once"
-        assert approach(system.ads, nominal, speed[2:3], gap[2:3])[..., 0].tobytes() == together[..., 2].tobytes()
+        assert not np.any((together[:, 0] > 0) & (together[:, 1] > 0)), (
+            "no vehicle accelerates and brakes at once"
+        )
+        assert (
+            approach(system.ads, nominal, speed[2:3], gap[2:3])[..., 0].tobytes()
+            == together[..., 2].tobytes()
+        )
 
 
 def test_a_standing_obstacle_close_ahead_makes_it_brake(name: str) -> None:
@@ -129,11 +159,12 @@ def worn(scenario: Any, latency: float, ads: Any) -> SimulationRuns:
 
 @pytest.mark.parametrize("latency", [0.05, 0.25, 0.4])
 @pytest.mark.parametrize(
-    "scenario", [CarToCar(test="CCRs", speed=60), Along(test="CPLA", speed=60), Along(test="CBLA", speed=70)]
+    "scenario",
+    [CarToCar(test="CCRs", speed=60), Along(test="CPLA", speed=60), Along(test="CBLA", speed=70)],
 )
 def test_sensors_that_are_late_warn_as_much_later(scenario: Any, latency: float) -> None:
-    """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s - latency, or one
-    step less.
+    """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s
+    - latency, or one step less.
     """
     warned = worn(scenario, latency, Aeb(warning_time=2.2)).warning_ttc[0]
     assert 2.2 - latency - STEP <= warned + 1e-9
@@ -215,8 +246,12 @@ def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_
     assert command.throttle[0] == pytest.approx(throttle)
 
 
-@pytest.mark.parametrize(("gap", "speed", "brakes"), [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)])
-def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(gap: float, speed: float, brakes: int) -> None:
+@pytest.mark.parametrize(
+    ("gap", "speed", "brakes"), [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)]
+)
+def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(
+    gap: float, speed: float, brakes: int
+) -> None:
     """Though it braked before, and whether it moves or stands."""
     ads = world_on_rails(release_gap=0.5)
     memory = ads.start(1, KNOWN, STEP)._replace(is_braking=np.ones(1, dtype=bool))
@@ -228,7 +263,9 @@ def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(gap: float, 
 def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_place(
     lateral: float, speed: float, gap: float
 ) -> None:
-    ads = world_on_rails(brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0)
+    ads = world_on_rails(
+        brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0
+    )
     short = max(-0.4 - lateral, 0.0)
     past = max(lateral + 0.4, 0.0)
     limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
@@ -268,9 +305,11 @@ def test_apollo_begins_where_a_comfortable_stop_and_the_way_lost_in_pedals_and_j
     assert expected - 2.5 * speed * STEP < 60.0 - speed * time < expected + 1e-9
 
 
-def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> None:
-    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest; pedal = (b - coasting) /
-    braking.
+def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_originals_brake_table() -> (
+    None
+):
+    """Beyond the jerk limit: deceleration b = v^2 / (2 (gap - stop gap)), at most the largest;
+    pedal = (b - coasting) / braking.
     """
     ads = apollo(jerk=1e4)
     memory = ads.start(1, KNOWN, STEP)
@@ -283,7 +322,9 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
 
 @given(speed=st.floats(0, 20), gap=st.floats(0, 100))
 def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap: float) -> None:
-    """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's lag; at the end 0.5 m/s^2."""
+    """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's lag; at the
+    end 0.5 m/s^2.
+    """
     ads = Krauss()
     command, _ = ads.drive(seen(0.0, speed, gap), ads.start(1, KNOWN, STEP))
     b = 0.6 * KNOWN.decel
@@ -291,7 +332,9 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     safe_speed = float(np.roots([1 / (2 * b), 1.0, -room]).max()) if room else 0.0
     safe_speed = max(safe_speed, room**0.5)
     acceleration = (min(safe_speed, 13.89) - speed) / (STEP + KNOWN.actuator_lag)
-    assert command.throttle[0] == pytest.approx(min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6)
+    assert command.throttle[0] == pytest.approx(
+        min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6
+    )
     assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
 
 
@@ -307,7 +350,12 @@ def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     while_ramp = speed * ramp - jerk * ramp**3 / 6
     after = speed - jerk * ramp**2 / 2
     stop = speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration)
-    margins = speed * ads.t_response + speed**2 / (2 * ads.a_ego_min) + ads.longitudinal_offset_margin - stop
+    margins = (
+        speed * ads.t_response
+        + speed**2 / (2 * ads.a_ego_min)
+        + ads.longitudinal_offset_margin
+        - stop
+    )
     assert margins == pytest.approx([3.6, -1.3, 4.5, -3.2, 6.1, -8.5], abs=0.06)
     gap = ads.distance(speed, np.zeros(6)) - 1e-9
     step = 0.001

@@ -1,4 +1,6 @@
-"""An FMU drives as the model that it was exported from; what it does wrong, and what a study maps wrongly, is told."""
+"""An FMU drives as the model that it was exported from; what it does wrong, and what a study maps
+wrongly, is told.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,13 @@ class Small(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.gap, self.speed, self.where, self.pedal, self.wish, self.steps = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        self.gap = self.speed = self.where = 0.0
+        self.pedal = self.wish = self.steps = 0.0
         for name in ("gap", "speed"):
             self.register_variable(Real(name, causality=Fmi2Causality.input))
-        self.register_variable(Real("where", causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed))
+        fixed = Fmi2Variability.fixed
+        parameter = Fmi2Causality.parameter
+        self.register_variable(Real("where", causality=parameter, variability=fixed))
         for name in ("pedal", "wish"):
             self.register_variable(Real(name, causality=Fmi2Causality.output))
 
@@ -53,9 +58,11 @@ class Small(Fmi3Slave):
         super().__init__(**kwargs)
         self.time, self.gap, self.where, self.pedal = 0.0, 0.0, 0.0, 0.0
         continuous, fixed = Fmi3Variability.continuous, Fmi3Variability.fixed
-        self.register_variable(Float64("time", causality=Fmi3Causality.independent, variability=continuous))
+        time = Float64("time", causality=Fmi3Causality.independent, variability=continuous)
+        self.register_variable(time)
         self.register_variable(Float64("gap", causality=Fmi3Causality.input))
-        self.register_variable(Float64("where", causality=Fmi3Causality.parameter, variability=fixed))
+        where = Float64("where", causality=Fmi3Causality.parameter, variability=fixed)
+        self.register_variable(where)
         self.register_variable(Float64("pedal", causality=Fmi3Causality.output))
 
     def do_step(self, now, step):
@@ -70,9 +77,17 @@ Make = Callable[..., System]
 
 @pytest.fixture
 def small(in_tmp: Path) -> Make:
-    """The system of an FMU that runs `then` within a gap of 25 m; in its model description `old` becomes `new`."""
+    """The system of an FMU that runs `then` within a gap of 25 m; in its model description `old`
+    becomes `new`.
+    """
 
-    def system(then: str = "self.pedal = 1.0", table: str = TABLE, old: str = "", new: str = "", source: str = SOURCE):  # type: ignore[no-untyped-def]
+    def system(
+        then: str = "self.pedal = 1.0",
+        table: str = TABLE,
+        old: str = "",
+        new: str = "",
+        source: str = SOURCE,
+    ):  # type: ignore[no-untyped-def]
         module = in_tmp / f"small_{next(NUMBERS)}.py"  # a process imports a module once
         module.write_text(source.format(then=then) if source is SOURCE else source)
         (FmuBuilder if source is SOURCE else FmuBuilder3).build_FMU(module, dest=in_tmp)
@@ -98,14 +113,18 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     commands = []
     one = np.ones(2)
     for sample, gap in enumerate(gaps):
-        seen = Observation(sample * step, 10 * one, gap + np.array([0.0, 10.0]), 10 * one, one, one, 1.0)
+        seen = Observation(
+            sample * step, 10 * one, gap + np.array([0.0, 10.0]), 10 * one, one, one, 1.0
+        )
         command, memory = system.ads.drive(seen, memory)
         commands.append([command.throttle, command.brake])
     return np.array(commands)
 
 
 @pytest.mark.parametrize("source", [SOURCE, SOURCE_3])
-def test_each_vehicle_has_an_instance_of_an_fmu_of_either_standard(small: Make, source: str) -> None:
+def test_each_vehicle_has_an_instance_of_an_fmu_of_either_standard(
+    small: Make, source: str
+) -> None:
     commands = driven(small(source=source), [40.0, 20.0, 10.0])
     np.testing.assert_array_equal(commands[:, 0], 0)
     np.testing.assert_array_equal(commands[:, 1], [[0, 0], [1, 0], [1, 1]])
@@ -161,7 +180,9 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
     assert message in error.value.problem
     assert "\n" not in error.value.problem
-    np.testing.assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")
+    np.testing.assert_array_equal(
+        driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault"
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,15 +191,37 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
         ('fmiVersion="2.0"', 'fmiVersion="1.0"', TABLE, "Small.fmu"),
         ("CoSimulation", "ModelExchange", TABLE, "is another FMU"),
         ('(canBeInstantiatedOnlyOncePerProcess=")false', "\\1true", TABLE, "is another FMU"),
-        ('(name="gap"[^>]*>\\s*<Real) ', '\\1 unit="km" ', TABLE, "ads.inputs.gap = 'gap': its unit is 'km'"),
-        ("", "", TABLE.replace('"gap"', '"gsp"'), "gsp': no real input of the FMU; did you mean 'gap'?"),
+        (
+            '(name="gap"[^>]*>\\s*<Real) ',
+            '\\1 unit="km" ',
+            TABLE,
+            "ads.inputs.gap = 'gap': its unit is 'km'",
+        ),
+        (
+            "",
+            "",
+            TABLE.replace('"gap"', '"gsp"'),
+            "gsp': no real input of the FMU; did you mean 'gap'?",
+        ),
         ("", "", TABLE.replace("brake =", "gas ="), "ads.outputs = ['gas']"),
-        ("", "", TABLE.replace("brake =", 'gas = "wish", brake ='), "ads.outputs.gas: there is no such quantity"),
-        ("", "", TABLE.replace("{ brake", '{ acceleration = "wish", brake'), "ads.outputs = ['acceleration', 'brake']"),
+        (
+            "",
+            "",
+            TABLE.replace("brake =", 'gas = "wish", brake ='),
+            "ads.outputs.gas: there is no such quantity",
+        ),
+        (
+            "",
+            "",
+            TABLE.replace("{ brake", '{ acceleration = "wish", brake'),
+            "ads.outputs = ['acceleration', 'brake']",
+        ),
         ("", "", TABLE.replace("where", "wear"), "ads.parameters.wear = 'wear': no real parameter"),
     ],
 )
-def test_what_cannot_be_used_is_refused_in_one_line(small: Make, old: str, new: str, table: str, message: str) -> None:
+def test_what_cannot_be_used_is_refused_in_one_line(
+    small: Make, old: str, new: str, table: str, message: str
+) -> None:
     with pytest.raises(InputError) as error:
         small(table=table, old=old, new=new)
     assert message in error.value.problem
@@ -187,7 +230,9 @@ def test_what_cannot_be_used_is_refused_in_one_line(small: Make, old: str, new: 
 
 def test_a_step_that_an_fmu_cannot_change_has_to_be_the_studys(small: Make) -> None:
     fixed = '\\1<DefaultExperiment stepSize="0.1"/><ModelVariables>'
-    system = small(old='(?s)canHandleVariableCommunicationStepSize="true"(.*?)<ModelVariables>', new=fixed)
+    system = small(
+        old='(?s)canHandleVariableCommunicationStepSize="true"(.*?)<ModelVariables>', new=fixed
+    )
     assert driven(system, [20.0])[0, 1, 0] == 1
     with pytest.raises(InputError, match=r"takes steps of 0\.1 s"):
         driven(system, [20.0], 0.05)

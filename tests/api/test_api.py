@@ -36,9 +36,12 @@ def test_every_public_name_is_there_and_nothing_else() -> None:
 
 
 def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) -> None:
-    changed = sv.load_study("rain", weather="fog", search={"runs": 2}, ads={"parameters": {"corridor": 3.0}})
+    changed = sv.load_study(
+        "rain", weather="fog", search={"runs": 2}, ads={"parameters": {"corridor": 3.0}}
+    )
     Path("mine.toml").write_text(
-        'extends = "rain"\nname = "rain"\nweather = "fog"\n[search]\nruns = 2\n[ads.parameters]\ncorridor = 3.0\n'
+        'extends = "rain"\nname = "rain"\nweather = "fog"\n[search]\nruns ='
+        " 2\n[ads.parameters]\ncorridor = 3.0\n"
     )
     same = sv.load_study("mine.toml")
     assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
@@ -53,10 +56,15 @@ def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
     assert sv.load_study("smoke", weather=theirs, search=search) == sv.load_study(
         "smoke", weather=weather, search=plain
     )
-    assert sv.load_study("smoke", weather=pd.Series(theirs)) == sv.load_study("smoke", weather=weather)
+    assert sv.load_study("smoke", weather=pd.Series(theirs)) == sv.load_study(
+        "smoke", weather=weather
+    )
     plain_setting = {"tireFric": 1.1, "mass": 2600.0}
     expected = sv.simulate("smoke", plain_setting).to_dict()
-    for changes in (pd.Series(plain_setting), {name: np.array(value) for name, value in plain_setting.items()}):
+    for changes in (
+        pd.Series(plain_setting),
+        {name: np.array(value) for name, value in plain_setting.items()},
+    ):
         assert sv.simulate("smoke", changes).to_dict() == expected
     settings = [pd.Series(plain_setting), {"tireFric": np.array(1.1)}]
     frame = sv.evaluate("smoke", [plain_setting, {"tireFric": 1.1}], jobs=1)
@@ -69,10 +77,16 @@ def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
         ("rain", {"ads": {"parameters": {"corridr": 1.0}}}, "ads.parameters.corridr"),
         ("wear", {"vehicle": {"parameters": {"kerb_mas": 1.0}}}, "vehicle.parameters.kerb_mas"),
         ("rain", {"scenario": {"parameters": {"sped": 1.0}}}, "scenario.parameters.sped"),
-        ("wear", {"matrix": {"tests": [{"name": "CPFA", "parameters": {"sped": 1.0}}]}}, "parameters.sped"),
+        (
+            "wear",
+            {"matrix": {"tests": [{"name": "CPFA", "parameters": {"sped": 1.0}}]}},
+            "parameters.sped",
+        ),
     ],
 )
-def test_a_misspelt_parameter_is_refused_when_a_study_is_loaded(name: str, changes: dict[str, Any], key: str) -> None:
+def test_a_misspelt_parameter_is_refused_when_a_study_is_loaded(
+    name: str, changes: dict[str, Any], key: str
+) -> None:
     with pytest.raises(sv.InputError, match=key):
         sv.load_study(name, **changes)
 
@@ -84,7 +98,9 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
     assert result.metrics["safety_degree"] == result.objectives["f_safe"]
-    assert result.original.setting == {one.name: one.original for one in CharacteristicSet.of(result.study)}
+    assert result.original.setting == {
+        one.name: one.original for one in CharacteristicSet.of(result.study)
+    }
     assert result.original.original is result.original
     assert result.original.metrics != result.metrics
     assert "<p>&lt;Simulation of rain" in result._repr_html_()
@@ -94,14 +110,18 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
 
 @pytest.mark.parametrize("value", [0.0, -5.0, 1e300])
 def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond(value: float) -> None:
-    with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0, up to 2.7e\+06 kg"):
+    with pytest.raises(
+        sv.InputError, match=r"mass = .*\nexpected: a finite number above 0, up to 2.7e\+06 kg"
+    ):
         sv.simulate("sun", {"mass": value}, beyond=True)
     with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0"):
         sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
 def test_evaluate_is_simulate_row_by_row() -> None:
-    asked = pd.DataFrame({"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc"))
+    asked = pd.DataFrame(
+        {"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc")
+    )
     frame = sv.evaluate("sun", asked, jobs=1)
     assert list(frame.index) == list("abc")
     assert frame.loc["b", "tireFric"] == 3.5, "too small a change is put back"
@@ -126,7 +146,8 @@ def test_a_simulation_is_shown_beside_the_original() -> None:
     comparison = sv.comparison_of(sv.simulate("sun", {"tireFric": 1.2}))
     assert comparison.changes == ["tireFric 3.5 -> 1.20 (-65.7 %)"]
     assert (
-        comparison.evaluations.f_safe.tolist() == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
+        comparison.evaluations.f_safe.tolist()
+        == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
     )
 
 
@@ -135,7 +156,9 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
     one = sv.simulate("wear", {"brakeTorque": 0.6})
     comparison = sv.comparison_of(one)
     name = comparison.point.name
-    assert sv.simulate("wear").pair.point.name != name, "the original's own worst point is another one"
+    assert sv.simulate("wear").pair.point.name != name, (
+        "the original's own worst point is another one"
+    )
     for row, vehicle in enumerate((one.original, one)):
         assert vehicle.metrics["safety_degree"] == comparison.evaluations.f_safe[row]
         assert vehicle.trace["speed [m/s]"].to_numpy() == pytest.approx(
@@ -159,7 +182,9 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
         (np.full((1, 17), np.nan), "shape|= nan"),
     ],
 )
-def test_unusable_settings_are_reported_before_any_simulation(settings: object, expected: str) -> None:
+def test_unusable_settings_are_reported_before_any_simulation(
+    settings: object, expected: str
+) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
 
@@ -185,7 +210,9 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
         ({"out": ""}, "out: ''"),
     ],
 )
-def test_a_run_refuses_what_its_command_refuses(options: dict[str, Any], error: str, in_tmp: Path) -> None:
+def test_a_run_refuses_what_its_command_refuses(
+    options: dict[str, Any], error: str, in_tmp: Path
+) -> None:
     with pytest.raises(sv.InputError) as refused:
         sv.run("smoke", **options)
     assert str(refused.value).startswith(error)
@@ -217,9 +244,10 @@ def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(
 @pytest.mark.slow
 def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
-        "import safevar_sumo as sv\nprint('begun')\n"
-        "results = sv.run(sv.load_study('smoke', search={'evaluations': 20}), 'out', jobs=2, progress=True)\n"
-        "print(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) == len(results.solutions))\n"
+        "import safevar_sumo as sv\nprint('begun')\nresults = sv.run(sv.load_study('smoke',"
+        " search={'evaluations': 20}), 'out', jobs=2,"
+        " progress=True)\nprint(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) =="
+        " len(results.solutions))\n"
     )
     done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["begun", "True"]
@@ -244,7 +272,8 @@ def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
         "        return (yield problem.characteristics.filter(settings))\n"
     )
     Path("mine.toml").write_text(
-        'extends = "smoke"\n[search]\nalgorithms = ["mine:Mine"]\nruns = 1\nevaluations = 4\npopulation = 4\n'
+        'extends = "smoke"\n[search]\nalgorithms = ["mine:Mine"]\nruns = 1\nevaluations ='
+        " 4\npopulation = 4\n"
     )
     results = sv.run("mine.toml", jobs=1)
     assert "My own search" in sv.tables(results).only("rq1").render("text")

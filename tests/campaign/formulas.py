@@ -1,4 +1,6 @@
-"""Campaigns whose settings are evaluated by a formula, in this process or in a thread for each worker."""
+"""Campaigns whose settings are evaluated by a formula, in this process or in a thread for each
+worker.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def evaluated(settings: FloatArray) -> Evaluations:
-    """Settings are safer the nearer they are to the original, measured by the sum of all relative changes."""
+    """Settings are safer the nearer they are to the original, measured by the sum of all relative
+    changes.
+    """
     share = (settings - SUN.original) / (SUN.upper - SUN.lower)
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
     metrics = {name: np.where(safety <= 0, np.nan, share[:, i]) for i, name in enumerate(METRICS)}

@@ -1,4 +1,6 @@
-"""Runs whose evaluations are formulas: in any shares, alone and together, with more or fewer evaluations."""
+"""Runs whose evaluations are formulas: in any shares, alone and together, with more or fewer
+evaluations.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def study() -> Study:
 
 
 @pytest.mark.slow
-def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: Study, tmp_path: Path) -> None:
+def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(
+    study: Study, tmp_path: Path
+) -> None:
     carried_out(study, tmp_path / "a")
     for name, pool, batch in (
         ("b", FormulaPool(workers=7), None),
@@ -45,7 +49,9 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(study: St
     ):
         carried_out(study, tmp_path / name, pool, batch=batch)
         assert solutions(tmp_path / name) == solutions(tmp_path / "a")
-        pd.testing.assert_frame_equal(load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations)
+        pd.testing.assert_frame_equal(
+            load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations
+        )
 
 
 def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
@@ -57,14 +63,22 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     assert np.mean(together.sizes[1:]) > 3 * large.search.population
     assert alone.sizes[1:3] == [40, 40]
     one, other = (
-        load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3") for name in ("together", "alone")
+        load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3")
+        for name in ("together", "alone")
     )
     pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
 
 
 @pytest.mark.parametrize(
     ("workers", "runs_at_once", "sizes"),
-    [(2, 160, {45}), (1, 80, {45}), (4, 160, {22, 23}), (16, 160, {5, 6}), (200, 160, {1}), (2, 8, {7, 8})],
+    [
+        (2, 160, {45}),
+        (1, 80, {45}),
+        (4, 160, {22, 23}),
+        (16, 160, {5, 6}),
+        (200, 160, {1}),
+        (2, 8, {7, 8}),
+    ],
 )
 def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm(
     workers: int, runs_at_once: int, sizes: set[int]
@@ -117,7 +131,9 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
 
-def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(study: Study, tmp_path: Path) -> None:
+def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(
+    study: Study, tmp_path: Path
+) -> None:
     study = with_search(study, algorithms=["rs"])
     shown = list[tuple[str, int, int]]()
     carried_out(study, tmp_path, keys=[RunKey("rs", 0)])
@@ -126,8 +142,12 @@ def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(stud
     assert shown[-1] == ("smoke: 2/2 runs, evaluations", 200, 200)
 
 
-@pytest.mark.parametrize("outcome", [Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR])
-def test_what_a_longer_run_found_after_its_budget_is_not_counted(outcome: Outcome, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "outcome", [Outcome.COLLISION, Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR]
+)
+def test_what_a_longer_run_found_after_its_budget_is_not_counted(
+    outcome: Outcome, tmp_path: Path
+) -> None:
     """A journal of two settings, and a run of one evaluation."""
     both = evaluated(np.stack([SUN.original, SUN.upper]))
     both = dataclasses.replace(both, outcome=np.array(["stopped", outcome.value]))
@@ -148,13 +168,20 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
     carried_out(study, tmp_path, batch=3)
     path = journal_file(tmp_path, "rs-00")
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
-    monkeypatch.setattr("safevar_sumo.campaign.share.random_generator_of", lambda study, key: np.random.default_rng(7))
-    with pytest.raises(SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"):
+    monkeypatch.setattr(
+        "safevar_sumo.campaign.share.random_generator_of",
+        lambda study, key: np.random.default_rng(7),
+    )
+    with pytest.raises(
+        SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"
+    ):
         carried_out(study, tmp_path)
 
 
 @pytest.mark.parametrize("workers", [1, 4])
-def test_the_speed_of_a_study_is_that_of_all_workers(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_speed_of_a_study_is_that_of_all_workers(
+    workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pool = FormulaPool(workers)
     seconds = iter([10.0, 14.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
@@ -164,8 +191,8 @@ def test_the_speed_of_a_study_is_that_of_all_workers(workers: int, monkeypatch: 
 
 
 def test_sumo_repeats_each_unsafe_solution_of_a_share_once_and_200_other_settings() -> None:
-    """Of 5,000 settings half collide, and those are solutions twice; without a collision, less than half of the
-    original's safety degree is unsafe.
+    """Of 5,000 settings half collide, and those are solutions twice; without a collision, less than
+    half of the original's safety degree is unsafe.
     """
     rng = np.random.default_rng(1)
     requested = made_up_evaluations(rng.uniform(-1, 1, 5000), settings=rng.random((5000, 3)))
@@ -183,9 +210,16 @@ def test_sumo_repeats_each_unsafe_solution_of_a_share_once_and_200_other_setting
 def test_what_sumo_refused_and_searches_without_a_solution_are_not_repeated() -> None:
     settings = np.arange(6.0).reshape(3, 2)
     requested = made_up_evaluations([1.0, 1.0, 1.0], settings=settings)
-    failed = dataclasses.replace(requested, outcome=np.array(["stopped", "stopped", Outcome.SIMULATOR_ERROR.value]))
-    assert np.array_equal(settings_to_verify(failed, failed.take([]), requested.take([0])), settings[:2])
-    assert settings_to_verify(failed.take([2]), failed.take([2]), requested.take([0])).shape == (0, 2)
+    failed = dataclasses.replace(
+        requested, outcome=np.array(["stopped", "stopped", Outcome.SIMULATOR_ERROR.value])
+    )
+    assert np.array_equal(
+        settings_to_verify(failed, failed.take([]), requested.take([0])), settings[:2]
+    )
+    assert settings_to_verify(failed.take([2]), failed.take([2]), requested.take([0])).shape == (
+        0,
+        2,
+    )
 
 
 ROOT = Path(__file__).parents[2]
@@ -208,13 +242,17 @@ ENDS = {
     "results/store.py": ("evaluations_frame",),
     "results/manifest.py": ("write_whole",),
 }
-"""Where a setting, or what became of it, leaves the package's way: into a model, a metric, or a file."""
+"""Where a setting, or what became of it, leaves the package's way: into a model, a metric, or a
+file.
+"""
 BESIDE = "_verify"
 """Verification takes a way of its own."""
 
 
 def functions_on_the_stack(frame: FrameType | None) -> list[tuple[str, str]]:
-    """The package's functions on the stack, up to the campaign, which a worker may carry out elsewhere."""
+    """The package's functions on the stack, up to the campaign, which a worker may carry out
+    elsewhere.
+    """
     functions = []
     while frame is not None:
         file = frame.f_code.co_filename
@@ -226,16 +264,23 @@ def functions_on_the_stack(frame: FrameType | None) -> list[tuple[str, str]]:
 
 
 def listed() -> list[tuple[str, str]]:
-    """The functions in the table of the manual, in its order: a file in the second column, its functions in the
-    third.
+    """The functions in the table of the manual, in its order: a file in the second column, its
+    functions in the third.
     """
-    section = (ROOT / "docs/architecture.md").read_text().partition("## The path of a value")[2].partition("\n## ")[0]
+    section = (
+        (ROOT / "docs/architecture.md")
+        .read_text()
+        .partition("## The path of a value")[2]
+        .partition("\n## ")[0]
+    )
     rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.+) \|$", section, re.MULTILINE)
     return [(file, name) for file, names in rows for name in re.findall(r"`([\w.]+)`", names)]
 
 
 def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
-    study = load_study("rain", search={"algorithms": ["nsga2"], "population": 4, "evaluations": 8, "runs": 1})
+    study = load_study(
+        "rain", search={"algorithms": ["nsga2"], "population": 4, "evaluations": 8, "runs": 1}
+    )
     way = dict[tuple[str, str], None]()
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
@@ -245,8 +290,12 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
             if file.startswith(PACKAGE) and name in ENDS.get(file.removeprefix(PACKAGE), ()):
                 functions = functions_on_the_stack(frame)
                 names = [name for _, name in functions]
-                if BESIDE not in names and ("carry_share" in names or "ResultsDirectory.finish" in names):
-                    start = names.index("carry_share" if "carry_share" in names else "ResultsDirectory.finish")
+                if BESIDE not in names and (
+                    "carry_share" in names or "ResultsDirectory.finish" in names
+                ):
+                    start = names.index(
+                        "carry_share" if "carry_share" in names else "ResultsDirectory.finish"
+                    )
                     way.update(dict.fromkeys(functions[start::-1]))
 
     sys.setprofile(note)
@@ -261,12 +310,22 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("batches", "settings", "workers", "number"),
     [
-        (Batches(4000, True, True), 300, 2, 1),  # vehicles in a recorded scene take the same steps together
+        (
+            Batches(4000, True, True),
+            300,
+            2,
+            1,
+        ),  # vehicles in a recorded scene take the same steps together
         (Batches(4000, True, True), 1000, 8, 1),
         (Batches(4000, True, True), 1001, 2, 2),
         (Batches(4000, True, True), 8000, 2, 8),
         (Batches(4000, True, True), 80_000, 2, 20),
-        (Batches(4000, False, True), 300, 2, 2),  # those of a `ScalarAds` take turns, as do copies in SUMO
+        (
+            Batches(4000, False, True),
+            300,
+            2,
+            2,
+        ),  # those of a `ScalarAds` take turns, as do copies in SUMO
         (Batches(200, False, False), 10, 4, 4),
         (Batches(200, False, False), 1, 4, 1),
     ],

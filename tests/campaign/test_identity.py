@@ -1,5 +1,5 @@
-"""What a study's identity tells, and workers that have other files than the campaign; every step on the disk fails
-once, and the campaign goes on to the same bytes.
+"""What a study's identity tells, and workers that have other files than the campaign; every step on
+the disk fails once, and the campaign goes on to the same bytes.
 """
 
 from __future__ import annotations
@@ -28,10 +28,14 @@ from tests.campaign.formulas import FormulaPool
 from tests.in_process import refused, run
 
 
-def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(tmp_path: Path) -> None:
+def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(
+    tmp_path: Path,
+) -> None:
     shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
     search = {"algorithms": ["rs"], "evaluations": 20, "runs": 1}
-    study = load_study("smoke", scenario={"parameters": {"network": str(tmp_path / "mine")}}, search=search)
+    study = load_study(
+        "smoke", scenario={"parameters": {"network": str(tmp_path / "mine")}}, search=search
+    )
     traffic = tmp_path / "mine" / "traffic.rou.xml"
 
     class Edited(FormulaPool):
@@ -40,7 +44,9 @@ def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_f
                 traffic.write_text(traffic.read_text() + "<!-- -->")
             return super().evaluate(task, settings)
 
-    with pytest.raises(InputError, match=r"traffic\.rou\.xml has changed since: it was changed meanwhile"):
+    with pytest.raises(
+        InputError, match=r"traffic\.rou\.xml has changed since: it was changed meanwhile"
+    ):
         formulas.carried_out(study, tmp_path / "out", Edited())
     assert not load_runs(tmp_path / "out").finished
 
@@ -103,7 +109,10 @@ def test_imported_modules_whole_packages_and_named_files_count_wherever_the_comm
 
     result = files(place)
     network = {name for name in result if name.startswith("pedestrian_crossing/")}
-    assert {"pedestrian_crossing/traffic.rou.xml", "pedestrian_crossing/scenario.sumocfg"} <= network
+    assert {
+        "pedestrian_crossing/traffic.rou.xml",
+        "pedestrian_crossing/scenario.sumocfg",
+    } <= network
     assert set(result) - network == set(FILES)
     monkeypatch.chdir(place / "tiles")
     assert files(place) == result
@@ -134,7 +143,9 @@ class Hidden(ScalarAds):
 """
 
 
-@pytest.mark.parametrize("workers", ["in this process", pytest.param("processes", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "workers", ["in this process", pytest.param("processes", marks=pytest.mark.slow)]
+)
 def test_what_user_code_imports_by_a_computed_name_counts_and_what_it_opens_is_named(
     workers: str, in_tmp: Path, request: pytest.FixtureRequest
 ) -> None:
@@ -142,24 +153,44 @@ def test_what_user_code_imports_by_a_computed_name_counts_and_what_it_opens_is_n
         request.getfixturevalue("worker_processes")
     there = in_tmp / "there"
     there.mkdir()
-    for name, text in {"hidden.py": HIDDEN, "helper.py": "MORE = 1.0\n", "gap.txt": "8.0", "scale.json": "1.0"}.items():
+    for name, text in {
+        "hidden.py": HIDDEN,
+        "helper.py": "MORE = 1.0\n",
+        "gap.txt": "8.0",
+        "scale.json": "1.0",
+    }.items():
         (there / name).write_text(text)
     search = "population = 5\nevaluations = 20\nruns = 1\nalgorithms = ['rs']\n"
-    (there / "it.toml").write_text(f'extends = "smoke"\n[ads]\nmodel = "hidden:Hidden"\n[search]\n{search}')
+    (there / "it.toml").write_text(
+        f'extends = "smoke"\n[ads]\nmodel = "hidden:Hidden"\n[search]\n{search}'
+    )
     command = ("study", str(there / "it.toml"), "--out", "out", "--jobs", "1", "--quiet")
-    message = "user code reads gap.txt, scale.json, which no `files` of the study names: edits go unnoticed"
+    message = (
+        "user code reads gap.txt, scale.json, which no `files` of the study names: edits go"
+        " unnoticed"
+    )
     for _ in range(2):
         assert message in run(*command).stderr, "also if the check is not needed again"
     assert {"hidden.py", "helper.py"} <= set(read_manifest(Path("out"))["files"])
     assert not {"gap.txt", "log.txt"} & set(read_manifest(Path("out"))["files"])
     run("rules", "out", "--samples", "20")
-    (there / "it.toml").write_text((there / "it.toml").read_text().replace("[search]", 'files = ["gap.txt"]\n[search]'))
-    assert "user code reads scale.json, which" in run(*command[:2], "--out", "other", *command[4:]).stderr
-    (there / "it.toml").write_text((there / "it.toml").read_text().replace('files = ["gap.txt"]\n', ""))
+    (there / "it.toml").write_text(
+        (there / "it.toml").read_text().replace("[search]", 'files = ["gap.txt"]\n[search]')
+    )
+    assert (
+        "user code reads scale.json, which"
+        in run(*command[:2], "--out", "other", *command[4:]).stderr
+    )
+    (there / "it.toml").write_text(
+        (there / "it.toml").read_text().replace('files = ["gap.txt"]\n', "")
+    )
     (there / "helper.py").write_text("MORE = 2.0\n")
     refused(*command, message=("helper.py has changed since", "another --out"))
     refused("rules", "out", "--samples", "20", message=("helper.py has changed since",))
-    assert "helper.py has changed since" in run("rules", "out", "--samples", "20", "--as-it-is-now").stderr
+    assert (
+        "helper.py has changed since"
+        in run("rules", "out", "--samples", "20", "--as-it-is-now").stderr
+    )
     (there / "helper.py").unlink()
     refused("rules", "out", "--samples", "20", message=("helper.py no longer exists",))
 
@@ -167,7 +198,11 @@ def test_what_user_code_imports_by_a_computed_name_counts_and_what_it_opens_is_n
 @pytest.mark.parametrize(
     ("files", "problem", "legal"),
     [
-        ("[]", "ads.parameters.weights = 'weights.json': the study does not name this file", "[ads]"),
+        (
+            "[]",
+            "ads.parameters.weights = 'weights.json': the study does not name this file",
+            "[ads]",
+        ),
         ('["weight.json"]', "ads.files: there is no file 'weight.json'", "relative to"),
     ],
 )
@@ -182,7 +217,9 @@ def test_a_file_that_a_study_does_not_name_or_that_is_missing_is_refused(
 
 
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)
-"""Errors that a step fails with; 0 is a write of half of what was to be written, and no error elsewhere."""
+"""Errors that a step fails with; 0 is a write of half of what was to be written, and no error
+elsewhere.
+"""
 MOST_STEPS = 500
 
 

@@ -1,4 +1,6 @@
-"""Workers in processes of this machine; what becomes of jobs whose workers die and of settings that fail."""
+"""Workers in processes of this machine; what becomes of jobs whose workers die and of settings that
+fail.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,20 @@ import psutil
 import pytest
 
 from safevar_sumo.campaign import all_runs, evaluation, run_campaign
-from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, reproduction_command
+from safevar_sumo.campaign.evaluation import (
+    Task,
+    carry_out,
+    evaluate_settings,
+    reproduction_command,
+)
 from safevar_sumo.campaign.pool import Pool, WorkerLostError, open_pool
-from safevar_sumo.errors import EnvironmentFault, InputError, SafevarError, SimulationError, UserCodeError
+from safevar_sumo.errors import (
+    EnvironmentFault,
+    InputError,
+    SafevarError,
+    SimulationError,
+    UserCodeError,
+)
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study, load_study
 from safevar_sumo.sumo.matrix import at_point
@@ -31,7 +44,9 @@ pytestmark = pytest.mark.usefixtures("worker_processes")
 
 
 def processes() -> list[psutil.Process]:
-    return [child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())]
+    return [
+        child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())
+    ]
 
 
 @pytest.fixture
@@ -66,7 +81,9 @@ def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(tmp_
         jobs = [(tmp_path / str(k), int(k == 1)) for k in range(4)]
         assert pool.map(die, jobs) == ["done"] * 4
         assert [len(path.read_text()) for path, _ in jobs] == [1, 2, 1, 1]
-        with pytest.raises(WorkerLostError, match=r"the worker process died \(exit code -9\)") as lost:
+        with pytest.raises(
+            WorkerLostError, match=r"the worker process died \(exit code -9\)"
+        ) as lost:
             pool.map(die, [(tmp_path / "a", 0), (tmp_path / "b", 2)])
         assert lost.value.job == 1
         os.kill(processes()[0].pid, signal.SIGKILL)
@@ -97,13 +114,23 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     with pytest.raises(InputError, match="world_on_roads") as caught:
         carry_out(evaluate_settings, [(Task(study=wrong), SUN.original[np.newaxis])], pool)
     assert "expected" in str(caught.value)
-    assert carry_out(evaluate_settings, [(Task(study=study), SUN.original[np.newaxis])], pool)[0].valid.all()
+    assert carry_out(evaluate_settings, [(Task(study=study), SUN.original[np.newaxis])], pool)[
+        0
+    ].valid.all()
 
 
 def test_a_study_in_worker_processes_has_the_solutions_of_this_one(tmp_path: Path) -> None:
     study = load_study("smoke", search={"algorithms": ["rs"], "evaluations": 20, "runs": 2})
     with open_pool(2) as pool:
-        run_campaign(study, assemble(study), all_runs(study), tmp_path / "a", pool, show_no_progress, pytest.fail)
+        run_campaign(
+            study,
+            assemble(study),
+            all_runs(study),
+            tmp_path / "a",
+            pool,
+            show_no_progress,
+            pytest.fail,
+        )
     assert solutions(tmp_path / "a") == solutions(searched(study, tmp_path / "b"))
 
 
@@ -122,7 +149,9 @@ def settings(number: int) -> FloatArray:
 
 @pytest.fixture
 def fail(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[int]]:
-    """Let batches with settings of these first values fail; returns the sizes of all batches that are tried."""
+    """Let batches with settings of these first values fail; returns the sizes of all batches that
+    are tried.
+    """
 
     def let_fail(error: Exception, *values: float) -> list[int]:
         sizes = list[int]()
@@ -139,7 +168,9 @@ def fail(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[int]]:
     return let_fail
 
 
-def test_a_setting_that_sumo_refuses_is_told_from_the_others(fail: Callable[..., list[int]]) -> None:
+def test_a_setting_that_sumo_refuses_is_told_from_the_others(
+    fail: Callable[..., list[int]],
+) -> None:
     fail(SimulationError("SUMO failed:\n no place"), 4302, 4305)
     result = evaluate_settings(Task(study=STUDY), settings(8))
     assert np.array_equal(result.settings, settings(8))
@@ -151,12 +182,17 @@ def test_a_setting_that_sumo_refuses_is_told_from_the_others(fail: Callable[...,
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
 
 
-def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it(fail: Callable[..., list[int]]) -> None:
-    sizes = fail(UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError"), 4313)
+def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it(
+    fail: Callable[..., list[int]],
+) -> None:
+    sizes = fail(
+        UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError"), 4313
+    )
     with pytest.raises(UserCodeError) as caught:
         evaluate_settings(Task(study=WITH_USER_CODE), settings(50))
-    assert "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set " in str(
-        caught.value
+    assert (
+        "ZeroDivisionError; to reproduce it: python -m safevar_sumo simulate 'my study.toml' --set "
+        in str(caught.value)
     )
     assert f"--set {SUN.names[0]}=4313.0" in str(caught.value)
     assert str(caught.value).count("--set") == 1, "what is not changed need not be set"
@@ -182,7 +218,10 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
     assert reproduced(study, mass=original + 5) == f" --set mass={original + 5} --no-filter"
     assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
     point = assemble(study).matrix[3].name
-    assert reproduced(at_point(study, point), mass=original + 200) == f" --point '{point}' --set mass={original + 200}"
+    assert (
+        reproduced(at_point(study, point), mass=original + 200)
+        == f" --point '{point}' --set mass={original + 200}"
+    )
 
 
 def half(number: float) -> float:
@@ -192,7 +231,9 @@ def half(number: float) -> float:
 
 @pytest.mark.slow
 def test_functions_share_out_the_workers_of_a_pool_and_end_together() -> None:
-    """Each gives two jobs to one of two workers; one that fails ends the others, which would ask for ever."""
+    """Each gives two jobs to one of two workers; one that fails ends the others, which would ask
+    for ever.
+    """
     with open_pool(2) as pool:
 
         def quarter(number: float, part: Pool) -> float:
@@ -200,7 +241,9 @@ def test_functions_share_out_the_workers_of_a_pool_and_end_together() -> None:
             return float(part.map(half, [(part.map(half, [(number,)])[0],)])[0])
 
         numbers = [float(number) for number in range(5)]
-        assert pool.share_out([partial(quarter, number) for number in numbers]) == [number / 4 for number in numbers]
+        assert pool.share_out([partial(quarter, number) for number in numbers]) == [
+            number / 4 for number in numbers
+        ]
 
         def ask_for_ever(part: Pool) -> None:
             while True:

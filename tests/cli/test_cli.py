@@ -1,4 +1,6 @@
-"""The program itself: what it lists, loads and prints; what simulate is told; progress as a person sees it."""
+"""The program itself: what it lists, loads and prints; what simulate is told; progress as a person
+sees it.
+"""
 
 from __future__ import annotations
 
@@ -55,14 +57,21 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
 def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
     found = commands.get_command(None, command)  # type: ignore[arg-type]
     assert CliRunner().invoke(commands, [command, "--help"]).exit_code == 0
-    for one in (found, *(option for option in found.params if not isinstance(option, click.Argument))):
+    for one in (
+        found,
+        *(option for option in found.params if not isinstance(option, click.Argument)),
+    ):
         assert str(one.help).strip().endswith((".", "]")), one.name
 
 
 def test_there_are_at_most_20_commands_and_110_different_options() -> None:
     found = [commands.get_command(None, name) for name in COMMANDS]  # type: ignore[arg-type]
     options = {
-        flag for command in found for one in command.params if isinstance(one, click.Option) for flag in one.opts
+        flag
+        for command in found
+        for one in command.params
+        if isinstance(one, click.Option)
+        for flag in one.opts
     }
     assert len(found) <= 20
     assert len(options) <= 110
@@ -77,8 +86,12 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
     assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == {"pandas"}
-    simulation = loaded(code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)")
-    assert simulation <= {"libsumo", "traci", "pandas", "scipy"}, "Numba looks up the version of scipy"
+    simulation = loaded(
+        code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)"
+    )
+    assert simulation <= {"libsumo", "traci", "pandas", "scipy"}, (
+        "Numba looks up the version of scipy"
+    )
 
 
 SUN = CharacteristicSet.of(load_study("sun"))
@@ -98,7 +111,9 @@ def simulate(*arguments: str) -> Result:
         ("results.simulated < 0", 2, "is no number"),
     ],
 )
-def test_a_gate_ends_with_code_3(condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_gate_ends_with_code_3(
+    condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     with (
         patch("sys.argv", ["safevar-sumo", "simulate", "smoke", "--fail-if", condition]),
         pytest.raises(SystemExit) as end,
@@ -113,7 +128,10 @@ def test_a_gate_on_a_table_names_the_row(capfd: pytest.CaptureFixture[str]) -> N
     with patch("sys.argv", typed), pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 3
-    assert capfd.readouterr().err == "failed: weathers.road_friction = 0.59 < 0.7 in the row hard_rain\n"
+    assert (
+        capfd.readouterr().err
+        == "failed: weathers.road_friction = 0.59 < 0.7 in the row hard_rain\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -134,11 +152,16 @@ def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]
 
 
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
-    result = simulate("rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301")
+    result = simulate(
+        "rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301"
+    )
     assert "original" in result.stdout
     assert "The original vehicle stops, with a safety degree of 2.01 m" in result.stdout
     assert "less safe than the original" in result.stdout
-    reset = "dragCoeff = 0.301 differs from the original by less than the filter threshold and was reset to 0.3"
+    reset = (
+        "dragCoeff = 0.301 differs from the original by less than the filter threshold and was"
+        " reset to 0.3"
+    )
     assert reset in " ".join(result.stdout.replace("│", " ").split())
     assert "changed vehicle" not in simulate("rain").stdout
     sweep = json.loads(simulate("native", "--set", "decel=4.5..8:2", "--json").stdout)
@@ -155,7 +178,9 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
 
 
 @pytest.mark.slow
-def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     replace = os.replace
 
     def full(source: Path, target: Path) -> None:
@@ -164,8 +189,18 @@ def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(in_tmp: Path, m
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    for flag, name in (("--trace", "trace.csv"), ("--plot", "plot.png"), ("--animate", "film.html")):
-        refused("simulate", "sun", flag, name, message=(flag, name, "No space left on device", "with space for it"))
+    for flag, name in (
+        ("--trace", "trace.csv"),
+        ("--plot", "plot.png"),
+        ("--animate", "film.html"),
+    ):
+        refused(
+            "simulate",
+            "sun",
+            flag,
+            name,
+            message=(flag, name, "No space left on device", "with space for it"),
+        )
         assert list(in_tmp.iterdir()) == []
         Path(name).write_text("old")
         refused("simulate", "sun", flag, name, message=(flag, name))
@@ -187,8 +222,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def shown(clock: list[float], width: int) -> list[str]:
-    """What a terminal shows of a study whose journals hold 300 of 6000 evaluations, and then 100 more every ten
-    seconds.
+    """What a terminal shows of a study whose journals hold 300 of 6000 evaluations, and then 100
+    more every ten seconds.
     """
     out = StringIO()
     console = Console(file=out, force_terminal=True, width=width, _environ={})
@@ -196,7 +231,9 @@ def shown(clock: list[float], width: int) -> list[str]:
         for done in range(300, 900, 100):
             show("rain: 1/6 runs, evaluations", done, 6000)
             clock[0] += 10
-    return [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()]
+    return [
+        re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()
+    ]
 
 
 @pytest.mark.parametrize("width", [120, 80])
@@ -217,41 +254,69 @@ def test_before_a_total_is_known_a_terminal_says_searching() -> None:
 
 
 @pytest.mark.slow
-def test_what_user_code_prints_leaves_the_json_alone(in_tmp: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_user_code_prints_leaves_the_json_alone(
+    in_tmp: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Also what other processes and compiled code print."""
     Path("loud.py").write_text(
-        "import os\nfrom safevar_sumo.ads import ScalarAds\n\nprint('loaded')\n\n\nclass Loud(ScalarAds):\n"
-        "    def drive(self, seen):\n        print('drives')\n        os.write(1, b'writes')\n        return 0.3, 0.0\n"
+        "import os\nfrom safevar_sumo.ads import ScalarAds\n\nprint('loaded')\n\n\nclass"
+        " Loud(ScalarAds):\n    def drive(self, seen):\n        print('drives')\n       "
+        " os.write(1, b'writes')\n        return 0.3, 0.0\n"
     )
     Path("loud.toml").write_text('extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n')
-    for question in (("simulate", "loud.toml"), ("risk", "loud.toml", "--samples", "4", "--jobs", "1")):
+    for question in (
+        ("simulate", "loud.toml"),
+        ("risk", "loud.toml", "--samples", "4", "--jobs", "1"),
+    ):
         assert json_of(*question)["question"] == question[0]
         out, err = capfd.readouterr()
         assert "writes" in err
         assert not out
 
 
-def test_a_question_with_one_parameter_is_refused(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_question_with_one_parameter_is_refused(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.syspath_prepend(str(in_tmp))
     Path("asks.py").write_text(
         "from safevar_sumo.questions.ask import question\n\n\n@question\ndef one(subject): ...\n"
     )
-    refused("asks:one", "smoke", message=("question 'asks:one': takes (subject)", "(subject, evaluator"))
+    refused(
+        "asks:one", "smoke", message=("question 'asks:one': takes (subject)", "(subject, evaluator")
+    )
 
 
 @pytest.mark.parametrize("command", [name for name in COMMANDS if contents_of(function_of(name))])
-def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(command: str) -> None:
+def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(
+    command: str,
+) -> None:
     """The subjects do not exist, and the message names what there is."""
     subjects = ["nothing"] * (2 if command in ("compare", "validate") else 1)
     declared = contents_of(function_of(command))
     assert declared is not None
-    refused(command, *subjects, "--table", "nope", message=("--table: there is no table 'nope'", *declared.tables))
+    refused(
+        command,
+        *subjects,
+        "--table",
+        "nope",
+        message=("--table: there is no table 'nope'", *declared.tables),
+    )
     if ... not in declared.numbers:
-        refused(command, *subjects, "--fail-if", "nope > 1", message=("--fail-if: the answer has no number 'nope'",))
+        refused(
+            command,
+            *subjects,
+            "--fail-if",
+            "nope > 1",
+            message=("--fail-if: the answer has no number 'nope'",),
+        )
 
 
 def test_every_command_that_gives_an_answer_declares_its_names() -> None:
-    gives = [name for name in COMMANDS if "Answer" in str(inspect.signature(function_of(name)).return_annotation)]
+    gives = [
+        name
+        for name in COMMANDS
+        if "Answer" in str(inspect.signature(function_of(name)).return_annotation)
+    ]
     assert [name for name in COMMANDS if contents_of(function_of(name))] == gives
 
 
@@ -260,11 +325,19 @@ def test_a_key_that_the_study_of_a_simulation_has_not_is_refused_before_it_drive
     key: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("safevar_sumo.replay.simulate.simulate_with_original", None)
-    refused("simulate", "smoke", "--fail-if", f"{key} > 1", message=(f"--fail-if: the answer has no number '{key}'",))
+    refused(
+        "simulate",
+        "smoke",
+        "--fail-if",
+        f"{key} > 1",
+        message=(f"--fail-if: the answer has no number '{key}'",),
+    )
 
 
 def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n')
-    assert "failed: drac = " in run("simulate", "mine.toml", "--fail-if", "drac > 0", expect=3).stderr
+    assert (
+        "failed: drac = " in run("simulate", "mine.toml", "--fail-if", "drac > 0", expect=3).stderr
+    )
     sweep = ("simulate", "mine.toml", "--set", "mass=2100..2200:2")
     assert "mass = 2200 > 2150" in run(*sweep, "--fail-if", "sweep.mass > 2150", expect=3).stderr

@@ -1,5 +1,5 @@
-"""A small study of three algorithms, in this process or in other processes that tests start, watch and kill; no command
-outlives its test, however the test ends.
+"""A small study of three algorithms, in this process or in other processes that tests start, watch
+and kill; no command outlives its test, however the test ends.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ running = []
 
 
 def started(*arguments: str, **options: object) -> Process:
-    """Start a command in its own process group and with Ctrl-C as a shell does, whatever this process ignores."""
+    """Start a command in its own process group and with Ctrl-C as a shell does, whatever this
+    process ignores.
+    """
     running.append(
         subprocess.Popen(
             [sys.executable, "-m", "safevar_sumo", *arguments],
@@ -41,7 +43,9 @@ def started(*arguments: str, **options: object) -> Process:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=None if os.name == "nt" else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            preexec_fn=None
+            if os.name == "nt"
+            else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             **options,
         )
     )
@@ -64,7 +68,11 @@ def written(out: Path) -> int:
 def workers_of(process: Process) -> list[psutil.Process]:
     """The worker processes of a command."""
     try:
-        return [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        return [
+            child
+            for child in psutil.Process(process.pid).children()
+            if "spawn_main" in " ".join(child.cmdline())
+        ]
     except psutil.NoSuchProcess:
         return []
 

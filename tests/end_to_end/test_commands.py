@@ -1,4 +1,6 @@
-"""The commands as a user types them; a study carried out in parts, and gone on with after damage."""
+"""The commands as a user types them; a study carried out in parts, and gone on with after
+damage.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
         "seen lateral [m]",
         "seen lateral speed [m/s]",
     ]
-    assert frame.loc[frame["speed [m/s]"] < 1e-3, "ttc [s]"].isna().all(), "a standing vehicle closes nothing"
+    assert frame.loc[frame["speed [m/s]"] < 1e-3, "ttc [s]"].isna().all(), (
+        "a standing vehicle closes nothing"
+    )
     assert frame["ttc [s]"].notna().any()
     step = np.diff(frame["time [s]"])
     assert np.allclose(step, step[0])
@@ -67,7 +71,10 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
         "original_outcome: stopped",
         "NSGA-II",
         "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)",
-        "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance results/smoke",
+        (
+            "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance"
+            " results/smoke"
+        ),
     ):
         assert part in output
     assert "RQ1 over runs" not in output, "no test of so few runs can be significant"
@@ -86,7 +93,9 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert "No solution." in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
     study("--out", "alone", "--only", "nsga2:1")
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
-    expected = load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+    expected = (
+        load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+    )
     pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
 
@@ -95,17 +104,22 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     assert "warning" not in study("--out", "out")
     longer = study("--out", "out", "--evaluations", "160")
     assert (
-        "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name another solution"
-        in longer
+        "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name"
+        " another solution" in longer
     )
     assert "left out" not in longer
     fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
-    assert "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00, safe_fuzzer-01" in fewer
+    assert (
+        "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00,"
+        " safe_fuzzer-01" in fewer
+    )
     assert "evaluations before" not in fewer
 
 
 @pytest.mark.slow
-def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what_is_asked_for(whole: Path) -> None:
+def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what_is_asked_for(
+    whole: Path,
+) -> None:
     simulated = len(load_runs(whole).evaluations)
     again = ("study", "small.toml", "--out", str(whole))
     assert f"evaluations: {simulated};" in run(*again).stdout
@@ -136,7 +150,9 @@ def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
         "    def drive(self, seen):\n        return 1 / 0\n"
     )
-    Path("bad.toml").write_text('extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n')
+    Path("bad.toml").write_text(
+        'extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n'
+    )
     for options, command in (([], "check bad.toml"), (["--dry-run"], "simulate bad.toml")):
         refused(
             "study",
@@ -219,7 +235,9 @@ def refusal(*words: str) -> str:
 def test_code_and_named_files_count_and_every_command_that_simulates_results_refuses_by_name(
     mine: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Path("mine.toml").write_text(STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX)
+    Path("mine.toml").write_text(
+        STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX
+    )
     files = {"my_test.py": TEST, "table.txt": "1", "near.txt": "2", "far.txt": "3"}
     for name, text in files.items():
         Path(name).write_text(text)
@@ -228,21 +246,29 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
     run("study", "../mine.toml", "--out", "../out", "--quiet")
     assert {*files, "my_ads.py", "my_map.py"} <= set(read_manifest(Path("../out"))["files"])
     run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
-    listed = [path.relative_to("../out").as_posix() for path in Path("../out").rglob("*") if path.is_file()]
+    listed = [
+        path.relative_to("../out").as_posix()
+        for path in Path("../out").rglob("*")
+        if path.is_file()
+    ]
     assert {row for row in FILES if any(fnmatch(name, row[0]) for name in listed)} == {*FILES}
     assert [name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
         "a file that the manual does not list"
     )
     for name, text in files.items():
         Path("..", name).write_text(f"{text}\n# a comment\n")
-        assert f"{name} has changed since" in refusal("study", "../mine.toml", "--out", "../out", "--runs", "3")
+        assert f"{name} has changed since" in refusal(
+            "study", "../mine.toml", "--out", "../out", "--runs", "3"
+        )
         Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
     for words in ("simulate ../out --most-severe", "explain ../out", "report ../out"):
         result = refusal(*words.split())
         assert "far.txt has changed since" in result
         assert "--as-it-is-now" in result
-    done = CliRunner().invoke(commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"])
+    done = CliRunner().invoke(
+        commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"]
+    )
     assert done.exit_code == 0, done.exception
     assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
 
@@ -257,7 +283,17 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
     sentence = f"he original vehicle itself collides at {speed:.2f} m/s: no change is needed"
     assert f"t{sentence}" in searched.stderr
     assert json.loads(searched.stdout)["verdict"].startswith(f"T{sentence}.")
-    demanded = run("study", "smoke", "--runs", "1", "--evaluations", "10", "--json", "--unsafe", "ave_dece >= 2")
+    demanded = run(
+        "study",
+        "smoke",
+        "--runs",
+        "1",
+        "--evaluations",
+        "10",
+        "--json",
+        "--unsafe",
+        "ave_dece >= 2",
+    )
     verdict = json.loads(demanded.stdout)["verdict"]
     assert verdict.startswith("The original vehicle itself has ave_dece ")
     assert verdict.endswith("tolerance results/smoke --unsafe 'ave_dece >= 2'")

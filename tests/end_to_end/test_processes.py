@@ -1,5 +1,5 @@
-"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a clear error,
-nothing left behind.
+"""Studies in processes of their own, killed, interrupted, starved and edited: the same bytes or a
+clear error, nothing left behind.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
 @SLOW
 def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     moments = random.Random(5)
-    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5", "--quiet")
+    process = started(
+        "study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5", "--quiet"
+    )
     until(lambda: written(OUT) > 0, process)
     for worker in workers_of(process):
         worker.kill()  # each share loses one
@@ -59,11 +61,16 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
-@pytest.mark.parametrize("when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", "twice"))])
+@pytest.mark.parametrize(
+    "when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", "twice"))]
+)
 def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
     process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo")
     if when == "loading":
-        until(lambda: any("numpy" in one.path for one in psutil.Process(process.pid).memory_maps()), process)
+        until(
+            lambda: any("numpy" in one.path for one in psutil.Process(process.pid).memory_maps()),
+            process,
+        )
     else:
         until(lambda: written(OUT) > 0, process)
         loaded = " ".join(one.path for one in workers_of(process)[0].memory_maps())
@@ -83,7 +90,9 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
 def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path) -> None:
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
-    process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo", env=environment)
+    process = started(
+        "study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo", env=environment
+    )
     until(lambda: written(OUT) > 0, process)
     process.terminate()
     errors = ended(process, 130)
@@ -92,11 +101,13 @@ def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path)
     assert not [*Path("temporary").iterdir()]
 
 
-def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_written_stays(in_tmp: Path) -> None:
+def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_written_stays(
+    in_tmp: Path,
+) -> None:
     code = (
-        "import sys\nfrom pathlib import Path\nfrom safevar_sumo.output import whole_file\n"
-        "with whole_file(Path('page.html')) as file:\n    file.write_text('half')\n    print(file.name, flush=True)\n"
-        "    sys.stdin.read()\n"
+        "import sys\nfrom pathlib import Path\nfrom safevar_sumo.output import whole_file\nwith"
+        " whole_file(Path('page.html')) as file:\n    file.write_text('half')\n    print(file.name,"
+        " flush=True)\n    sys.stdin.read()\n"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     writers = [subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) for _ in range(2)]
@@ -123,7 +134,7 @@ with temporary_folder() as folder:
 """
 
 
-def test_a_temporary_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_stays(
+def test_a_temporary_folder_is_removed_once_its_process_was_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -146,10 +157,13 @@ def test_a_temporary_folder_of_a_killed_process_is_removed_by_the_next_and_that_
 @SLOW
 def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
     Path("my_ads.py").write_text(
-        "import time\nfrom pathlib import Path\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Dozing(ScalarAds):\n"
-        "    def drive(self, seen):\n        Path('dozing').touch()\n        time.sleep(1000)\n"
+        "import time\nfrom pathlib import Path\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass"
+        " Dozing(ScalarAds):\n    def drive(self, seen):\n        Path('dozing').touch()\n       "
+        " time.sleep(1000)\n"
     )
-    Path("dozing.toml").write_text('extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n')
+    Path("dozing.toml").write_text(
+        'extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
+    )
     process = started("study", "dozing.toml", "--out", "out")
     until(Path("dozing").exists, process)
     killed(process)
@@ -166,18 +180,23 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
 )
 def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(line: str, why: str) -> None:
     Path("my_ads.py").write_text(
-        "import ctypes\nimport os\nimport time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass Deadly(ScalarAds):\n"
-        f"    def drive(self, seen):\n        if os.path.exists('now'):\n            {line}\n        return 0.5, 0.0\n"
+        "import ctypes\nimport os\nimport time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass"
+        " Deadly(ScalarAds):\n    def drive(self, seen):\n        if os.path.exists('now'):\n     "
+        f"       {line}\n        return 0.5, 0.0\n"
     )
     Path("deadly.toml").write_text(
-        'extends = "small.toml"\nname = "deadly"\n[ads]\nmodel = "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
+        'extends = "small.toml"\nname = "deadly"\n[ads]\nmodel ='
+        ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
     )
     process = started("study", "deadly.toml", "--out", "out", "--jobs", "1", "--batch", "1")
     until(lambda: written(OUT) > 0, process)
     Path("now").touch()
     errors = ended(process, 2)
     place = "" if "exit(" in line else f" in {Path('my_ads.py').resolve()}, line 10"
-    assert f"study 'deadly': two workers were lost at the same work, runs nsga2-00: {why}{place}, probably" in errors
+    assert (
+        f"study 'deadly': two workers were lost at the same work, runs nsga2-00: {why}{place},"
+        " probably" in errors
+    )
     assert "in ads.model = 'my_ads:Deadly'" in errors
 
 
@@ -190,11 +209,24 @@ def start(small: None) -> Iterator[Start]:
     running = []
 
     def begin(program: str, *arguments: str) -> Process:
-        command = [sys.executable, "-m", f"distributed.cli.dask_{program}", *arguments, "--no-dashboard"]
+        command = [
+            sys.executable,
+            "-m",
+            f"distributed.cli.dask_{program}",
+            *arguments,
+            "--no-dashboard",
+        ]
         environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
         with open(f"{program}-{len(running)}.log", "w") as log:
             running.append(
-                subprocess.Popen(command, stdout=log, stderr=log, text=True, start_new_session=True, env=environment)
+                subprocess.Popen(
+                    command,
+                    stdout=log,
+                    stderr=log,
+                    text=True,
+                    start_new_session=True,
+                    env=environment,
+                )
             )
         return running[-1]
 
@@ -211,7 +243,9 @@ def scheduler(start: Start) -> tuple[Process, str]:
     process = start("scheduler", "--host", "127.0.0.1", "--port", "0")
     log = Path("scheduler-0.log")
     until(lambda: "Scheduler at:" in log.read_text(), process)
-    return process, next(line.split()[-1] for line in log.read_text().splitlines() if "Scheduler at:" in line)
+    return process, next(
+        line.split()[-1] for line in log.read_text().splitlines() if "Scheduler at:" in line
+    )
 
 
 def worker(start: Start, address: str, *options: str) -> Process:
@@ -229,7 +263,10 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
 ) -> None:
     _, address = scheduler
     workers = [worker(start, address, "--no-nanny") for _ in range(2)]
-    until(lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)), workers[0])
+    until(
+        lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)),
+        workers[0],
+    )
     process = started("study", "small.toml", "--cluster", address, "--out", "out")
     until(lambda: written(Path("out")) > 4000 and all(busy(one) for one in workers), process)
     assert process.poll() is None, "too late: the study is over"

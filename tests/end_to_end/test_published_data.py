@@ -21,29 +21,39 @@ COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Forty settings of the study sun in the published format, with the metrics that this package finds; some changes
-    are below the threshold.
+    """Forty settings of the study sun in the published format, with the metrics that this package
+    finds; some changes are below the threshold.
     """
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
-    settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (40, 12))
+    settings = np.random.default_rng(3).uniform(
+        characteristics.lower, characteristics.upper, (40, 12)
+    )
     settings[::2, :6] = characteristics.original[:6] + 0.001
     result = evaluate(system, package_filter(characteristics, settings))
     columns = {column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()}
     path = tmp_path_factory.mktemp("data") / "mine.csv"
-    pd.DataFrame(settings, columns=list(characteristics.names)).assign(**columns).to_csv(path, index=False)
+    pd.DataFrame(settings, columns=list(characteristics.names)).assign(**columns).to_csv(
+        path, index=False
+    )
     return path
 
 
 @pytest.mark.slow
 def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
     output = json_of("validate", "sun", str(data))
-    assert (output["question"], output["study"], output["numbers"]["rows"]) == ("validate", "sun", 40)
+    assert (output["question"], output["study"], output["numbers"]["rows"]) == (
+        "validate",
+        "sun",
+        40,
+    )
     collisions = [output["numbers"][f"collisions_{side}"] for side in ("here", "reference", "both")]
     assert collisions == collisions[:1] * 3
     table = output["tables"]["agreement"]
     assert all(list(row) == list(table["columns"]) for row in table["rows"])
-    assert {row["metric"]: row["spearman"] for row in table["rows"]} == pytest.approx(dict.fromkeys(COLUMNS, 1.0))
+    assert {row["metric"]: row["spearman"] for row in table["rows"]} == pytest.approx(
+        dict.fromkeys(COLUMNS, 1.0)
+    )
     errors = [row[name] for row in table["rows"] for name in ("mean_absolute_error", "bias")]
     assert errors == pytest.approx([0.0] * 8, abs=1e-12)
 
@@ -85,17 +95,24 @@ def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(resul
 
 def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Path) -> None:
     run("import", "sun", "--out", "imported", "--nsga2", str(data), "--rs", str(data))
-    assert sorted(path.name for path in Path("imported").iterdir()) == ["manifest.json", "solutions.csv"]
+    assert sorted(path.name for path in Path("imported").iterdir()) == [
+        "manifest.json",
+        "solutions.csv",
+    ]
     frame = pd.read_csv("imported/solutions.csv")
     assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
-    pd.read_csv(data).assign(mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)).to_csv("heavy.csv", index=False)
+    pd.read_csv(data).assign(mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)).to_csv(
+        "heavy.csv", index=False
+    )
     output = run("import", "sun", "--out", "imported", "--rs", "heavy.csv")
     assert "1 rows with values outside the domains are left out" in output.stderr
     assert "39 solutions" in output.stdout
     original = CharacteristicSet.of(load_study("sun")).original
     changed = frame.iloc[:, 1:13].to_numpy() != original
-    assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, "changes below the threshold are put back"
+    assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, (
+        "changes below the threshold are put back"
+    )
     assert frame["f_num_diff"].tolist() == changed.sum(axis=1).tolist()
     assert np.allclose(frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1))
 
@@ -113,8 +130,14 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     against = json_of("tables", "part", "--algorithm", "rs")["tables"]["rq2"]["rows"]
     assert {(one["algorithm"], one["baseline"]) for one in against} == {("rs", "nsga2")}
     assert "did you mean 'nsga2'?" in run("tables", "part", "--algorithm", "nsga3", expect=2).stderr
-    sizes = zip([one["effect_size"] for one in records], [1 - one["effect_size"] for one in against], strict=True)
-    assert all(one == pytest.approx(other) for one, other in sizes), "the same pair from the other side"
+    sizes = zip(
+        [one["effect_size"] for one in records],
+        [1 - one["effect_size"] for one in against],
+        strict=True,
+    )
+    assert all(one == pytest.approx(other) for one, other in sizes), (
+        "the same pair from the other side"
+    )
     Path("part/runs/rs-00.jsonl").unlink()
     assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
     refused("tables", "part", "--table", "rq9", message=("no table 'rq9'", "rq3.3-safety"))

@@ -1,4 +1,6 @@
-"""The wheel carries studies and networks: every command works from anywhere, without the checkout."""
+"""The wheel carries studies and networks: every command works from anywhere, without the
+checkout.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     wheel = next(folder.glob("*.whl"))
     subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(folder / "site"), str(wheel)],
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-deps",
+            "--target",
+            str(folder / "site"),
+            str(wheel),
+        ],
         check=True,
         capture_output=True,
     )
@@ -42,7 +54,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(site: Path, cwd: Path, *arguments: str) -> str:
     environment = {**os.environ, "PYTHONPATH": str(site)}
     return subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, env=environment, check=True, capture_output=True, text=True
+        [sys.executable, *arguments],
+        cwd=cwd,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
 
 
@@ -53,15 +70,23 @@ def test_every_module_study_and_network_is_in_the_wheel(site: Path) -> None:
         for path in (ROOT / folder).rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    inside = {Path("safevar_sumo") / path if path.parts[0] != "safevar_sumo" else path for path in kept}
+    inside = {
+        Path("safevar_sumo") / path if path.parts[0] != "safevar_sumo" else path for path in kept
+    }
     assert {path for path in inside if not (site / path).is_file()} == set()
 
 
 def test_commands_work_from_an_empty_directory(site: Path, tmp_path: Path) -> None:
-    assert str(site) in run(site, tmp_path, "-c", "import safevar_sumo; print(safevar_sumo.__file__)")
+    assert str(site) in run(
+        site, tmp_path, "-c", "import safevar_sumo; print(safevar_sumo.__file__)"
+    )
     assert (
-        json.loads(run(site, tmp_path, "-m", "safevar_sumo", "simulate", "lgsvl", "--json"))["numbers"]["outcome"]
+        json.loads(run(site, tmp_path, "-m", "safevar_sumo", "simulate", "lgsvl", "--json"))[
+            "numbers"
+        ]["outcome"]
         == "stopped"
     )
-    run(site, tmp_path, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "20")
+    run(
+        site, tmp_path, "-m", "safevar_sumo", "study", "smoke", "--runs", "1", "--evaluations", "20"
+    )
     assert (tmp_path / "results/smoke/solutions.csv").is_file()

@@ -1,8 +1,8 @@
-"""Results of shipped studies, to the bit where that is promised: the original vehicle and a small search. As a program:
-renews golden.json.
+"""Results of shipped studies, to the bit where that is promised: the original vehicle and a small
+search. As a program: renews golden.json.
 
-Each entry has rounded values that a person can compare, the reason for the entry (`why`), and digests of the exact
-values.
+Each entry has rounded values that a person can compare, the reason for the entry (`why`), and
+digests of the exact values.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ from safevar_sumo.sumo.system import assemble
 from tests.in_process import searched
 
 WHY = {
-    "sun": "the published vehicle and driving system in dry clear weather: the case to which they were fitted",
+    "sun": (
+        "the published vehicle and driving system in dry clear weather: the case to which they were"
+        " fitted"
+    ),
     "rain": "the same in rain: friction, sight, recognition delay and hesitation act",
     "lgsvl": "another vehicle model, driving system and scenario: a lead vehicle stands",
     "native": "SUMO's own car-following model with modelled sensors and actuators",
@@ -36,7 +39,12 @@ FILE = Path(__file__).with_name("golden.json")
 
 def small(name: str) -> Study:
     """A shipped study with a search that takes a second."""
-    search = {"algorithms": ["nsga2", "rs", "safe_fuzzer"], "population": 10, "evaluations": 40, "runs": 1}
+    search = {
+        "algorithms": ["nsga2", "rs", "safe_fuzzer"],
+        "population": 10,
+        "evaluations": 40,
+        "runs": 1,
+    }
     return load_study(name, search=search)
 
 
@@ -48,7 +56,8 @@ def computed(name: str) -> JsonObject:
     original = results.manifest["original"]
     changed = {member: row.original for member, row in study.vehicle.characteristics.items()}
     solutions = {
-        str(algorithm): _of_algorithm(rows, changed) for algorithm, rows in results.solutions.groupby("algorithm")
+        str(algorithm): _of_algorithm(rows, changed)
+        for algorithm, rows in results.solutions.groupby("algorithm")
     }
     return {
         "why": WHY[name],
@@ -58,10 +67,16 @@ def computed(name: str) -> JsonObject:
 
 
 def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> JsonObject:
-    """The numbers of solutions and of collisions, and the most severe solution: its objectives and its changes."""
+    """The numbers of solutions and of collisions, and the most severe solution: its objectives and
+    its changes.
+    """
     most_severe = rows.sort_values(CHOICES["most_severe"], kind="stable").iloc[0]
     values = {name: float(most_severe[name]) for name in CHOICES["most_severe"]}
-    values |= {name: float(most_severe[name]) for name, value in original.items() if most_severe[name] != value}
+    values |= {
+        name: float(most_severe[name])
+        for name, value in original.items()
+        if most_severe[name] != value
+    }
     return {
         "number": len(rows),
         "collisions": int((rows["outcome"] == "collision").sum()),
@@ -72,7 +87,10 @@ def _of_algorithm(rows: pd.DataFrame, original: dict[str, float]) -> JsonObject:
 
 def _rounded(values: JsonObject) -> JsonObject:
     """Round numbers to five digits, enough to see how much a value has changed."""
-    return {name: float(f"{value:.5g}") if isinstance(value, float) else value for name, value in values.items()}
+    return {
+        name: float(f"{value:.5g}") if isinstance(value, float) else value
+        for name, value in values.items()
+    }
 
 
 def _digest(text: str) -> str:
@@ -87,8 +105,8 @@ def platform_here() -> dict[str, str]:
 
 
 CHANGED = (
-    "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew golden.json and "
-    "say why"
+    "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew"
+    " golden.json and say why"
 )
 GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
 
@@ -97,7 +115,9 @@ GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
 def test_a_shipped_studys_results_are_those_of_ever(name: str) -> None:
     here = computed(name)
     expected = GOLDEN["studies"][name]
-    numbers = {key: value for key, value in expected["original"].items() if isinstance(value, float)}
+    numbers = {
+        key: value for key, value in expected["original"].items() if isinstance(value, float)
+    }
     assert {key: here["original"][key] for key in numbers} == pytest.approx(numbers, rel=1e-4), (
         "other results, not only other bits"
     )
@@ -112,7 +132,8 @@ def test_results_and_the_number_that_stands_for_them_change_together() -> None:
 
 
 @pytest.mark.skipif(
-    (platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="bytes are promised for Linux on x86-64"
+    (platform.system(), platform.machine()) != ("Linux", "x86_64"),
+    reason="bytes are promised for Linux on x86-64",
 )
 def test_this_is_the_platform_that_bytes_are_promised_for() -> None:
     assert platform_here() == GOLDEN["platform"], (
@@ -124,7 +145,8 @@ if __name__ == "__main__":
     studies = {name: computed(name) for name in WHY}
     if studies != GOLDEN["studies"] and GOLDEN["results"] == RESULTS:
         raise SystemExit(
-            f"results have changed: raise RESULTS in safevar_sumo/results/manifest.py above {RESULTS} first"
+            "results have changed: raise RESULTS in safevar_sumo/results/manifest.py above"
+            f" {RESULTS} first"
         )
     golden = {"platform": platform_here(), "results": RESULTS, "studies": studies}
     FILE.write_text(json.dumps(golden, indent=2) + "\n", encoding="utf-8", newline="\n")

@@ -1,4 +1,6 @@
-"""The least time to collision and the deceleration rate along the path, from gaps and speeds alone."""
+"""The least time to collision and the deceleration rate along the path, from gaps and speeds
+alone.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +28,21 @@ def measured(runs: SimulationRuns) -> FloatArray:
 
 
 def along_the_path(runs: SimulationRuns) -> FloatArray:
-    """Both for somebody who crosses at right angles: gap / v and v^2 / (2 gap), as long as he is in the strip that the
-    vehicle drives over or will be when it arrives.
+    """Both for somebody who crosses at right angles: gap / v and v^2 / (2 gap), as long as he is in
+    the strip that the vehicle drives over or will be when it arrives.
     """
     trace = runs.trace
     with np.errstate(all="ignore"):
         ttc = trace.gap / trace.speed
         rate = trace.speed**2 / (2 * trace.gap)
-        nearest = np.minimum(np.abs(trace.lateral), np.abs(trace.lateral + trace.lateral_speed * ttc))
-    meets = (nearest < (trace.vehicle_width + trace.obstacle_width) / 2) & (trace.gap > 0) & (trace.speed > 1e-3)
+        nearest = np.minimum(
+            np.abs(trace.lateral), np.abs(trace.lateral + trace.lateral_speed * ttc)
+        )
+    meets = (
+        (nearest < (trace.vehicle_width + trace.obstacle_width) / 2)
+        & (trace.gap > 0)
+        & (trace.speed > 1e-3)
+    )
     counts = meets & trace.active & runs.encounter.in_conflict & np.isnan(runs.collision_speed)
     both = np.where(counts, ttc, np.inf).min(axis=0), np.where(counts, rate, 0).max(axis=0)
     return np.where(counts.any(axis=0), both, np.nan)
@@ -57,7 +65,9 @@ def test_in_the_published_scenario_too() -> None:
 
 
 def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
-    """2.84 m/s^2 stops in time, and gap over speed is never below 0.577 s; TET and TIT keep the paper's TTC."""
+    """2.84 m/s^2 stops in time, and gap over speed is never below 0.577 s; TET and TIT keep the
+    paper's TTC.
+    """
     values = {"test": "CPNA", "speed": 12.26, "impact_location": 4.88, "target_speed": 11.99}
     scenario: Any = WEAR.scenario.at(values)
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
@@ -65,11 +75,16 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
     assert time_to_collision(runs).min() == pytest.approx(0.489, abs=5e-4)
 
 
-@pytest.mark.parametrize("scenario", [CarToCar(impact_location=20), CarToCar(test="CCRb"), Along()], ids=repr)
+@pytest.mark.parametrize(
+    "scenario", [CarToCar(impact_location=20), CarToCar(test="CCRb"), Along()], ids=repr
+)
 def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(scenario: Any) -> None:
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
     ttc = time_to_collision(runs)
-    assert measured(runs)[:, 0].tolist() == [ttc.min(), np.nanmax(runs.encounter.closing_speed / (2 * ttc))]
+    assert measured(runs)[:, 0].tolist() == [
+        ttc.min(),
+        np.nanmax(runs.encounter.closing_speed / (2 * ttc)),
+    ]
 
 
 def test_the_table_of_metrics_says_that_there_are_two_times_to_collision() -> None:

@@ -10,8 +10,24 @@ import pytest
 from scipy import signal
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_DIFF, F_SAFE, METRICS, OPTIONAL_METRICS, Measure, Scoring, Unsafe, time_to_collision
-from safevar_sumo.records import NO_CONTACT, Encounter, Evaluations, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.metrics import (
+    F_DIFF,
+    F_SAFE,
+    METRICS,
+    OPTIONAL_METRICS,
+    Measure,
+    Scoring,
+    Unsafe,
+    time_to_collision,
+)
+from safevar_sumo.records import (
+    NO_CONTACT,
+    Encounter,
+    Evaluations,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -19,7 +35,9 @@ STEP = 0.01
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
 
 
-def braking_run(speed: float, deceleration: float, gap: float, collision_speed: float = np.nan) -> SimulationRuns:
+def braking_run(
+    speed: float, deceleration: float, gap: float, collision_speed: float = np.nan
+) -> SimulationRuns:
     """One vehicle that brakes from `speed` at once and stands in the end."""
     time = np.arange(0, 10, STEP)[:, np.newaxis]
     moving = np.minimum(time, speed / deceleration)
@@ -55,7 +73,9 @@ def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_c
     assert value("safety_degree", HIT) == -3.5
 
 
-@pytest.mark.parametrize(("speed_of_the_struck", "degree"), [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)])
+@pytest.mark.parametrize(
+    ("speed_of_the_struck", "degree"), [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)]
+)
 def test_severity_is_the_closing_speed_and_every_collision_is_below_0(
     speed_of_the_struck: float, degree: float
 ) -> None:
@@ -65,15 +85,19 @@ def test_severity_is_the_closing_speed_and_every_collision_is_below_0(
 
 
 def test_safety_degree_is_the_least_separation_of_the_encounter_alone() -> None:
-    """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an encounter it is
-    undefined.
+    """The encounter ends after 1 s and 7.5 m, at a gap of 4.5 m; the last gap is 2 m. Without an
+    encounter it is undefined.
     """
-    assert value("safety_degree", meeting(in_conflict=FIRST_SECOND)) == pytest.approx(4.5, abs=10 * STEP)
+    assert value("safety_degree", meeting(in_conflict=FIRST_SECOND)) == pytest.approx(
+        4.5, abs=10 * STEP
+    )
     assert np.isnan(value("safety_degree", meeting(in_conflict=RUN.trace.gap < 0)))
 
 
 def test_exposed_and_integrated_time_of_even_approach() -> None:
-    """At constant speed v from distance d, TTC = d/v - t: TET = TTC*, TIT = TTC*^2 / 2 when it goes on to contact."""
+    """At constant speed v from distance d, TTC = d/v - t: TET = TTC*, TIT = TTC*^2 / 2 when it goes
+    on to contact.
+    """
     time = np.arange(0, 5 + STEP / 2, STEP)[:, np.newaxis]
     run = made_up_runs(STEP, np.full_like(time, 4.0), 20 - 4.0 * time)
     run = dataclasses.replace(run, encounter=run.encounter._replace(in_conflict=run.trace.gap > -1))
@@ -83,7 +107,9 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
 
 
 def test_least_ttc_and_largest_drac_of_even_braking() -> None:
-    """From 10 m/s with 5 m/s^2 and 12 m ahead, at speed v the distance is 2 m + v^2 / (10 m/s^2)."""
+    """From 10 m/s with 5 m/s^2 and 12 m ahead, at speed v the distance is 2 m + v^2 / (10
+    m/s^2).
+    """
     least = float(OPTIONAL_METRICS["ttc_min"].function(RUN, THRESHOLDS)[0])
     largest = float(OPTIONAL_METRICS["drac"].function(RUN, THRESHOLDS)[0])
     speed = np.linspace(0.01, 10, 100_001)
@@ -91,7 +117,9 @@ def test_least_ttc_and_largest_drac_of_even_braking() -> None:
     assert least == pytest.approx((distance / speed).min(), rel=1e-3)
     assert largest == pytest.approx((speed**2 / (2 * distance)).max(), rel=1e-3)
     nobody = meeting(closing_speed=np.zeros_like(RUN.encounter.closing_speed))
-    assert np.isnan([OPTIONAL_METRICS[name].function(nobody, THRESHOLDS)[0] for name in ("ttc_min", "drac")]).all()
+    assert np.isnan(
+        [OPTIONAL_METRICS[name].function(nobody, THRESHOLDS)[0] for name in ("ttc_min", "drac")]
+    ).all()
 
 
 @pytest.mark.parametrize(
@@ -107,9 +135,15 @@ def test_least_ttc_and_largest_drac_of_even_braking() -> None:
 def test_post_encroachment_time_is_that_of_the_second_one(
     gap: float, lateral: float, lateral_speed: float, expected: float
 ) -> None:
-    """A vehicle 2 m wide at 10 m/s, and somebody 1.2 m wide across the lane; the last sample is after the run's end."""
+    """A vehicle 2 m wide at 10 m/s, and somebody 1.2 m wide across the lane; the last sample is
+    after the run's end.
+    """
     at = np.ones((3, 1))
-    columns = {"lateral": lateral * at, "lateral_speed": lateral_speed * at, "obstacle_width": 1.2 * at}
+    columns = {
+        "lateral": lateral * at,
+        "lateral_speed": lateral_speed * at,
+        "obstacle_width": 1.2 * at,
+    }
     active = np.array([[True], [True], [False]])
     run = made_up_runs(STEP, 10 * at, gap * at, **columns, active=active)
     run = dataclasses.replace(run, trace=dataclasses.replace(run.trace, vehicle_width=2.0))
@@ -125,7 +159,9 @@ def test_reaction_time_begins_with_the_first_sight() -> None:
     brake = ((time > 0.5) & (time < 0.9)) | (time >= 1.7)
     visible = time >= 1.0
     reaction = OPTIONAL_METRICS["reaction_time"].function
-    assert reaction(driving(brake=brake.astype(float), visible=visible), THRESHOLDS)[0] == pytest.approx(0.7)
+    assert reaction(driving(brake=brake.astype(float), visible=visible), THRESHOLDS)[
+        0
+    ] == pytest.approx(0.7)
     assert np.isnan(reaction(driving(brake=brake & (time < 0.9), visible=visible), THRESHOLDS)[0])
     assert np.isnan(reaction(driving(visible=visible & False), THRESHOLDS)[0])
 
@@ -135,7 +171,9 @@ def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none
     nan = np.nan
     columns = {"safety_degree": [1.0, 2.0, -3.0, -1.0, 1.0], "drac": [5.0, 7.0, 1.0, nan, nan]}
     columns["rating_points"] = [40.0, 30.0, 40.0, 30.0, 35.0]
-    runs = made_up_evaluations(columns["safety_degree"], metrics={k: np.array(v) for k, v in columns.items()})
+    runs = made_up_evaluations(
+        columns["safety_degree"], metrics={k: np.array(v) for k, v in columns.items()}
+    )
     for text, expected in (
         ("drac > 6", [False, True, True, True, False]),
         ("drac < 6", [True, False, True, True, False]),
@@ -189,9 +227,12 @@ def test_samples_that_are_not_active_do_not_count(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "encounter", [{"closing_speed": -RUN.encounter.closing_speed}, {"distance": RUN.encounter.distance - 20}]
+    "encounter",
+    [{"closing_speed": -RUN.encounter.closing_speed}, {"distance": RUN.encounter.distance - 20}],
 )
-def test_what_opens_or_lies_behind_has_no_time_to_collision(encounter: dict[str, FloatArray]) -> None:
+def test_what_opens_or_lies_behind_has_no_time_to_collision(
+    encounter: dict[str, FloatArray],
+) -> None:
     run = meeting(**encounter)
     assert np.isinf(time_to_collision(run)).all()
     assert value("tet", run) == value("tit", run) == 0
@@ -213,7 +254,9 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
 def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     """Without a simulation, a user's metric is undefined, and so is the safety degree."""
     failed = made_up_evaluations([np.nan, np.nan], outcome=np.full(2, "simulator-error"))
-    scoring = Scoring(metrics=(), objectives=(F_SAFE, F_DIFF, Measure(name="jerk", title="jerk", unit="m/s^3")))
+    scoring = Scoring(
+        metrics=(), objectives=(F_SAFE, F_DIFF, Measure(name="jerk", title="jerk", unit="m/s^3"))
+    )
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
 
@@ -226,10 +269,17 @@ def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
 def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_must_have() -> None:
     def earning(*points: float) -> Evaluations:
         undefined = np.full(len(points), np.nan)
-        return made_up_evaluations(undefined, metrics={"safety_degree": undefined, "rating_points": np.array(points)})
+        return made_up_evaluations(
+            undefined, metrics={"safety_degree": undefined, "rating_points": np.array(points)}
+        )
 
     changed = earning(40.0, 39.25, 39.0, 38.5)
-    assert Unsafe.default_among(changed, earning(40.0)).of(changed).tolist() == [False, False, True, True]
+    assert Unsafe.default_among(changed, earning(40.0)).of(changed).tolist() == [
+        False,
+        False,
+        True,
+        True,
+    ]
     assert Unsafe.default_among(changed, earning(1.5)).points == 0.5
     with pytest.raises(InputError, match=r"earns 0\.5 points and has none to lose"):
         Unsafe.default_among(changed, earning(0.5))
@@ -237,13 +287,18 @@ def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_mu
 
 def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
     made = made_up_evaluations([2.0, -1.0])
-    assert [Unsafe(below=below).left(made).tolist() for below in (None, 0.5)] == [[2.0, -1.0], [1.5, -1.5]]
+    assert [Unsafe(below=below).left(made).tolist() for below in (None, 0.5)] == [
+        [2.0, -1.0],
+        [1.5, -1.5],
+    ]
 
 
 SAMPLED = 0.05
 
 
-def comfort(name: str, speed: FloatArray, until: float = np.inf, collision_speed: float = np.nan) -> FloatArray:
+def comfort(
+    name: str, speed: FloatArray, until: float = np.inf, collision_speed: float = np.nan
+) -> FloatArray:
     v = speed.reshape(len(speed), -1)
     active = np.broadcast_to((np.arange(len(v)) * SAMPLED <= until)[:, np.newaxis], v.shape)
     runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=active)
@@ -255,7 +310,9 @@ def sampled(speed: Callable[[FloatArray], FloatArray], seconds: float = 6.0) -> 
 
 
 def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_its_ends() -> None:
-    """5 m/s^2 from 15 m/s, for 3 s; at the stop the deceleration ends within the second over which jerk is averaged."""
+    """5 m/s^2 from 15 m/s, for 3 s; at the stop the deceleration ends within the second over which
+    jerk is averaged.
+    """
     speed = sampled(lambda t: np.maximum(15 - 5 * t, 0))
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(5.0)
@@ -265,7 +322,9 @@ def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_
 
 
 def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_second() -> None:
-    """Deceleration 2 t: jerk 2 everywhere; the mean over the last half of the first 3 seconds is 2 (3 - 0.25)."""
+    """Deceleration 2 t: jerk 2 everywhere; the mean over the last half of the first 3 seconds is 2
+    (3 - 0.25).
+    """
     speed = sampled(lambda t: 20 - t**2, 3.0)
     assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
     assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
@@ -283,13 +342,17 @@ def test_rms_agrees_with_scipys_filters() -> None:
     expected = np.diff(speed, axis=0) / SAMPLED
     for taps in (first, second):
         expected = signal.lfilter(*taps, expected, axis=0)
-    assert comfort("rms_acceleration", speed) == pytest.approx(np.sqrt((expected**2).mean(axis=0)), rel=1e-9)
+    assert comfort("rms_acceleration", speed) == pytest.approx(
+        np.sqrt((expected**2).mean(axis=0)), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", sorted(OPTIONAL_METRICS.keys() - {"stopping_distance"}))
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
-    assert np.array_equal(comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()), equal_nan=True)
+    assert np.array_equal(
+        comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()), equal_nan=True
+    )
     assert np.isnan(comfort(name, speed, collision_speed=3.0)).all()
 
 
@@ -312,6 +375,8 @@ def test_what_an_unsafe_vehicle_does_is_said_with_its_value(
     unsafe: Unsafe, outcome: Outcome, degree: float, words: str
 ) -> None:
     metrics = {"drac": np.array([6.774]), "safety_degree": np.array([degree])}
-    vehicle = made_up_evaluations(np.array([degree]), outcome=np.array([str(outcome)]), metrics=metrics)
+    vehicle = made_up_evaluations(
+        np.array([degree]), outcome=np.array([str(outcome)]), metrics=metrics
+    )
     assert unsafe.of(vehicle)[0]
     assert unsafe.breach_in_words(vehicle) == words

@@ -22,43 +22,76 @@ LENGTH = 5.0
 WIDTH = 3.2
 """Of vehicles and lanes: the device takes lanes for bodies."""
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
-DEVICE = (("has.ssm.device", "true"), ("device.ssm.measures", "TTC DRAC PET"), ("device.ssm.thresholds", "1e4 0 1e4"))
+DEVICE = (
+    ("has.ssm.device", "true"),
+    ("device.ssm.measures", "TTC DRAC PET"),
+    ("device.ssm.thresholds", "1e4 0 1e4"),
+)
 Rows = dict[str, dict[float, tuple[float, float, float]]]
 
 
 def vehicle(name: str, route: str, depart: float, place: float, speed: float, *, ego: bool) -> str:
-    """A vehicle that keeps its speed; that under test has the device, and brakes for who is ahead."""
+    """A vehicle that keeps its speed; that under test has the device, and brakes for who is
+    ahead.
+    """
     params = "".join(f'<param key="{key}" value="{value}"/>' for key, value in DEVICE if ego)
     return (
-        f'<vType id="t{name}" length="{LENGTH}" width="{WIDTH}" maxSpeed="{speed}" accel="8" decel="9" tau="0.05" '
-        f'minGap="0" sigma="0" speedDev="0" jmIgnoreFoeProb="1" jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1"/>'
-        f'<vehicle id="{name}" type="t{name}" route="{route}" depart="{depart}" departPos="{place}" '
-        f'departSpeed="{speed}" insertionChecks="none">{params}</vehicle>'
+        f'<vType id="t{name}" length="{LENGTH}" width="{WIDTH}" maxSpeed="{speed}" accel="8"'
+        ' decel="9" tau="0.05" minGap="0" sigma="0" speedDev="0" jmIgnoreFoeProb="1"'
+        f' jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1"/><vehicle id="{name}" type="t{name}"'
+        f' route="{route}" depart="{depart}" departPos="{place}" departSpeed="{speed}"'
+        f' insertionChecks="none">{params}</vehicle>'
     )
 
 
-def simulate(folder: Path, nodes: str, edges: str, traffic: list[str]) -> tuple[Rows, dict[str, ET.Element]]:
-    """SUMO's rows by vehicle and time: x, y, speed; and the conflict that the device of each vehicle reports."""
+def simulate(
+    folder: Path, nodes: str, edges: str, traffic: list[str]
+) -> tuple[Rows, dict[str, ET.Element]]:
+    """SUMO's rows by vehicle and time: x, y, speed; and the conflict that the device of each
+    vehicle reports.
+    """
     (folder / "n.xml").write_text(f"<nodes>{nodes}</nodes>")
     (folder / "e.xml").write_text(f"<edges>{edges}</edges>")
     (folder / "r.xml").write_text(f"<routes>{''.join(traffic)}</routes>")
-    net = ("netconvert", "-n", "n.xml", "-e", "e.xml", "-o", "net.xml", "--no-turnarounds", "--no-internal-links=false")
-    run = f"sumo -n net.xml -r r.xml --step-length {STEP} --fcd-output fcd.xml --precision 6 --collision.action none"
-    run += " --device.ssm.file ssm.xml --device.ssm.range 400 --time-to-teleport -1 --device.ssm.extratime 60"
+    net = (
+        "netconvert",
+        "-n",
+        "n.xml",
+        "-e",
+        "e.xml",
+        "-o",
+        "net.xml",
+        "--no-turnarounds",
+        "--no-internal-links=false",
+    )
+    run = (
+        f"sumo -n net.xml -r r.xml --step-length {STEP} --fcd-output fcd.xml --precision 6"
+        " --collision.action none"
+    )
+    run += (
+        " --device.ssm.file ssm.xml --device.ssm.range 400 --time-to-teleport -1"
+        " --device.ssm.extratime 60"
+    )
     for name, *words in (net, run.split()):
-        subprocess.run([sumolib.checkBinary(name), *words], cwd=folder, check=True, capture_output=True)
+        subprocess.run(
+            [sumolib.checkBinary(name), *words], cwd=folder, check=True, capture_output=True
+        )
     rows: Rows = defaultdict(dict)
     for step in ET.parse(folder / "fcd.xml").getroot():
         for row in step:
             values = (float(row.attrib["x"]), float(row.attrib["y"]), float(row.attrib["speed"]))
             rows[row.attrib["id"]][float(step.attrib["time"])] = values
-    return rows, {row.attrib["ego"] + row.attrib["foe"]: row for row in ET.parse(folder / "ssm.xml").getroot()}
+    return rows, {
+        row.attrib["ego"] + row.attrib["foe"]: row for row in ET.parse(folder / "ssm.xml").getroot()
+    }
 
 
 def shared(rows: Rows, one: str, other: str) -> tuple[FloatArray, FloatArray]:
     """The rows of two vehicles at the times at which both are on the road, shape (T, 3) each."""
     times = sorted(rows[one].keys() & rows[other].keys())
-    return np.array([rows[one][time] for time in times]), np.array([rows[other][time] for time in times])
+    return np.array([rows[one][time] for time in times]), np.array(
+        [rows[other][time] for time in times]
+    )
 
 
 def measured(name: str, run: SimulationRuns) -> float:
@@ -67,7 +100,9 @@ def measured(name: str, run: SimulationRuns) -> float:
 
 @pytest.mark.slow
 def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path) -> None:
-    """Both divide the gap by the closing speed, and half its square by the gap, at the ends of steps."""
+    """Both divide the gap by the closing speed, and half its square by the gap, at the ends of
+    steps.
+    """
     rng = np.random.default_rng(1)
     traffic = list[str]()
     nodes = edges = ""
@@ -90,8 +125,12 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
             collision_speed=run.collision_speed,
         )
         conflict = conflicts[f"ego{i}foe{i}"]
-        assert measured("ttc_min", run) == pytest.approx(float(conflict.find("minTTC").attrib["value"]), rel=2e-3)
-        assert measured("drac", run) == pytest.approx(float(conflict.find("maxDRAC").attrib["value"]), rel=2e-3)
+        assert measured("ttc_min", run) == pytest.approx(
+            float(conflict.find("minTTC").attrib["value"]), rel=2e-3
+        )
+        assert measured("drac", run) == pytest.approx(
+            float(conflict.find("maxDRAC").attrib["value"]), rel=2e-3
+        )
 
 
 @pytest.mark.slow
@@ -103,8 +142,12 @@ def test_before_and_behind_who_crosses_pet_is_that_of_the_device(tmp_path: Path)
         offset = rng.choice([-1, 1]) * rng.uniform(3, 6)
         at_crossing = 60.0 * i + 40
         traffic.append(vehicle(f"ego{i}", "east", at_crossing - 150 / own, 50, own, ego=True))
-        traffic.append(vehicle(f"foe{i}", "north", at_crossing + offset - 150 / its, 50, its, ego=False))
-    traffic[1:] = sorted(traffic[1:], key=lambda text: float(text.split('depart="')[1].split('"')[0]))
+        traffic.append(
+            vehicle(f"foe{i}", "north", at_crossing + offset - 150 / its, 50, its, ego=False)
+        )
+    traffic[1:] = sorted(
+        traffic[1:], key=lambda text: float(text.split('depart="')[1].split('"')[0])
+    )
     ends = {"c": (0, 0), "w": (-200, 0), "e": (200, 0), "s": (0, -200), "n": (0, 200)}
     nodes = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in ends.items())
     edges = "".join(

@@ -16,7 +16,18 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.tracks import BODIES, PERSONS, VUT_LENGTH, VUT_WIDTH
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
-from tests.openscenario.writing import AT_ONCE, at, body, event, person, private, speed, teleport, world, write
+from tests.openscenario.writing import (
+    AT_ONCE,
+    at,
+    body,
+    event,
+    person,
+    private,
+    speed,
+    teleport,
+    world,
+    write,
+)
 from tests.scenarios.holding import Pedals, driven
 
 WEAR = assemble(load_study("wear"))
@@ -49,11 +60,19 @@ def as_file(folder: Path, scenario: TrackScenario, time_to_impact: float = 0.0) 
         action = SYNCHRONIZE.format(goal, world(east, LANE + float(y[1])), final, abs(way) - 1)
         car = teleport(world(east, north, np.copysign(np.pi / 2, way))), speed(0)
         return OpenScenario(
-            write(folder, event(action), car=car, ego=ego + init, entities=entities + person("Car", length, width))
+            write(
+                folder,
+                event(action),
+                car=car,
+                ego=ego + init,
+                entities=entities + person("Car", length, width),
+            )
         )
     brakes = [event(speed(2 / 3.6, "linear", "rate", 4.0), AT_ONCE.format(3))] if first else []
     car = teleport(world(FRONT + float(x[0]) - 1.5, LANE + float(y[0]))), speed(first)
-    return OpenScenario(write(folder, *brakes, car=car, ego=ego, entities=entities + body("Car", length, width)))
+    return OpenScenario(
+        write(folder, *brakes, car=car, ego=ego, entities=entities + body("Car", length, width))
+    )
 
 
 def least_gap(runs: SimulationRuns) -> float:
@@ -85,7 +104,9 @@ def test_a_class_and_its_file_have_the_same_gap(
 
 
 def test_the_two_parked_cars_of_a_file_hide_the_child(tmp_path: Path) -> None:
-    """Who brakes as soon as it sees somebody within 40 m stops 6 to 8 m before the child, and 20 m earlier without."""
+    """Who brakes as soon as it sees somebody within 40 m stops 6 to 8 m before the child, and 20 m
+    earlier without.
+    """
     settings = WEAR.characteristics.original[np.newaxis]
     scenario = Crossing(test="CPNCO", speed=40.0)
     sight = Pedals(lambda seen: (0.0, 1.0 * (seen.gap < 40)))

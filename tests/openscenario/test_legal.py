@@ -1,5 +1,7 @@
 # ruff: noqa: E501 (lines of XML)
-"""Words that an enumeration does not have and numbers that cannot be, whether the scene comes to them or not."""
+"""Words that an enumeration does not have and numbers that cannot be, whether the scene comes to
+them or not.
+"""
 
 from __future__ import annotations
 
@@ -73,26 +75,40 @@ TimeHeadwayCondition.freespace Timing.domainAbsoluteRelative TriggeringEntities.
 
 @pytest.mark.parametrize(
     ("names", "bad", "legal"),
-    [(SIZES, "-1", SIZE), (SIZES, "INF", "finite"), (SIZES, "nan", "finite"), (WORDS, "longitudnal", "one of ")],
+    [
+        (SIZES, "-1", SIZE),
+        (SIZES, "INF", "finite"),
+        (SIZES, "nan", "finite"),
+        (WORDS, "longitudnal", "one of "),
+    ],
 )
-def test_what_is_illegal_is_refused_with_all_that_names_it(tmp_path: Path, names: str, bad: str, legal: str) -> None:
+def test_what_is_illegal_is_refused_with_all_that_names_it(
+    tmp_path: Path, names: str, bad: str, legal: str
+) -> None:
     file = Path(write(tmp_path, groups=group(EVENT), entities=body("Ego") + CAR))
     text = file.read_text()
     assert play(str(file), {}).duration == pytest.approx(14)
     for one in names.split():
         element, name = one.split(".")
-        file.write_text(re.sub(rf"(<{element} [^>]*?\b{name}=['\"])[^'\"]*", rf"\g<1>{bad}", text, count=1))
+        file.write_text(
+            re.sub(rf"(<{element} [^>]*?\b{name}=['\"])[^'\"]*", rf"\g<1>{bad}", text, count=1)
+        )
         with pytest.raises(InputError, match=f"{element}: {name} = '{bad}'") as caught:
             play(str(file), {})
         assert legal in caught.value.legal
 
 
 def test_the_words_are_those_of_the_schemas_of_all_versions() -> None:
-    schemas = sorted(Path(scenariogeneration.__file__).parents[1].glob("schemas/OpenSCENARIO_1*.xsd"), reverse=True)
+    schemas = sorted(
+        Path(scenariogeneration.__file__).parents[1].glob("schemas/OpenSCENARIO_1*.xsd"),
+        reverse=True,
+    )
     text = "".join(path.read_text() for path in schemas)
     for key, legal in LEGAL.items():
         within = key.replace(".", '".*?name="') if "." in key else f'.*?name="{key}'
         (kind, *_) = re.findall(rf'complexType name="{within}" type="(\w+)"', text, re.DOTALL)
         types = re.findall(rf'simpleType name="{kind}".*?</xsd:simpleType', text, re.DOTALL)
         words = {"none", *re.findall('enumeration value="(.*?)"', "".join(types))}
-        assert words == {"none", *legal} or legal == {"Boolean": ["true", "false", "1", "0"]}.get(kind, SIZE), key
+        assert words == {"none", *legal} or legal == {"Boolean": ["true", "false", "1", "0"]}.get(
+            kind, SIZE
+        ), key

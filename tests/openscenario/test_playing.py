@@ -1,5 +1,7 @@
 # ruff: noqa: E501, E731 (lines of XML, and formulas)
-"""Motions of OpenSCENARIO against closed forms, and the numbers of a second simulator for files of our own."""
+"""Motions of OpenSCENARIO against closed forms, and the numbers of a second simulator for files of
+our own.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +61,12 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_lane_change_has_its_shape_and_the_body_keeps_its_speed(tmp_path: Path, shape: str) -> None:
-    car = only(play(write(tmp_path, event(lane_change(-1, shape, "time", 4.0), AT_ONCE.format(1))), {}))
+def test_a_lane_change_has_its_shape_and_the_body_keeps_its_speed(
+    tmp_path: Path, shape: str
+) -> None:
+    car = only(
+        play(write(tmp_path, event(lane_change(-1, shape, "time", 4.0), AT_ONCE.format(1))), {})
+    )
     times, place = times_of(car), origin(car)
     since = times >= 1
     left = 20 - 6 + 4 * SHAPES[shape](np.clip((times - 1) / 4, 0, 1)) * since
@@ -92,25 +98,35 @@ def test_a_rate_is_the_largest_one_and_a_distance_is_driven(
 
 
 @pytest.mark.parametrize(
-    ("final", "half", "end"), [(4, 5 - math.sqrt(10), 3 + 9 / 4), (16, math.sqrt(40) - 5, math.sqrt(55) - 5)]
+    ("final", "half", "end"),
+    [(4, 5 - math.sqrt(10), 3 + 9 / 4), (16, math.sqrt(40) - 5, math.sqrt(55) - 5)],
 )
 def test_a_lane_change_over_a_distance_takes_it_whatever_the_speed_does(
     tmp_path: Path, final: float, half: float, end: float
 ) -> None:
-    """30 m, while the speed changes by 2 m/s^2 from 10 m/s; after 15 m the body is between the lanes."""
+    """30 m, while the speed changes by 2 m/s^2 from 10 m/s; after 15 m the body is between the
+    lanes.
+    """
     change = event(lane_change(-1, "cubic", "distance", 30.0))
     faster = event(speed(final, "linear", "rate", 2.0), name="Faster", priority="parallel")
-    played = play(write(tmp_path, change, faster, stop=trigger(DONE.format("event", "Event"), "")), {})
+    played = play(
+        write(tmp_path, change, faster, stop=trigger(DONE.format("event", "Event"), "")), {}
+    )
     assert played.duration - 4 == pytest.approx(end, abs=STEP)
     assert origin(only(played))[round(half / STEP)].imag == pytest.approx(16, abs=0.02)
 
 
 @pytest.mark.parametrize(
-    ("dimension", "amount", "duration"), [("rate", 2.0, 5.0), ("time", 5.0, 5.0), ("distance", 75.0, 5.0)]
+    ("dimension", "amount", "duration"),
+    [("rate", 2.0, 5.0), ("time", 5.0, 5.0), ("distance", 75.0, 5.0)],
 )
-def test_a_linear_change_of_the_speed(tmp_path: Path, dimension: str, amount: float, duration: float) -> None:
+def test_a_linear_change_of_the_speed(
+    tmp_path: Path, dimension: str, amount: float, duration: float
+) -> None:
     """From 10 to 20 m/s in 5 s, by 2 m/s^2, on 75 m."""
-    car = only(play(write(tmp_path, event(speed(20, "linear", dimension, amount), AT_ONCE.format(2))), {}))
+    car = only(
+        play(write(tmp_path, event(speed(20, "linear", dimension, amount), AT_ONCE.format(2))), {})
+    )
     times = times_of(car)
     since = np.clip(times - 2, 0, duration)
     later = np.maximum(times - 2 - duration, 0)
@@ -131,9 +147,12 @@ SYNCHRONIZE = """<SynchronizeAction masterEntityRef="Ego"><TargetPositionMaster>
 
 @pytest.mark.parametrize("start", [0.0, 10.0])
 @pytest.mark.parametrize(
-    "steady", ["", "<TargetDistanceSteadyState distance='30'/>", "<TargetTimeSteadyState time='2'/>"]
+    "steady",
+    ["", "<TargetDistanceSteadyState distance='30'/>", "<TargetTimeSteadyState time='2'/>"],
 )
-def test_both_are_at_their_positions_at_the_same_time(tmp_path: Path, start: float, steady: str) -> None:
+def test_both_are_at_their_positions_at_the_same_time(
+    tmp_path: Path, start: float, steady: str
+) -> None:
     action = SYNCHRONIZE.format(at(-1, 250), at(-2, 190), 15, steady)
     played = play(write(tmp_path, event(action), car=(teleport(at(-2, 100)), speed(start))), {})
     car, arrival = only(played), (250 - 50) / 20
@@ -152,12 +171,17 @@ def test_a_final_speed_relative_to_ego_is_one_of_that_size(tmp_path: Path) -> No
     for value, kind in (-5, "delta"), (0.75, "factor"):
         relative = f'<RelativeSpeedToMaster value="{value}" speedTargetValueType="{kind}"/>'
         action = SYNCHRONIZE.replace('<AbsoluteSpeed value="{}">{}</AbsoluteSpeed>', relative)
-        found = only(play(write(tmp_path, event(action.format(at(-1, 250), at(-2, 190))), car=car), {}))
+        found = only(
+            play(write(tmp_path, event(action.format(at(-1, 250), at(-2, 190))), car=car), {})
+        )
         assert np.array_equal(found.place, absolute.place)
 
 
 def polyline(*vertices: tuple[float, float, float], timing: str) -> str:
-    points = "".join(f'<Vertex time="{time}"><Position>{world(x, y)}</Position></Vertex>' for time, x, y in vertices)
+    points = "".join(
+        f'<Vertex time="{time}"><Position>{world(x, y)}</Position></Vertex>'
+        for time, x, y in vertices
+    )
     trajectory = f'<Trajectory name="" closed="false"><Shape><Polyline>{points}</Polyline></Shape></Trajectory>'
     return (
         f"<RoutingAction><FollowTrajectoryAction><TrajectoryRef>{trajectory}</TrajectoryRef><TimeReference>{timing}"
@@ -195,24 +219,36 @@ def test_a_distance_is_kept_between_bodies(tmp_path: Path) -> None:
             '<RelativeDistanceCondition entityRef="Car" relativeDistanceType="longitudinal" freespace="true" rule="lessThan" value="20.5"/>',
             2.5,
         ),
-        ('<TimeHeadwayCondition entityRef="Car" freespace="false" rule="lessThan" value="1"/>', 3.0),
+        (
+            '<TimeHeadwayCondition entityRef="Car" freespace="false" rule="lessThan" value="1"/>',
+            3.0,
+        ),
         (
             '<TimeToCollisionCondition freespace="true" rule="lessThan" value="2.5"><TimeToCollisionConditionTarget><EntityRef entityRef="Car"/></TimeToCollisionConditionTarget></TimeToCollisionCondition>',
             2.05,
         ),
         ('<TraveledDistanceCondition value="40"/>', 2.0),
-        (f'<ReachPositionCondition tolerance="1"><Position>{at(-1, 111)}</Position></ReachPositionCondition>', 3.0),
+        (
+            f'<ReachPositionCondition tolerance="1"><Position>{at(-1, 111)}</Position></ReachPositionCondition>',
+            3.0,
+        ),
     ],
 )
 def test_a_trigger_that_watches_ego(tmp_path: Path, condition: str, when: float) -> None:
-    """Ego, 4 m long, drives at 20 m/s, 50 m behind the origin of a Car of 5 m at 10 m/s in the next lane."""
-    played = play(write(tmp_path, event(lane_change(-1, "linear", "time", 2), watching("Ego", condition))), {})
+    """Ego, 4 m long, drives at 20 m/s, 50 m behind the origin of a Car of 5 m at 10 m/s in the next
+    lane.
+    """
+    played = play(
+        write(tmp_path, event(lane_change(-1, "linear", "time", 2), watching("Ego", condition))), {}
+    )
     begins = np.flatnonzero(np.abs(np.diff(origin(only(played)).imag)) > 1e-9)[0] * STEP
     assert begins == pytest.approx(when, abs=2 * STEP)
     assert played.depends_until == pytest.approx(begins)
 
 
-@pytest.mark.parametrize(("edge", "delay", "when"), [("none", 0.0, 3.0), ("rising", 1.5, 4.5), ("falling", 0.0, 5.0)])
+@pytest.mark.parametrize(
+    ("edge", "delay", "when"), [("none", 0.0, 3.0), ("rising", 1.5, 4.5), ("falling", 0.0, 5.0)]
+)
 def test_edges_and_delays(tmp_path: Path, edge: str, delay: float, when: float) -> None:
     rule = "lessThan' value='5" if edge == "falling" else "greaterOrEqual' value='3"
     condition = f"<SimulationTimeCondition rule='{rule}'/>"
@@ -231,11 +267,17 @@ def test_one_event_ends_another(tmp_path: Path) -> None:
         assert car.speed[-1] == 20
 
 
-@pytest.mark.parametrize("stop", ["", trigger(watching("Ego", '<StandStillCondition duration="1"/>'), "")])
+@pytest.mark.parametrize(
+    "stop", ["", trigger(watching("Ego", '<StandStillCondition duration="1"/>'), "")]
+)
 def test_an_empty_trigger_starts_at_once_and_never_stops(tmp_path: Path, stop: str) -> None:
-    """Without a StopTrigger, and with one that waits for how Ego drives, a remark says when the scene ends."""
+    """Without a StopTrigger, and with one that waits for how Ego drives, a remark says when the
+    scene ends.
+    """
     faster = event(speed(20, "linear", "time", 2), "<StartTrigger></StartTrigger>")
-    empty = play(write(tmp_path, faster, act_trigger="<StartTrigger/><StopTrigger/>", stop=stop), {})
+    empty = play(
+        write(tmp_path, faster, act_trigger="<StartTrigger/><StopTrigger/>", stop=stop), {}
+    )
     assert only(empty).speed[[100, 250]].tolist() == [pytest.approx(15), 20]
     assert (empty.duration, "the scene ends at 60 s" in empty.remarks[0]) == (60, True)
 
@@ -261,7 +303,9 @@ def test_lanes_count_to_the_left_of_an_entity_as_it_faces(
 ) -> None:
     """On lanes with a number above 0 they drive against the others."""
     start = private("Ego", teleport(at(ego, 900)), speed(20))
-    played = play(write(tmp_path, event(action), ego=start, car=(teleport(at(its_lane, 900)), speed(10))), {})
+    played = play(
+        write(tmp_path, event(action), ego=start, car=(teleport(at(its_lane, 900)), speed(10))), {}
+    )
     assert origin(only(played))[-1].imag == pytest.approx(20 + left)
 
 
@@ -283,18 +327,26 @@ ON_LINE = """<TrajectoryPosition s="1"><Orientation h="0.5" {}/><TrajectoryRef><
         ("3", ON_LINE.format(""), 1),
     ],
 )
-def test_an_orientation_is_absolute_or_relative(tmp_path: Path, minor: str, place: str, turned: int) -> None:
-    """The road leads to the east, lane 1 and the trajectory to the west. A remark says how lanes are understood."""
+def test_an_orientation_is_absolute_or_relative(
+    tmp_path: Path, minor: str, place: str, turned: int
+) -> None:
+    """The road leads to the east, lane 1 and the trajectory to the west. A remark says how lanes
+    are understood.
+    """
     played = play(write(tmp_path, car=(teleport(place), speed(0)), minor=minor), {})
     assert only(played).facing[0] == pytest.approx(np.exp(1j * (0.5 + turned * math.pi)))
-    assert any("driving direction" in remark for remark in played.remarks) == (turned and "Lane" in place)
+    assert any("driving direction" in remark for remark in played.remarks) == (
+        turned and "Lane" in place
+    )
 
 
 def test_a_spiral_is_the_integral_of_its_curvature() -> None:
     for first, last in ((0.0, 0.02), (0.02, -0.01), (-0.01, -0.03)):
         piece = Piece(Pose.at(3.0, -2.0, 0.7), 80.0, first, last)
         for distance in (0.0, 31.0, 80.0):
-            turn = lambda at, first=first, last=last: 0.7 + first * at + (last - first) / 160 * at * at
+            turn = lambda at, first=first, last=last: (
+                0.7 + first * at + (last - first) / 160 * at * at
+            )
             x = quad(lambda at, turn=turn: math.cos(turn(at)), 0, distance)[0]
             y = quad(lambda at, turn=turn: math.sin(turn(at)), 0, distance)[0]
             pose = piece.pose(distance)
@@ -306,7 +358,9 @@ def test_a_spiral_is_the_integral_of_its_curvature() -> None:
 def test_the_way_through_a_bend_counts_where_the_body_is(tmp_path: Path) -> None:
     """A quarter of a circle to the left with a radius of 100 m, in lane -1, 2 m outside."""
     bend = 50 * math.pi
-    geometry = f'<geometry s="0" x="0" y="0" hdg="0" length="{bend}"><arc curvature="0.01"/></geometry>'
+    geometry = (
+        f'<geometry s="0" x="0" y="0" hdg="0" length="{bend}"><arc curvature="0.01"/></geometry>'
+    )
     ego = private("Ego", teleport(world(0, -300)), speed(20))
     car = (teleport(at(-1, 0)), speed(10))
     played = play(write(tmp_path, car=car, ego=ego, geometry=geometry, length=bend), {})
@@ -346,21 +400,34 @@ def test_an_ego_in_the_left_lane_drives_against_s(tmp_path: Path) -> None:
 
 def test_a_state_is_that_of_the_element_with_its_whole_path(tmp_path: Path) -> None:
     """A story has ended with its last act."""
-    for name in ("Event", "Maneuver of Car::Event", "Story::Act::Group of Car::Maneuver of Car::Event"):
+    for name in (
+        "Event",
+        "Maneuver of Car::Event",
+        "Story::Act::Group of Car::Maneuver of Car::Event",
+    ):
         file = write(
             tmp_path,
             event(speed(20, "linear", "time", 3), AT_ONCE.format(2)),
             stop=trigger(DONE.format("event", name), ""),
         )
         assert play(file, {}).duration == pytest.approx(5 + 4, abs=2 * STEP)
-    later = "</Act><Act name='Later'>" + group(event(speed(5, "linear", "time", 2), AT_ONCE.format(6)))
-    file = write(tmp_path, event(speed(8)), act_trigger=later, stop=trigger(DONE.format("story", "Story"), ""))
+    later = "</Act><Act name='Later'>" + group(
+        event(speed(5, "linear", "time", 2), AT_ONCE.format(6))
+    )
+    file = write(
+        tmp_path,
+        event(speed(8)),
+        act_trigger=later,
+        stop=trigger(DONE.format("story", "Story"), ""),
+    )
     assert play(file, {}).duration == pytest.approx(8 + 4, abs=STEP)
 
 
 def test_a_selection_acts_and_is_watched_as_its_members(tmp_path: Path) -> None:
     members = '<Members><EntityRef entityRef="Car"/></Members>'
-    entities = body("Ego") + body("Car", 5.0) + f'<EntitySelection name="All">{members}</EntitySelection>'
+    entities = (
+        body("Ego") + body("Car", 5.0) + f'<EntitySelection name="All">{members}</EntitySelection>'
+    )
     far = watching("All", '<TraveledDistanceCondition value="30"/>')
     slower = group(event(speed(5, "linear", "time", 2.0), far), actor="All")
     of_all = only(play(write(tmp_path, groups=slower, entities=entities), {}))

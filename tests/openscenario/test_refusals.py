@@ -95,24 +95,36 @@ COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionConditio
         ({"stop": trigger(watching("Ego", '<SpeedCondition direction="lateral" value="5" rule="lessThan"/>'), "")}, "SpeedCondition with direction = lateral is not supported"),
     ],
 )  # fmt: skip
-def test_a_refusal_names_what_is_not_supported(tmp_path: Path, parts: dict[str, str], problem: str) -> None:
+def test_a_refusal_names_what_is_not_supported(
+    tmp_path: Path, parts: dict[str, str], problem: str
+) -> None:
     with pytest.raises(InputError, match=problem) as caught:
         play(write(tmp_path, **parts), {})  # type: ignore[arg-type]
     assert str(caught.value).count("\n") <= 1
-    assert any(re.fullmatch(template, caught.value.problem) for template in TEMPLATES), caught.value.problem
+    assert any(re.fullmatch(template, caught.value.problem) for template in TEMPLATES), (
+        caught.value.problem
+    )
 
 
 def test_what_happens_less_than_the_file_says_is_remarked(tmp_path: Path) -> None:
     late = event(lane_change(-1, "linear", "time", 1), AT_ONCE.format(99))
     actions = (
-        "<GlobalAction><EnvironmentAction/></GlobalAction>" + EGO + private("Car", teleport(at(-2, 1900)), speed(30))
+        "<GlobalAction><EnvironmentAction/></GlobalAction>"
+        + EGO
+        + private("Car", teleport(at(-2, 1900)), speed(30))
     )
     played = play(write(tmp_path, late, init=actions), {})
     assert "without effect here: EnvironmentAction" in played.remarks
     assert "the event Event never fires" in played.remarks
     often = late.replace("<Event ", '<Event maximumExecutionCount="3" ')
-    assert "the event Event is played once, of up to 3 times" in play(write(tmp_path, often), {}).remarks
-    assert any("the scene ends at 3.3 s, when Car is at the end of its road" in remark for remark in played.remarks)
+    assert (
+        "the event Event is played once, of up to 3 times"
+        in play(write(tmp_path, often), {}).remarks
+    )
+    assert any(
+        "the scene ends at 3.3 s, when Car is at the end of its road" in remark
+        for remark in played.remarks
+    )
     assert played.duration == pytest.approx(3.33)
 
 
@@ -136,7 +148,16 @@ def test_expressions() -> None:
         "left": "left",
     }.items():
         assert literal(text, values) == expected
-    for wrong in ("__import__('os')", "1 / 0", "$text + 1", "(1).real", "9 ** 9", "+", "max()", "1" * 1001):
+    for wrong in (
+        "__import__('os')",
+        "1 / 0",
+        "$text + 1",
+        "(1).real",
+        "9 ** 9",
+        "+",
+        "max()",
+        "1" * 1001,
+    ):
         with pytest.raises(InputError, match="has no value"):
             evaluate(wrong, values)
 
@@ -144,14 +165,19 @@ def test_expressions() -> None:
 LOGICAL = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValueDistribution>
 <ScenarioFile filepath="scenario.xosc"/>{}</ParameterValueDistribution></OpenSCENARIO>"""
 ROW = '<DeterministicSingleParameterDistribution parameterName="{}">{}</DeterministicSingleParameterDistribution>'
-RANGE = '<DistributionRange stepWidth="{}"><Range lowerLimit="{}" upperLimit="{}"/></DistributionRange>'
+RANGE = (
+    '<DistributionRange stepWidth="{}"><Range lowerLimit="{}" upperLimit="{}"/></DistributionRange>'
+)
 
 
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
         ("<Stochastic/>", "Stochastic distributions are not supported"),
-        ("<Deterministic>" + ROW.format("w", RANGE.format(1, 0, 5)) + "</Deterministic>", "declares no parameter w"),
+        (
+            "<Deterministic>" + ROW.format("w", RANGE.format(1, 0, 5)) + "</Deterministic>",
+            "declares no parameter w",
+        ),
         (
             "<Deterministic>" + 2 * ROW.format("v", RANGE.format(1, 0, 5)) + "</Deterministic>",
             "2 parameters with values",

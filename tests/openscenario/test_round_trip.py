@@ -36,16 +36,45 @@ def runs_of(study: Study, wear: Mapping[str, float]) -> tuple[SimulationRuns, An
 @pytest.mark.parametrize(
     ("scenario", "wear", "outcome"),
     [
-        pytest.param({"file": str(FILES / "crossing_pedestrian.xosc")}, WEAR, COLLISION, marks=pytest.mark.slow),
-        ({"file": str(FILES / "cut_in.xosc"), "values": {"gap_m": 6, "slower_kmh": 30}}, WEAR, COLLISION),
-        pytest.param({"file": str(FILES / "braking_leader.xosc")}, WEAR, COLLISION, marks=pytest.mark.slow),
-        pytest.param({"model": "car_to_car", "parameters": CCRB}, WEAR, COLLISION, marks=pytest.mark.slow),
-        pytest.param({"model": "crossing", "parameters": CPNA}, WEAR, COLLISION, marks=pytest.mark.slow),
+        pytest.param(
+            {"file": str(FILES / "crossing_pedestrian.xosc")},
+            WEAR,
+            COLLISION,
+            marks=pytest.mark.slow,
+        ),
+        (
+            {"file": str(FILES / "cut_in.xosc"), "values": {"gap_m": 6, "slower_kmh": 30}},
+            WEAR,
+            COLLISION,
+        ),
+        pytest.param(
+            {"file": str(FILES / "braking_leader.xosc")}, WEAR, COLLISION, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"model": "car_to_car", "parameters": CCRB}, WEAR, COLLISION, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"model": "crossing", "parameters": CPNA}, WEAR, COLLISION, marks=pytest.mark.slow
+        ),
         ({"file": str(FILES / "cut_in.xosc")}, {}, Outcome.PASSED),
-        pytest.param({"file": str(FILES / "crossing_pedestrian.xosc")}, {}, Outcome.STOPPED, marks=pytest.mark.slow),
-        pytest.param({"file": str(FILES / "braking_leader.xosc")}, {}, Outcome.STOPPED, marks=pytest.mark.slow),
-        pytest.param({"model": "car_to_car", "parameters": CCRB}, {}, Outcome.PASSED, marks=pytest.mark.slow),
-        pytest.param({"model": "crossing", "parameters": CPNA}, {}, Outcome.STOPPED, marks=pytest.mark.slow),
+        pytest.param(
+            {"file": str(FILES / "crossing_pedestrian.xosc")},
+            {},
+            Outcome.STOPPED,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"file": str(FILES / "braking_leader.xosc")},
+            {},
+            Outcome.STOPPED,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"model": "car_to_car", "parameters": CCRB}, {}, Outcome.PASSED, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            {"model": "crossing", "parameters": CPNA}, {}, Outcome.STOPPED, marks=pytest.mark.slow
+        ),
     ],
 )
 def test_an_exported_run_is_the_same_from_its_file(
@@ -67,5 +96,7 @@ def test_an_exported_run_is_the_same_from_its_file(
     n = int(np.count_nonzero(runs.trace.active)) + (outcome == COLLISION)
     for name in ("position", "gap", "lateral"):
         first, second = (getattr(one.trace, name)[:n, 0] for one in (runs, again))
-        assert np.abs(first - second - (first[0] - second[0]) * (name == "position")).max() < 1e-3, name
+        assert (
+            np.abs(first - second - (first[0] - second[0]) * (name == "position")).max() < 1e-3
+        ), name
     assert again.collision_speed == pytest.approx(runs.collision_speed, abs=1e-3, nan_ok=True)

@@ -1,4 +1,6 @@
-"""How long a scene is played, and whether something happens in it to an Ego that keeps its speed."""
+"""How long a scene is played, and whether something happens in it to an Ego that keeps its
+speed.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ from tests.openscenario import writing
 from tests.openscenario.writing import AT_ONCE, at, event, private, speed, teleport, trigger, world
 from tests.scenarios.holding import driven
 
-LONG = {"geometry": writing.STRAIGHT.replace("2000", "20000"), "length": 20_000.0, "parameters": writing.PARAMETER}
+LONG = {
+    "geometry": writing.STRAIGHT.replace("2000", "20000"),
+    "length": 20_000.0,
+    "parameters": writing.PARAMETER,
+}
 AT_V = AT_ONCE.format("$v")
 
 
@@ -35,14 +41,18 @@ def brakes(folder: Path, begin: object, stop: str) -> str:
 
 
 @pytest.mark.parametrize("stop", [10.0, 58.0, 90.0, 600.0])
-def test_a_scene_lasts_to_its_stop_trigger_and_what_happens_late_happens(tmp_path: Path, stop: float) -> None:
+def test_a_scene_lasts_to_its_stop_trigger_and_what_happens_late_happens(
+    tmp_path: Path, stop: float
+) -> None:
     played = play(brakes(tmp_path, stop - 6, trigger(AT_ONCE.format(stop), "")), {})
     (other,) = played.others
     assert (played.duration, played.remarks, played.uneventful) == (pytest.approx(stop + 4), [], "")
     assert other.place[-1].real == pytest.approx(10 + 100 + 1.5 + 20 * (stop - 6) + 20**2 / 4)
 
 
-def test_who_brakes_late_is_hit_and_a_stop_trigger_that_comes_too_late_is_refused(tmp_path: Path) -> None:
+def test_who_brakes_late_is_hit_and_a_stop_trigger_that_comes_too_late_is_refused(
+    tmp_path: Path,
+) -> None:
     """Fewer vehicles are simulated at once in a long run; points beyond are left out by name."""
     file = brakes(tmp_path, 80, trigger(AT_V, ""))
     late = OpenScenario(file, v=116)
@@ -84,7 +94,10 @@ EVENTS = {
     "never": event(writing.lane_change(-1, "linear", "time", 2), AT_ONCE.format(99)),
     "slows": event(speed(17, "linear", "rate", 3)),
 }
-STARTS = {"short": at(-1, 1994), "back": at(-1, 50, 0, '<Orientation type="relative" h="3.141592653589793"/>')}
+STARTS = {
+    "short": at(-1, 1994),
+    "back": at(-1, 50, 0, '<Orientation type="relative" h="3.141592653589793"/>'),
+}
 NO_EVENT = "no event begins that moves somebody, and nobody is in Ego's lane or crosses it"
 
 
@@ -95,22 +108,34 @@ def test_what_happens_to_an_ego_that_keeps_its_speed(tmp_path: Path, scene: str)
     other = {"car": car, "walker": walker}[kind](*map(float, numbers))
     ego = private("Ego", teleport(STARTS.get(first, at(-1, 50))), speed(20))
     entities = {"entities": PERSON} if kind == "walker" else {}
-    found = play(writing.write(tmp_path, EVENTS.get(first, ""), car=other, ego=ego, **entities), {}).uneventful
+    found = play(
+        writing.write(tmp_path, EVENTS.get(first, ""), car=other, ego=ego, **entities), {}
+    ).uneventful
     nobody = f"the scene ends at {third} s, before Ego has come near anybody"
     assert found == {"-": "", "NO_EVENT": NO_EVENT}.get(third, nobody)
 
 
-def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(tmp_path: Path) -> None:
-    """A pedestrian is passed at 0.75 m, by any vehicle; in a search the original's encounter decides on a verdict."""
+def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(
+    tmp_path: Path,
+) -> None:
+    """A pedestrian is passed at 0.75 m, by any vehicle; in a search the original's encounter
+    decides on a verdict.
+    """
     walks = event(speed(1.5), AT_V)
-    file = writing.write(tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER)
+    file = writing.write(
+        tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER
+    )
     for when in (99, 3):
         table = f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\nvalues.v = {when}'
         (tmp_path / "mine.toml").write_text(table)
         answer = json_of("simulate", str(tmp_path / "mine.toml"))
         search = {"v": {"lower": 0.0, "upper": 99.0, "original": when}}
-        searched = why_no_verdict(assemble(load_study("wear", scenario={"file": file, "search": search})))
-        assert [answer["numbers"]["driven"], searched == "", NO_EVENT not in answer["verdict"]] == [when == 3] * 3
+        searched = why_no_verdict(
+            assemble(load_study("wear", scenario={"file": file, "search": search}))
+        )
+        assert [answer["numbers"]["driven"], searched == "", NO_EVENT not in answer["verdict"]] == [
+            when == 3
+        ] * 3
     with pytest.warns(match=r"2 of 3 .* the first is v = 50: no event begins .*; others: v = 60"):
         study = load_study("wear", scenario={"file": writing.logical(tmp_path, 50, 4, 60)})
     assert (study.scenario.parameters["v"], why_no_verdict(assemble(study))) == (4, "")
@@ -119,11 +144,13 @@ def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(
 
 
 def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Path) -> None:
-    """The pedestrian walks after v seconds: at 3 s in time, at 50 s never, and vehicles of that encounter are left out
-    whatever they do.
+    """The pedestrian walks after v seconds: at 3 s in time, at 50 s never, and vehicles of that
+    encounter are left out whatever they do.
     """
     walks = event(speed(1.5), AT_V)
-    file = writing.write(tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER)
+    file = writing.write(
+        tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER
+    )
     search = {"v": {"lower": 0.0, "upper": 99.0, "original": 3.0}}
     study = load_study("wear", scenario={"file": file, "search": search})
     system = assemble(study)

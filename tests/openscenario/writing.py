@@ -1,5 +1,7 @@
 # ruff: noqa: E501 (lines of XML, and formulas)
-"""Files of OpenSCENARIO for tests, from the parts that differ: a straight road of four lanes, Ego and a Car."""
+"""Files of OpenSCENARIO for tests, from the parts that differ: a straight road of four lanes, Ego
+and a Car.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def person(name: str, length: float, width: float) -> str:
 
 
 def at(lane: int, s: float, offset: float = 0.0, inner: str = "") -> str:
-    return f'<LanePosition roadId="1" laneId="{lane}" s="{s}" offset="{offset}">{inner}</LanePosition>'
+    return (
+        f'<LanePosition roadId="1" laneId="{lane}" s="{s}" offset="{offset}">{inner}</LanePosition>'
+    )
 
 
 def world(x: float, y: float, h: float = 0.0) -> str:
@@ -53,7 +57,9 @@ def speed(value: object, shape: str = "step", dimension: str = "time", amount: f
     return f"<LongitudinalAction><SpeedAction>{how}{target}</SpeedAction></LongitudinalAction>"
 
 
-def lane_change(lane: int, shape: str, dimension: str, amount: float, kind: str = "AbsoluteTargetLane") -> str:
+def lane_change(
+    lane: int, shape: str, dimension: str, amount: float, kind: str = "AbsoluteTargetLane"
+) -> str:
     how = dynamics(shape, dimension, amount, "LaneChangeActionDynamics")
     target = f'<LaneChangeTarget><{kind} value="{lane}"/></LaneChangeTarget>'
     return f"<LateralAction><LaneChangeAction>{how}{target}</LaneChangeAction></LateralAction>"
@@ -64,7 +70,9 @@ def private(name: str, *actions: str) -> str:
     return f'<Private entityRef="{name}">{inner}</Private>'
 
 
-def trigger(condition: str, name: str = "StartTrigger", edge: str = "none", delay: float = 0.0) -> str:
+def trigger(
+    condition: str, name: str = "StartTrigger", edge: str = "none", delay: float = 0.0
+) -> str:
     kind = "ByEntityCondition" if "TriggeringEntities" in condition else "ByValueCondition"
     inner = f'<Condition name="" delay="{delay}" conditionEdge="{edge}"><{kind}>{condition}</{kind}></Condition>'
     group = f"<ConditionGroup>{inner}</ConditionGroup>"
@@ -76,7 +84,9 @@ def watching(name: str, condition: str) -> str:
     return f"{entities}<EntityCondition>{condition}</EntityCondition>"
 
 
-def event(action: str, when: str = AT_ONCE.format(0), name: str = "Event", priority: str = "override") -> str:
+def event(
+    action: str, when: str = AT_ONCE.format(0), name: str = "Event", priority: str = "override"
+) -> str:
     start = when if when.startswith("<StartTrigger") else trigger(when)
     content = f'<Action name="{name} action"><PrivateAction>{action}</PrivateAction></Action>'
     return f'<Event name="{name}" priority="{priority}">{content}{start}</Event>'
@@ -94,7 +104,9 @@ LOGICAL = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValu
 
 
 def logical(folder: Path, *values: float) -> str:
-    """The path of a file with values of the parameter v of the scenario that has been written there."""
+    """The path of a file with values of the parameter v of the scenario that has been written
+    there.
+    """
     path = folder / "values.xosc"
     path.write_text(LOGICAL.format("".join(f'<Element value="{value}"/>' for value in values)))
     return str(path)

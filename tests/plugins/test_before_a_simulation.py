@@ -1,4 +1,6 @@
-"""User code that hangs before a simulation, whose attributes cannot be set, or whose error is no legal text."""
+"""User code that hangs before a simulation, whose attributes cannot be set, or whose error is no
+legal text.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,10 @@ JOINT = '[scenario]\nmodel = "mine:Mine"\n[scenario.search]\nspeed = {}\n' + LIM
     [
         (SCALAR + INIT + DRIVE, ADS + LIMIT, "`__init__`"),
         (SEARCH, ALGORITHM, "`__init__`"),
-        *((IMPORT, table, "the import of mine") for table in (ADS + LIMIT, ALGORITHM, METRIC, JOINT)),
+        *(
+            (IMPORT, table, "the import of mine")
+            for table in (ADS + LIMIT, ALGORITHM, METRIC, JOINT)
+        ),
     ],
 )
 def test_user_code_that_hangs_before_a_simulation_ends_at_the_time_limit(
@@ -41,7 +46,9 @@ def test_user_code_that_hangs_before_a_simulation_ends_at_the_time_limit(
 
     with pytest.raises(UserCodeError) as caught:
         load()
-    assert f"{what} took longer than the time limit of 0.3 s ({folder / 'mine.py'}:" in str(caught.value)
+    assert f"{what} took longer than the time limit of 0.3 s ({folder / 'mine.py'}:" in str(
+        caught.value
+    )
     assert len(str(caught.value).splitlines()) == 2
 
 
@@ -53,17 +60,27 @@ def test_user_code_that_hangs_before_a_simulation_ends_at_the_time_limit(
             "ads.model = 'mine:Mine' raised in start",
         ),
         ("step = property(lambda self: 1)", "ads.model = 'mine:Mine' raised in start"),
-        ("def put(self, value):\n        raise RuntimeError('no')\n    nominal = property(None, put)", "raised in put"),
+        (
+            (
+                "def put(self, value):\n        raise RuntimeError('no')\n    nominal ="
+                " property(None, put)"
+            ),
+            "raised in put",
+        ),
     ],
 )
-def test_an_ads_whose_attributes_cannot_be_set_is_told_in_two_lines(body: str, place: str, mine: Mine) -> None:
+def test_an_ads_whose_attributes_cannot_be_set_is_told_in_two_lines(
+    body: str, place: str, mine: Mine
+) -> None:
     system = mine(f"{SCALAR}    {body}\n\n{DRIVE}")
     with pytest.raises(UserCodeError, match=place) as caught:
         evaluate(system, original_of(system))
     assert len(str(caught.value).splitlines()) <= 2
 
 
-def test_a_lone_surrogate_in_an_error_of_the_user_is_told_as_its_code(mine: Mine, folder: Path) -> None:
+def test_a_lone_surrogate_in_an_error_of_the_user_is_told_as_its_code(
+    mine: Mine, folder: Path
+) -> None:
     mine(SCALAR + "    def drive(self, seen):\n        raise ValueError('bad \\ud800 text')\n")
     study = str(folder / "mine.toml")
     refused("simulate", study, "--json", message=("bad \\ud800 text", "mine.py:6"))

@@ -1,5 +1,5 @@
-"""Planted defects of all kinds are found, with the input that shows them; what is shipped and what is right elsewhere
-passes.
+"""Planted defects of all kinds are found, with the input that shows them; what is shipped and what
+is right elsewhere passes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class Mine:
     def drive(self, seen, memory):
         BODY
         near = (np.abs(seen.lateral) < 2.5) & (seen.gap < seen.speed**2 / (1.2 * memory) + 2)
-        return Command(np.where(~near & (seen.speed < 5), 0.5, 0.0), np.where(near, 1.0, 0.0)), memory
+        throttle = np.where(~near & (seen.speed < 5), 0.5, 0.0)
+        return Command(throttle, np.where(near, 1.0, 0.0)), memory
 """
 FILES = files_of("docs/tutorials/own_vehicle.md", "docs/tutorials/own_metric.md")
 VEHICLE, SCENARIO, METRIC, OBJECTIVE, ALGORITHM = (
@@ -117,32 +118,63 @@ def planted(kind: str, check: str, module: str, where: str, line: str, got: str)
     return Defect(kind, check, module.replace(where, line, 1).replace("BODY", "pass"), got)
 
 
-ALONE, ORDER, AGAIN = " in a smaller batch, with ", " in another order, with ", " in a second run, with "
+ALONE, ORDER, AGAIN = (
+    " in a smaller batch, with ",
+    " in another order, with ",
+    " in a second run, with ",
+)
 RUN = "in another run"
 DEFECTS = {
     "random": planted("ads", "repetition", SCALAR, "BODY", "stopping += random.random()", AGAIN),
     "class variable": planted(
-        "ads", "order", SCALAR, "BODY", "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one", ORDER
+        "ads",
+        "order",
+        SCALAR,
+        "BODY",
+        "Mine.seen_one = stopping = stopping + 0.01 * Mine.seen_one",
+        ORDER,
     ),
     "mean over vehicles": planted(
-        "ads", "alone", ARRAYS, "BODY", "seen = seen._replace(gap=seen.gap + np.mean(seen.speed))", ALONE
+        "ads",
+        "alone",
+        ARRAYS,
+        "BODY",
+        "seen = seen._replace(gap=seen.gap + np.mean(seen.speed))",
+        ALONE,
     ),
     "place in the batch": planted(
         "ads", "order", ARRAYS, "BODY", "memory = memory + np.arange(len(seen.speed))", ORDER
     ),
     "out of range": planted(
-        "ads", "contract", SCALAR, "return 0.0, 1.0", "return 0.0, 100.0", "returned brake = 100.0 from drive"
+        "ads",
+        "contract",
+        SCALAR,
+        "return 0.0, 1.0",
+        "return 0.0, 100.0",
+        "returned brake = 100.0 from drive",
     ),
     "vehicle keeps state": planted(
-        "vehicle", "repetition", VEHICLE, "        grip = ", "        self.top_speed *= 0.999\n        grip = ", AGAIN
+        "vehicle",
+        "repetition",
+        VEHICLE,
+        "        grip = ",
+        "        self.top_speed *= 0.999\n        grip = ",
+        AGAIN,
     ),
     "vehicle maximum": planted(
         "vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE
     ),
-    "scenario with a text": planted("scenario", "contract", SCENARIO, "self.distance, 0.0", "'far', 0.0", "returned x"),
+    "scenario with a text": planted(
+        "scenario", "contract", SCENARIO, "self.distance, 0.0", "'far', 0.0", "returned x"
+    ),
     "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO, with "),
     "metric over runs": planted(
-        "metric", "alone", METRIC, "    return np.max(", "    jerk = jerk - np.mean(jerk)\n    return np.max(", ALONE
+        "metric",
+        "alone",
+        METRIC,
+        "    return np.max(",
+        "    jerk = jerk - np.mean(jerk)\n    return np.max(",
+        ALONE,
     ),
     "objective no number": planted(
         "objective",
@@ -169,13 +201,28 @@ DEFECTS = {
         RUN,
     ),
     "algorithm unfiltered": planted(
-        "algorithm", "contract", ALGORITHM, "problem.characteristics.filter(settings)", "settings", "from search"
+        "algorithm",
+        "contract",
+        ALGORITHM,
+        "problem.characteristics.filter(settings)",
+        "settings",
+        "from search",
     ),
     "controller module variable": planted(
-        "traci", "repetition", CONTROLLER, "BODY", "calls.append(1); speed += len(calls) / 1e3", AGAIN
+        "traci",
+        "repetition",
+        CONTROLLER,
+        "BODY",
+        "calls.append(1); speed += len(calls) / 1e3",
+        AGAIN,
     ),
     "controller other vehicle": planted(
-        "traci", "contract", CONTROLLER, "BODY", "traci.vehicle.setSpeed('parked_ahead', 0)", "parked_ahead"
+        "traci",
+        "contract",
+        CONTROLLER,
+        "BODY",
+        "traci.vehicle.setSpeed('parked_ahead', 0)",
+        "parked_ahead",
     ),
 }
 FAST = ("random", "mean over vehicles", "out of range", "scenario undeclared reaction")
@@ -207,31 +254,44 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     subject: str, drive: str, reason: str, in_tmp: Path
 ) -> None:
     (in_tmp / "mine.py").write_text(
-        f"from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
         f"    def drive(self, seen):\n        {drive}\n"
     )
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
-    assert [(finding.check, reason in finding.finding) for finding in check(study_to_check(subject))] == [
-        ("reaction", True)
-    ]
+    assert [
+        (finding.check, reason in finding.finding) for finding in check(study_to_check(subject))
+    ] == [("reaction", True)]
 
 
 @pytest.mark.parametrize(("pace", "found"), [(2.5, []), (4.0, ["meeting"])])
-def test_others_who_have_left_in_time_are_the_scenarios_matter(pace: float, found: list[str], in_tmp: Path) -> None:
-    """A deer runs from 12 m beside the lane to 50 m ahead; the car, at 40 km/h, is there after 4.5 s."""
+def test_others_who_have_left_in_time_are_the_scenarios_matter(
+    pace: float, found: list[str], in_tmp: Path
+) -> None:
+    """A deer runs from 12 m beside the lane to 50 m ahead; the car, at 40 km/h, is there after 4.5
+    s.
+    """
     (in_tmp / "mine.py").write_text(
-        "from safevar_sumo.scenarios import Track\n\n\nclass Deer:\n    speed = 40.0\n    duration = 12.0\n\n"
-        "    def tracks(self, times):\n"
-        f"        return [Track.of('deer', 'deer', 50.0, -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n"
+        "from safevar_sumo.scenarios import Track\n\n\nclass Deer:\n    speed = 40.0\n    duration"
+        " = 12.0\n\n    def tracks(self, times):\n        return [Track.of('deer', 'deer', 50.0,"
+        f" -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n"
     )
-    (in_tmp / "mine.toml").write_text('extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n')
+    (in_tmp / "mine.toml").write_text(
+        'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n'
+    )
     findings = check(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
-    assert all("mine.py:4" in finding.where and "have left after" in finding.finding for finding in findings)
+    assert all(
+        "mine.py:4" in finding.where and "have left after" in finding.finding
+        for finding in findings
+    )
 
 
 @pytest.mark.parametrize(
-    "study", ["smoke", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lgsvl", "native", "wear"))]
+    "study",
+    [
+        "smoke",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("lgsvl", "native", "wear")),
+    ],
 )
 def test_what_is_shipped_passes(study: str) -> None:
     """What is right of users is in the tutorials, whose studies begin with these checks."""

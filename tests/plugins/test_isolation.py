@@ -1,4 +1,6 @@
-"""Checks before a search find models in which one setting affects another; a run ends with its end."""
+"""Checks before a search find models in which one setting affects another; a run ends with its
+end.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,12 @@ def search_all(folder: Path, out: Path) -> None:
 def test_an_algorithm_whose_runs_learn_from_each_other(
     own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path
 ) -> None:
-    mine(SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
-    learns = pytest.raises(UserCodeError, match=r"repetition: setting 11 is .* in another run .*mine.py:2")
+    mine(
+        SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n'
+    )
+    learns = pytest.raises(
+        UserCodeError, match=r"repetition: setting 11 is .* in another run .*mine.py:2"
+    )
     with learns if shared else nullcontext():
         search_all(folder, tmp_path / "out")
 
@@ -71,8 +77,14 @@ class Mine:
     ("module", "problem"),
     [
         (GREEDY, "read-only"),
-        (IDLE.format(body="if problem.evaluations == 0:\n            yield"), "returned no settings from search"),
-        (IDLE.format(body="yield problem.characteristics.original[None][:0]"), "returned settings = .* from search"),
+        (
+            IDLE.format(body="if problem.evaluations == 0:\n            yield"),
+            "returned no settings from search",
+        ),
+        (
+            IDLE.format(body="yield problem.characteristics.original[None][:0]"),
+            "returned settings = .* from search",
+        ),
         (IDLE.format(body="return iter([problem.original.settings])"), "returned <list_iterator"),
         (IDLE.format(body="return None"), "returned None from search"),
     ],
@@ -107,7 +119,9 @@ factor = 0.7
 
 @pytest.fixture
 def six(in_tmp: Path) -> None:
-    for name, text in files_of(*(f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))).items():
+    for name, text in files_of(
+        *(f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))
+    ).items():
         Path(name).write_text(text)
     Path("six.toml").write_text(SIX)
 
@@ -136,7 +150,9 @@ MASS = NATIVE.characteristics.names.index("mass")
 HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
 
 
-BRAKES = Pedals(lambda seen: (np.where((np.arange(len(seen.speed)) > 0) & (seen.time > 1), 0.05, 1), 0))
+BRAKES = Pedals(
+    lambda seen: (np.where((np.arange(len(seen.speed)) > 0) & (seen.time > 1), 0.05, 1), 0)
+)
 """Full throttle, and hardly any for the light one of two."""
 
 
@@ -154,7 +170,8 @@ class Diverges(Vehicle):
 
     UNITS = NATIVE.vehicle.UNITS
     sumo_type, at_rest, at_speed, sense = (
-        staticmethod(getattr(NATIVE.vehicle, name)) for name in ("sumo_type", "at_rest", "at_speed", "sense")
+        staticmethod(getattr(NATIVE.vehicle, name))
+        for name in ("sumo_type", "at_rest", "at_speed", "sense")
     )
 
     def prepare(self, characteristics: Any, *arguments: Any) -> Any:
@@ -165,7 +182,9 @@ class Diverges(Vehicle):
     def advance(self, prepared: Any, state: Any, command: Command) -> Any:
         self._calls += 1
         result = self._inner.advance(prepared, state, command)
-        return result._replace(speed=np.where(self._is_heavy & (self._calls >= self.steps), self.speed, result.speed))
+        return result._replace(
+            speed=np.where(self._is_heavy & (self._calls >= self.steps), self.speed, result.speed)
+        )
 
 
 USERS = checked_class(UserCode("vehicle.model = 'mine:Mine'", Diverges), Vehicle)
@@ -175,7 +194,9 @@ BOTH = np.stack([HEAVY, ORIGINAL])
 
 
 @pytest.mark.parametrize("vehicle", [Diverges(np.nan), *map(USERS, (np.nan, -3.0, 900.0))])
-def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_has_alone(vehicle: Vehicle) -> None:
+def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_has_alone(
+    vehicle: Vehicle,
+) -> None:
     system = replace(NATIVE, ads=BRAKES, vehicle=vehicle)
     alone = evaluate(system, BOTH[:1])
     together = evaluate(system, BOTH)
@@ -185,7 +206,9 @@ def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_
 
 
 @pytest.mark.parametrize("vehicle", [Diverges(np.nan, LENGTH - 1), USERS(-3.0, LENGTH - 1)])
-def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(vehicle: Vehicle) -> None:
+def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
+    vehicle: Vehicle,
+) -> None:
     for settings in (BOTH[:1], BOTH):
         with pytest.raises(InputError, match=r"speed (is nan|= -3\.0)"):
             evaluate(replace(NATIVE, ads=BRAKES, vehicle=vehicle), settings)

@@ -1,4 +1,6 @@
-"""What is shipped has no privilege: its source in a user's file gives the same results, to the bit."""
+"""What is shipped has no privilege: its source in a user's file gives the same results, to the
+bit.
+"""
 
 from __future__ import annotations
 
@@ -61,12 +63,20 @@ def assert_equal(ours: Study, theirs: Study) -> None:
 
 def with_scenario(name: str, model: str, **tables: Any) -> Study:
     """A study of one scenario, and the same of its copy."""
-    study = load_study(BASES.get(name, "wear"), scenario={"model": name}, **{"matrix": None, **tables})
-    return msgspec.structs.replace(study, scenario=msgspec.structs.replace(study.scenario, model=model))
+    study = load_study(
+        BASES.get(name, "wear"), scenario={"model": name}, **{"matrix": None, **tables}
+    )
+    return msgspec.structs.replace(
+        study, scenario=msgspec.structs.replace(study.scenario, model=model)
+    )
 
 
-@pytest.mark.parametrize("name", each(sorted(SCENARIOS.keys() - {"openscenario"})))  # a file is no class
-def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(name: str, in_tmp: Path) -> None:
+@pytest.mark.parametrize(
+    "name", each(sorted(SCENARIOS.keys() - {"openscenario"}))
+)  # a file is no class
+def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
+    name: str, in_tmp: Path
+) -> None:
     own = copied(SCENARIOS[name], in_tmp)
     free = free_parameters(SCENARIOS[name])
     assert_equal(with_scenario(name, name), with_scenario(name, own))
@@ -77,7 +87,9 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(n
     matrix = {"tests": [{"name": "it", "over": {key: [one.lower, middle]}}]}
     assert_equal(with_scenario(name, name, matrix=matrix), with_scenario(name, own, matrix=matrix))
     search = {key: {"lower": middle, "upper": one.upper, "original": one.upper, "unit": one.unit}}
-    base = load_study(BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search})
+    base = load_study(
+        BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search}
+    )
     copy = msgspec.structs.replace(base, scenario=msgspec.structs.replace(base.scenario, model=own))
     assert_equal(base, copy)
 
@@ -95,7 +107,9 @@ class Deer(Struct):
 """
 
 
-def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_users(in_tmp: Path) -> None:
+def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_users(
+    in_tmp: Path,
+) -> None:
     """The original is the class's default; in a matrix the class may be that of a test."""
     (in_tmp / "deer.py").write_text(DEER)
     for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
@@ -114,7 +128,9 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
         load_study("wear", matrix=None, scenario={"model": "deer:Deer", "search": {"pace": {}}})
 
 
-@pytest.mark.parametrize("name", sorted(SCENARIOS.keys() - {"openscenario", "stop"}))  # which have no such scenes
+@pytest.mark.parametrize(
+    "name", sorted(SCENARIOS.keys() - {"openscenario", "stop"})
+)  # which have no such scenes
 def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
     names = []
     for model in (name, copied(SCENARIOS[name], in_tmp)):
@@ -125,7 +141,11 @@ def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_
 
 @pytest.mark.parametrize("name", each(VEHICLES))
 def test_a_vehicle_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
-    base = next(study for study in ("sun", "lgsvl", "native", "wear") if load_study(study).vehicle.model == name)
+    base = next(
+        study
+        for study in ("sun", "lgsvl", "native", "wear")
+        if load_study(study).vehicle.model == name
+    )
     ours = load_study(base, matrix=None)
     vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES[name], in_tmp))
     assert_equal(ours, msgspec.structs.replace(ours, vehicle=vehicle))
@@ -133,26 +153,36 @@ def test_a_vehicle_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
 
 @pytest.mark.parametrize("name", each(ADS))
 def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
-    base = next((one for one in ("sun", "lgsvl", "native", "wear") if load_study(one).ads.model == name), None)
+    base = next(
+        (one for one in ("sun", "lgsvl", "native", "wear") if load_study(one).ads.model == name),
+        None,
+    )
     parameters = {} if base is None else load_study(base).ads.parameters
     own = copied(ADS[name], in_tmp)
     ours, theirs = (
-        load_study(base or "wear", matrix=None, ads={"model": model, "parameters": parameters}) for model in (name, own)
+        load_study(base or "wear", matrix=None, ads={"model": model, "parameters": parameters})
+        for model in (name, own)
     )
     assert_equal(ours, theirs)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", each(ALGORITHMS))
-def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
+def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
+    name: str, in_tmp: Path
+) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
     (in_tmp / "named.py").write_text(f"from {module} import {class_}\n\n{name} = {class_}\n")
     tables = []
     for number, model in enumerate((name, f"named:{name}")):
         search = {"algorithms": [model], "runs": 1, "population": 10, "evaluations": 40}
-        rows = load_runs(searched(load_study("smoke", search=search), in_tmp / f"results{number}")).solutions
-        tables.append(rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False))
+        rows = load_runs(
+            searched(load_study("smoke", search=search), in_tmp / f"results{number}")
+        ).solutions
+        tables.append(
+            rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False)
+        )
     assert tables[0] == tables[1]
 
 
@@ -160,27 +190,45 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     """A column has one name, so the copies have others."""
     shipped = {**METRICS, **OPTIONAL_METRICS}
     module, _, _ = copied(time_to_collision, in_tmp).partition(":")
-    lines = ["import msgspec", f"from {module} import *", "from safevar_sumo.metrics import Measure"]
+    lines = [
+        "import msgspec",
+        f"from {module} import *",
+        "from safevar_sumo.metrics import Measure",
+    ]
     lines.append("known = [one for one in list(globals().values()) if isinstance(one, Measure)]")
-    lines.append("globals().update({one.name: msgspec.structs.replace(one, name='own_' + one.name) for one in known})")
-    lines.append("def largest(settings, characteristics): return characteristics.largest_change(settings)")
-    lines.append("own_f_diff = Measure(name='own_f_diff', title='largest', unit='-', of='settings', function=largest)")
+    lines.append(
+        "globals().update({one.name: msgspec.structs.replace(one, name='own_' + one.name) for one"
+        " in known})"
+    )
+    lines.append(
+        "def largest(settings, characteristics): return characteristics.largest_change(settings)"
+    )
+    lines.append(
+        "own_f_diff = Measure(name='own_f_diff', title='largest', unit='-', of='settings',"
+        " function=largest)"
+    )
     (in_tmp / "named.py").write_text("\n".join(lines))
     own = [f"named:{name}" for name in shipped]
     objectives = ["named:tit", "f_safe", "named:own_f_diff"]
     system = assemble(
-        load_study("smoke", metrics={"also": [*OPTIONAL_METRICS, *own]}, search={"objectives": objectives})
+        load_study(
+            "smoke", metrics={"also": [*OPTIONAL_METRICS, *own]}, search={"objectives": objectives}
+        )
     )
     found = evaluate(system, drawn(system, 8, 2))
     for name in shipped:
         np.testing.assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
     np.testing.assert_array_equal(found.column("own_f_diff"), found.f_diff)
     values = system.measuring.scoring.values(found)
-    np.testing.assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
+    np.testing.assert_array_equal(
+        values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1)
+    )
 
 
 @pytest.mark.slow
-def test_a_rating_of_scenarios_in_a_users_file_is_the_same(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     study = load_study("euro_ncap_rating")
     own = {prefix: copied(SCENARIOS[model], in_tmp) for prefix, model in MODELS.items()}
     points = []
@@ -204,11 +252,17 @@ def with_own_models(study: Study, folder: Path) -> Study:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["smoke", "sun_joint", "alks_joint"])
-def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(name: str, in_tmp: Path) -> None:
-    ours = load_study(name, search={"algorithms": ["nsga2"], "runs": 1, "population": 10, "evaluations": 30})
+def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
+    name: str, in_tmp: Path
+) -> None:
+    ours = load_study(
+        name, search={"algorithms": ["nsga2"], "runs": 1, "population": 10, "evaluations": 30}
+    )
     for number, study in enumerate((ours, with_own_models(ours, in_tmp))):
         searched(study, in_tmp / f"results{number}")
-    solutions = [(in_tmp / f"results{number}" / "solutions.csv").read_bytes() for number in range(2)]
+    solutions = [
+        (in_tmp / f"results{number}" / "solutions.csv").read_bytes() for number in range(2)
+    ]
     assert solutions[0] == solutions[1]
 
 
@@ -216,11 +270,15 @@ def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(name: str
 def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """But for the simulations that find out whether a user's system drives many vehicles with different parameters."""
+    """But for the simulations that find out whether a user's system drives many vehicles with
+    different parameters.
+    """
     monkeypatch.setattr("safevar_sumo.questions.repair.attack.BUDGET", 300)
     monkeypatch.setattr("safevar_sumo.questions.repair.SOBOL_VEHICLES", 32)
     scenario = {"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
-    change = {"response_time": {"lower": 0.0, "upper": 1.5, "unit": "s", "meaning": "it plans with"}}
+    change = {
+        "response_time": {"lower": 0.0, "upper": 1.5, "unit": "s", "meaning": "it plans with"}
+    }
     ours = load_study("wear", matrix=None, scenario=scenario, repair=change)
     answers = []
     for study in (ours, with_own_models(ours, in_tmp)):
@@ -228,9 +286,13 @@ def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
             study, ads=msgspec.structs.replace(study.ads, parameters={"response_time": 0.6})
         )
         worn = ["brakeTorque >= 0.5"]
-        repaired = sv.repair(study, promise=worn, change=["response_time"], fits=0, pool=InlinePool())
+        repaired = sv.repair(
+            study, promise=worn, change=["response_time"], fits=0, pool=InlinePool()
+        )
         compared = sv.compare(study, slower, samples=16, pool=InlinePool())
-        answers.append([(one.verdict, {**one.numbers, "simulations": 0}) for one in (repaired, compared)])
+        answers.append(
+            [(one.verdict, {**one.numbers, "simulations": 0}) for one in (repaired, compared)]
+        )
     assert answers[0] == answers[1]
     assert answers[0][0][1]["repairs"] == 1
     assert answers[0][1][1]["only_a_unsafe"] > 0
@@ -243,7 +305,9 @@ def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() ->
         for model in family.values()
     }
     questions = re.compile(rf"is(?:instance|subclass)\([^:]*?, [^:]*?\b({'|'.join(shipped)})\b")
-    files = {file: questions.findall(file.read_text()) for file in (ROOT / "safevar_sumo").rglob("*.py")}
+    files = {
+        file: questions.findall(file.read_text()) for file in (ROOT / "safevar_sumo").rglob("*.py")
+    }
     asked = [(file, name) for file, names in files.items() for name in names]
     assert asked != [], "some ask in their own file"
     assert [(file, name) for file, name in asked if shipped[name] != file] == []

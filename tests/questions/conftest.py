@@ -1,5 +1,5 @@
-"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose unsafe region is
-known.
+"""Made-up studies for tests: characteristics from 0 to 10 with an original of 5, and a pool whose
+unsafe region is known.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
     for module in (models, scope, counterexamples, search):
-        monkeypatch.setattr(module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study))
+        monkeypatch.setattr(
+            module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
+        )
 
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
@@ -59,13 +61,16 @@ def made_up_study(n: int) -> Study:
         for name in "abcdefghijkl"[:n]
     }
     return msgspec.structs.replace(
-        smoke, name="made-up", spread={}, vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows)
+        smoke,
+        name="made-up",
+        spread={},
+        vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows),
     )
 
 
 class Plant(InlinePool):
-    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all others have the safety
-    degree `degree`.
+    """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all
+    others have the safety degree `degree`.
     """
 
     def __init__(
@@ -93,9 +98,14 @@ class Plant(InlinePool):
         return made_up_evaluations(
             degree,
             settings=settings,
-            outcome=np.where(fails, "simulator-error", np.where(collides, "collision", "stopped")).astype("U16"),
+            outcome=np.where(
+                fails, "simulator-error", np.where(collides, "collision", "stopped")
+            ).astype("U16"),
             collision_speed=np.where(collides, 1.0, np.nan),
-            metrics={**dict.fromkeys(METRICS, np.full(len(settings), np.nan)), "safety_degree": degree},
+            metrics={
+                **dict.fromkeys(METRICS, np.full(len(settings), np.nan)),
+                "safety_degree": degree,
+            },
             f_diff=self._characteristics.largest_change(settings),
             f_num_diff=self._characteristics.number_changed(settings),
         )
@@ -126,20 +136,32 @@ def two_islands(settings: FloatArray) -> BoolArray:
 
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
-    return np.asarray((settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8))
+    return np.asarray(
+        (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
+    )
 
 
 def box_of(
-    n: int, region: Region, limits: dict[str, Limit], others: Sequence[Region] = (), budget: int = 2000
+    n: int,
+    region: Region,
+    limits: dict[str, Limit],
+    others: Sequence[Region] = (),
+    budget: int = 2000,
 ) -> LimitsTogether:
     """The box of a planted region, and of those of further fits."""
     study = made_up_study(n)
     fits = [
-        Model(number, Evaluator(study, Plant(study, each)), Unsafe()) for number, each in enumerate([region, *others])
+        Model(number, Evaluator(study, Plant(study, each)), Unsafe())
+        for number, each in enumerate([region, *others])
     ]
     evaluator = fits[0].evaluator
     columns = list(range(n))
     scans = scan(evaluator, columns, Unsafe())
-    ends = [{one.characteristic.name: end} for one in scans for interval in one.of_state("unsafe") for end in interval]
+    ends = [
+        {one.characteristic.name: end}
+        for one in scans
+        for interval in one.of_state("unsafe")
+        for end in interval
+    ]
     known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
     return find_limits_together(Models(tuple(fits), ()), columns, limits, scans, known, budget)

@@ -1,5 +1,5 @@
-"""An answer in every format, a question from outside the package, and one set of options, from which flags, Python
-functions, the report's calls and printed commands follow.
+"""An answer in every format, a question from outside the package, and one set of options, from
+which flags, Python functions, the report's calls and printed commands follow.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ COLUMNS = {
     "age": Column("s", "its age"),
     "changes": Column("", "what is changed"),
 }
-ROWS = [("a < b & 1 %", 1.234, 1.0, np.inf, np.nan, {"mass": 2600.0}), ("c_d", np.nan, np.nan, np.nan, np.nan, {})]
+ROWS = [
+    ("a < b & 1 %", 1.234, 1.0, np.inf, np.nan, {"mass": 2600.0}),
+    ("c_d", np.nan, np.nan, np.nan, np.nan, {}),
+]
 ANSWER = Answer(
     question="parts",
     study=load_study("smoke"),
@@ -68,7 +71,9 @@ def test_readers_see_units_and_intervals_and_no_column_without_values() -> None:
 
 
 def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
-    frame = tabulate("Many", {"number": Column("", "it")}, [(number,) for number in range(MAX_ROWS + 1)])
+    frame = tabulate(
+        "Many", {"number": Column("", "it")}, [(number,) for number in range(MAX_ROWS + 1)]
+    )
     long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
     for form in ("text", "html"):
         assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in long.render(form)
@@ -78,14 +83,30 @@ def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
 
 
 def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
-    """Part a holds up to 20: from 1 to 2; to 30 it has no room. Of part b one end is known, and nothing up to 30."""
-    columns = {"part": "it", "by": "value", "length_low": Column("m", "least"), "length_high": Column("m", "largest")}
-    rows = [("a", 20.0, 1.0, 2.0), ("a", 30.0, 1.5, 1.5), ("b", 20.0, np.nan, 2.0), ("b", 30.0, np.nan, np.nan)]
-    frame = tabulate("Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h"))
+    """Part a holds up to 20: from 1 to 2; to 30 it has no room. Of part b one end is known, and
+    nothing up to 30.
+    """
+    columns = {
+        "part": "it",
+        "by": "value",
+        "length_low": Column("m", "least"),
+        "length_high": Column("m", "largest"),
+    }
+    rows = [
+        ("a", 20.0, 1.0, 2.0),
+        ("a", 30.0, 1.5, 1.5),
+        ("b", 20.0, np.nan, 2.0),
+        ("b", 30.0, np.nan, np.nan),
+    ]
+    frame = tabulate(
+        "Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h")
+    )
     page = replace(ANSWER, tables={"lengths": frame}).render("html")
     assert re.findall("<th.*?>([^<]*)</th>", page) == ["part", "to 20 km/h", "to 30 km/h"]
     assert re.findall("<td.*?>([^<]*)</td>", page) == ["a", "1 to 2", "1.5", "b", "up to 2", "-"]
-    assert len(replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"]["rows"]) == 4
+    assert (
+        len(replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"]["rows"]) == 4
+    )
 
 
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
@@ -104,15 +125,25 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
     rows = [("parts", "one is old"), ("others", "none is"), ("all", "they are made up")]
-    remarks = tabulate("Remarks", {"table": Column("", "table"), "remark": Column("", "remark")}, rows)
-    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}).only("parts")
+    remarks = tabulate(
+        "Remarks", {"table": Column("", "table"), "remark": Column("", "remark")}, rows
+    )
+    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}).only(
+        "parts"
+    )
     assert list(answer.tables) == ["parts", "remarks"]
     assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
-    long = tabulate("Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)])
+    long = tabulate(
+        "Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)]
+    )
     assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text")
     assert "Others" not in ANSWER.render("latex", "parts")
-    others = replace(answer, tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]})
-    assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), "no table, whose label would repeat"
+    others = replace(
+        answer, tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]}
+    )
+    assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), (
+        "no table, whose label would repeat"
+    )
     for form in ("text", "html"):
         assert "Remarks" in answer.render(form)
         assert "Remarks" not in replace(others, folded=("others",)).render(form), "an empty table"
@@ -152,7 +183,12 @@ def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
 
 @pytest.mark.parametrize(
     ("key", "values"),
-    [("probability", [0.25]), ("interval.0", [0.1]), ("interval.1", [np.nan]), ("parts.length", [1.234, None])],
+    [
+        ("probability", [0.25]),
+        ("interval.0", [0.1]),
+        ("interval.1", [np.nan]),
+        ("parts.length", [1.234, None]),
+    ],
 )
 def test_a_key_names_numbers(key: str, values: list[Any]) -> None:
     assert ANSWER.values(key) == pytest.approx(values, nan_ok=True)
@@ -175,7 +211,9 @@ def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
         assert f"--{option.name.replace('_', '-')}" in text
 
 
-def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_question_that_the_manual_adds_from_outside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It has at most 60 lines, and gets a command with the shared options and every format."""
     code = files_of("CONTRIBUTING.md")["my_questions.py"]
     assert code.count("\n") <= 60
@@ -188,7 +226,13 @@ def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypa
     assert failed.exit_code == 3, failed.output
     assert "Unsafe at an end of the domain: " in failed.output
     assert "failed: unsafe_ends = " in failed.output
-    refused("rules", "smoke", "--samples", "0", message=("--samples: 0", "a whole number from 1 to 100,000,000"))
+    refused(
+        "rules",
+        "smoke",
+        "--samples",
+        "0",
+        message=("--samples: 0", "a whole number from 1 to 100,000,000"),
+    )
     answer = json.loads(CliRunner().invoke(commands, [*command, "--format", "json"]).stdout)
     assert answer["question"] == name
     rows = answer["tables"]["ends"]["rows"]
@@ -197,10 +241,17 @@ def test_the_question_that_the_manual_adds_from_outside(tmp_path: Path, monkeypa
 
 
 def test_a_printed_command_asks_the_same() -> None:
-    """The command, parsed by its own flags, has the values that printed it, and no flag for a default."""
+    """The command, parsed by its own flags, has the values that printed it, and no flag for a
+    default.
+    """
     ask = find_question("tolerance")
     (fits,) = (option.default for option in ask.options if option.name == "fits")
-    values = {"unsafe": "collision", "characteristics": ("mass", "tireFric"), "margin": 0.5, "fits": fits}
+    values = {
+        "unsafe": "collision",
+        "characteristics": ("mass", "tireFric"),
+        "margin": 0.5,
+        "fits": fits,
+    }
     typed = shlex.split(ask.command_line(["its results"], "CPNA, night", values))
     assert typed[:5] == ["python", "-m", "safevar_sumo", "tolerance", "its results"]
     assert "--fits" not in typed
@@ -216,7 +267,13 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
     typed = ["rules", "wear", "--samples", "64", "--point", point, "--json"]
     answer = sv.rules("wear", samples=64, point=point, pool=InlinePool()).to_dict()
     assert json.dumps(answer, indent=2) == run(*typed).stdout.strip()
-    refused("rules", "wear", "--point", "CPFB", message=("--point: 'CPFB'", "expected: one of 26 points"))
+    refused(
+        "rules",
+        "wear",
+        "--point",
+        "CPFB",
+        message=("--point: 'CPFB'", "expected: one of 26 points"),
+    )
     with pytest.raises(sv.InputError, match="point: 'CPFB'"):
         sv.rules("wear", point="CPFB")
 
@@ -230,7 +287,10 @@ def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
         ("risk", "--samples", "300"),
         ("compare", str(slippery), "--samples", "100"),
     ):
-        one, two = (run(question, str(slippery), *flags, "--json", "--jobs", jobs).stdout for jobs in ("1", "2"))
+        one, two = (
+            run(question, str(slippery), *flags, "--json", "--jobs", jobs).stdout
+            for jobs in ("1", "2")
+        )
         assert one == two
 
 
@@ -245,4 +305,6 @@ def test_limits_are_rounded_to_the_safe_side() -> None:
     assert one.rounded(2.3178, upwards=True) == 2.32
     assert one.rounded(2.3278, upwards=False) == 2.32
     assert one.rounded(7.999, upwards=True) == 8
-    assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, "not beyond the original"
+    assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, (
+        "not beyond the original"
+    )

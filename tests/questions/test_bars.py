@@ -27,12 +27,15 @@ def test_a_bar_shows_where_its_ranges_are_in_the_domain() -> None:
     quarter = CELLS // 4
     assert len(worn.blocks) == CELLS
     assert worn.blocks[:quarter] == "·" * quarter, "below 2 it is unsafe alone"
-    assert worn.blocks[quarter : 2 * quarter].strip("▒") == "|", "from 2 to 4 alone; specified: from 3"
+    assert worn.blocks[quarter : 2 * quarter].strip("▒") == "|", (
+        "from 2 to 4 alone; specified: from 3"
+    )
     assert worn.blocks[2 * quarter :] == "█" * (2 * quarter - 1) + "o"
     assert undefined.blocks.replace("o", "·") == "·" * CELLS
     inside = WIDTH - HEIGHT
     found = {
-        name: (float(x), float(w)) for name, x, w in re.findall(r'class="(\w+)" x="(.*?)" .*?width="(.*?)"', worn.svg)
+        name: (float(x), float(w))
+        for name, x, w in re.findall(r'class="(\w+)" x="(.*?)" .*?width="(.*?)"', worn.svg)
     }
     assert found["together"] == (HEIGHT / 2 + inside / 2, inside / 2)
     assert found["alone"] == (round(HEIGHT / 2 + inside / 4, 1), round(inside * 0.75, 1))

@@ -1,4 +1,6 @@
-"""Two systems with the same settings: counted one by one, against itself, run by run, and refused."""
+"""Two systems with the same settings: counted one by one, against itself, run by run, and
+refused.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,15 @@ from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
 
-LONGER = {"ads": {"model": "aeb", "parameters": {"braking_share": 0.65, "response_time": 0.3}}, "name": "earlier"}
+LONGER = {
+    "ads": {"model": "aeb", "parameters": {"braking_share": 0.65, "response_time": 0.3}},
+    "name": "earlier",
+}
 ONE_TEST = {
     "title": "one test",
-    "matrix": {"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}]},
+    "matrix": {
+        "tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}]
+    },
 }
 POOL = InlinePool()
 
@@ -30,7 +37,9 @@ POOL = InlinePool()
 def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     nothing = {"a_needless_braking": None, "b_needless_braking": None, "benign_scenes": 0}
-    monkeypatch.setattr("safevar_sumo.questions.compare.differences._needless_braking", lambda a, b: nothing)
+    monkeypatch.setattr(
+        "safevar_sumo.questions.compare.differences._needless_braking", lambda a, b: nothing
+    )
 
 
 def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
@@ -59,17 +68,27 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", [(), ("treadDepth >= 3", "brakeTorque >= 0.8")])
-def test_settings_lie_on_lines_from_the_original_and_within_the_limits(limits: tuple[str, ...]) -> None:
+def test_settings_lie_on_lines_from_the_original_and_within_the_limits(
+    limits: tuple[str, ...],
+) -> None:
     wear = sv.load_study("wear", **ONE_TEST)
-    answer = sv.compare(wear, sv.load_study("wear", **ONE_TEST, **LONGER), samples=30, limits=limits, pool=POOL)
+    answer = sv.compare(
+        wear, sv.load_study("wear", **ONE_TEST, **LONGER), samples=30, limits=limits, pool=POOL
+    )
     frame = answer.tables["settings"].sort_index()
     assert len(frame) == 30
-    changes = frame[[*wear.vehicle.characteristics]].to_numpy() - [row.original for row in wear.domains.values()]
+    changes = frame[[*wear.vehicle.characteristics]].to_numpy() - [
+        row.original for row in wear.domains.values()
+    ]
     for line in range(8):
         of_line = changes[line::8]  # one after the other, in four rounds
         shares = np.linalg.norm(of_line / np.ptp(changes, axis=0), axis=1)
-        assert shares[1] / shares[0] == pytest.approx(0.5) or shares[1] / shares[0] == pytest.approx(1.5)
-        np.testing.assert_allclose(of_line / shares[:, np.newaxis], [of_line[0] / shares[0]] * len(of_line), atol=1e-9)
+        assert shares[1] / shares[0] == pytest.approx(0.5) or shares[1] / shares[
+            0
+        ] == pytest.approx(1.5)
+        np.testing.assert_allclose(
+            of_line / shares[:, np.newaxis], [of_line[0] / shares[0]] * len(of_line), atol=1e-9
+        )
     if limits:
         assert frame["treadDepth"].min() >= 3
         assert frame["brakeTorque"].min() >= 0.8
@@ -121,7 +140,10 @@ def test_none_of_three_worse_versions_is_called_better(
     answer = sv.compare(sv.load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL)
     collides = answer.numbers["b_outcome"] == "collision"
     assert (
-        answer.verdict.startswith("Do not release later: ") == bool(answer.failures) == collides == (version == "later")
+        answer.verdict.startswith("Do not release later: ")
+        == bool(answer.failures)
+        == collides
+        == (version == "later")
     )
     assert re.search(rf"(^|\. )(Neither is better|{version} is worse than wear)", answer.verdict)
     assert worse in answer.verdict
@@ -132,7 +154,9 @@ def test_none_of_three_worse_versions_is_called_better(
 @pytest.mark.slow
 def test_a_slower_sensor_meets_the_same_changes() -> None:
     wear = load_study("wear", **ONE_TEST)
-    slower = load_study("wear", **ONE_TEST, vehicle={"characteristics": {"sensorLatency": {"original": 0.15}}})
+    slower = load_study(
+        "wear", **ONE_TEST, vehicle={"characteristics": {"sensorLatency": {"original": 0.15}}}
+    )
     answer = sv.compare(wear, slower, samples=16, pool=POOL)
     frame = answer.tables["settings"]
     np.testing.assert_allclose(frame["b_sensorLatency"] - frame["sensorLatency"], 0.1)
@@ -179,13 +203,17 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
 @pytest.mark.slow
 def test_original_values_that_differ(in_tmp: Path) -> None:
     Path("heavy.toml").write_text(
-        'extends = "smoke"\nname = "heavy"\n[vehicle.characteristics]\nmass = { original = 2500.0, lower = 2450.0 }\n'
+        'extends = "smoke"\nname = "heavy"\n[vehicle.characteristics]\nmass = { original = 2500.0,'
+        " lower = 2450.0 }\n"
     )
     answer = sv.compare("smoke", "heavy.toml", samples=50, pool=POOL)
     frame = answer.tables["settings"]
     assert frame["b_mass"].min() >= 2450
     np.testing.assert_allclose(frame["b_mass"] - frame["mass"], 96)
-    assert answer.tables["limits"].set_index("characteristic").loc["mass", ["a", "b"]].tolist() == [2404, 2500]
+    assert answer.tables["limits"].set_index("characteristic").loc["mass", ["a", "b"]].tolist() == [
+        2404,
+        2500,
+    ]
     assert answer.numbers["a_degree"] > answer.numbers["b_degree"]
     assert answer.figure().axes
 
@@ -195,7 +223,9 @@ def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
     numbers = sv.compare("native", later, samples=8, pool=POOL).numbers
-    assert [numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"] == pytest.approx([4.7, 4.7])
+    assert [numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"] == pytest.approx(
+        [4.7, 4.7]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +246,9 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     frame = answer.tables["settings"].sort_index()
     sizes = {"a": len(wet.solutions), "b": len(dry.solutions), "sample": 20}
     assert frame["source"].value_counts().to_dict() == sizes
-    np.testing.assert_array_equal(frame["a_degree"][frame["source"] == "a"], wet.solutions["f_safe"])
+    np.testing.assert_array_equal(
+        frame["a_degree"][frame["source"] == "a"], wet.solutions["f_safe"]
+    )
     solutions = frame[frame["source"] != "sample"]
     runs = [solutions["source"], solutions["solution"].str.rpartition(":")[0]]
     means = solutions.groupby(runs)[["a_degree", "b_degree"]].mean()
@@ -230,26 +262,60 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
 @pytest.mark.slow
 def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Path) -> None:
     dry, wet = map(str, weathers)
-    page = run("report", dry, wet, "--ask", "compare", "--out", "it.html") and Path("it.html").read_text()
+    page = (
+        run("report", dry, wet, "--ask", "compare", "--out", "it.html")
+        and Path("it.html").read_text()
+    )
     assert sv.compare(dry, wet, pool=POOL).render("html").replace("^2", "²") in page
-    assert ">Compare</a>" in page.partition("</section>")[0], "its verdict stands on the first sheet"
+    assert ">Compare</a>" in page.partition("</section>")[0], (
+        "its verdict stands on the first sheet"
+    )
     assert f"python -m safevar_sumo compare {dry} {wet}" in page
-    refused("report", dry, "--ask", "compare", "--out", "it.html", message=("--ask: compare cannot be asked about 1",))
+    refused(
+        "report",
+        dry,
+        "--ask",
+        "compare",
+        "--out",
+        "it.html",
+        message=("--ask: compare cannot be asked about 1",),
+    )
     refused("report", dry, dry, "--out", "it.html", message=("twice",))
 
 
 def test_systems_that_cannot_be_compared_are_refused(in_tmp: Path) -> None:
-    refused("compare", "wear", "rain", message=("study 'rain': cannot be compared", "treadDepth [mm]", "same units"))
+    refused(
+        "compare",
+        "wear",
+        "rain",
+        message=("study 'rain': cannot be compared", "treadDepth [mm]", "same units"),
+    )
     refused("compare", "smoke", "smok", message=("smok", "did you mean 'smoke'"))
-    refused("compare", "euro_ncap_rating", "wear", "--unsafe", "points=3", message=("--unsafe", "'wear' is not rated"))
+    refused(
+        "compare",
+        "euro_ncap_rating",
+        "wear",
+        "--unsafe",
+        "points=3",
+        message=("--unsafe", "'wear' is not rated"),
+    )
     Path("far.toml").write_text(
-        'extends = "sun_joint"\nname = "far"\n[scenario.search]\ndistance = { original = 31, lower = 30, upper = 32 }\n'
+        'extends = "sun_joint"\nname = "far"\n[scenario.search]\ndistance = { original = 31, lower'
+        " = 30, upper = 32 }\n"
     )
     domains = "far.toml: distance: the domains of the two studies do not overlap"
     refused("compare", "sun_joint", "far.toml", message=(domains,))
     Path("slow.toml").write_text(
-        'extends = "wear"\nname = "slow"\n[vehicle.characteristics]\nsensorLatency = { original = 0.15 }\n'
+        'extends = "wear"\nname = "slow"\n[vehicle.characteristics]\nsensorLatency = { original ='
+        " 0.15 }\n"
     )
     limit = "sensorLatency.at_most = 0.1: the original, 0.15 s, does not keep it"
-    refused("compare", "wear", "slow.toml", "--limits", "sensorLatency <= 0.1", message=("slow.toml", limit))
+    refused(
+        "compare",
+        "wear",
+        "slow.toml",
+        "--limits",
+        "sensorLatency <= 0.1",
+        message=("slow.toml", limit),
+    )
     run("compare", "smoke", "--json", expect=2)

@@ -1,4 +1,6 @@
-"""Printed counterexamples fail as printed, printed speeds and limits hold, and what does not count is said."""
+"""Printed counterexamples fail as printed, printed speeds and limits hold, and what does not count
+is said.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ wider = ""
 [matrix]
 tests = [{ name = "CPNCO", parameters = { test = "CPNCO" } }]
 [scenario.search]
-speed = { unit = "km/h", original = 40, lower = 10, upper = 60, meaning = "speed of the vehicle at the start" }
+speed = { unit = "km/h", original = 40, lower = 10, upper = 60, meaning = "speed at the start" }
 impact_location = { unit = "%", original = 50, lower = 25, upper = 75, meaning = "impact location" }
 """
 GRID = 41
@@ -56,20 +58,26 @@ def rough(searched: Study) -> Answer:
 
 
 def drives(study: Study, tread: float, highest: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Speeds, what a car with this tread keeps, and what the original does, over a grid of encounters."""
+    """Speeds, what a car with this tread keeps, and what the original does, over a grid of
+    encounters.
+    """
     system = assemble(study)
     members = system.characteristics
     speeds, places = np.meshgrid(np.linspace(10, highest, GRID), np.linspace(25, 75, GRID))
     settings = np.tile(members.original, (speeds.size, 1))
     columns = [members.names.index(name) for name in ("treadDepth", "speed", "impact_location")]
-    settings[:, columns] = np.stack([np.full(speeds.size, tread), speeds.ravel(), places.ravel()], axis=1)
+    settings[:, columns] = np.stack(
+        [np.full(speeds.size, tread), speeds.ravel(), places.ravel()], axis=1
+    )
     runs = evaluate(system, settings)
     return speeds.ravel(), runs.f_safe, runs.column(ORIGINAL_DEGREE)
 
 
 @pytest.mark.slow
 def test_what_fails_first_fails_as_it_is_printed(searched: Study, rough: Answer) -> None:
-    """Simulated anew with the values of `fails_at`, each car keeps less than the margin, and the original does not."""
+    """Simulated anew with the values of `fails_at`, each car keeps less than the margin, and the
+    original does not.
+    """
     rows = rough.to_dict()["tables"]["limits"]["rows"]
     system = assemble(searched)
     names = system.characteristics.names
@@ -85,7 +93,9 @@ def test_what_fails_first_fails_as_it_is_printed(searched: Study, rough: Answer)
 
 
 @pytest.mark.slow
-def test_up_to_the_printed_speed_no_car_is_unsafe_and_soon_beyond_it_one_is(searched: Study, rough: Answer) -> None:
+def test_up_to_the_printed_speed_no_car_is_unsafe_and_soon_beyond_it_one_is(
+    searched: Study, rough: Answer
+) -> None:
     up_to = rough.numbers["up_to"]
     assert round(up_to, 1) == up_to
     assert rough.numbers["attacked"] >= LEAST_SIMULATIONS
@@ -99,14 +109,18 @@ def test_up_to_the_printed_speed_no_car_is_unsafe_and_soon_beyond_it_one_is(sear
 
 
 @pytest.mark.slow
-def test_every_limit_of_a_table_by_speed_holds_in_all_encounters_that_count(searched: Study, rough: Answer) -> None:
+def test_every_limit_of_a_table_by_speed_holds_in_all_encounters_that_count(
+    searched: Study, rough: Answer
+) -> None:
     for row in rough.to_dict()["tables"]["limits"]["rows"]:
         _, keeps, original = drives(searched, row["alone_low"], row["by_speed"])
         assert keeps[original >= searched.scenario.margin].min() >= rough.numbers["margin"]
 
 
 @pytest.mark.slow
-def test_the_originals_own_limit_is_a_number_and_is_said_early(searched: Study, rough: Answer) -> None:
+def test_the_originals_own_limit_is_a_number_and_is_said_early(
+    searched: Study, rough: Answer
+) -> None:
     keeps_up_to = rough.numbers["original_keeps_up_to"]
     safe_up_to = rough.numbers["original_safe_up_to"]
     speeds, _, original = drives(searched, 3.0, 60.0)
@@ -118,25 +132,39 @@ def test_the_originals_own_limit_is_a_number_and_is_said_early(searched: Study, 
     assert original[speeds <= safe_up_to + step].min() < 0
     assert rough.numbers["up_to"] <= keeps_up_to <= safe_up_to
     second = rough.verdict.split(". ")[2]
-    assert second.startswith(f"The original vehicle itself keeps 0.3 m only up to {keeps_up_to:g} km/h")
-    beyond = next(row for row in rough.to_dict()["tables"]["limits"]["rows"] if row["by_speed"] == 60)
+    assert second.startswith(
+        f"The original vehicle itself keeps 0.3 m only up to {keeps_up_to:g} km/h"
+    )
+    beyond = next(
+        row for row in rough.to_dict()["tables"]["limits"]["rows"] if row["by_speed"] == 60
+    )
     assert "of the encounters in which the original keeps 0.3 m" in beyond["sentence"]
 
 
 @pytest.mark.slow
-def test_contacts_where_the_original_keeps_too_little_are_counted(searched: Study, rough: Answer) -> None:
+def test_contacts_where_the_original_keeps_too_little_are_counted(
+    searched: Study, rough: Answer
+) -> None:
     speeds, keeps, original = drives(searched, 3.0, 60.0)
     is_contact = (keeps < 0) & (original >= 0) & (original < searched.scenario.margin)
     assert rough.numbers["contacts_left_out"] > 0
     assert is_contact.any()
-    lowest = float(re.search(r"such contacts? found, the lowest at speed ([\d.]+) km/h", rough.verdict)[1])  # type: ignore[index]
+    lowest = float(
+        re.search(r"such contacts? found, the lowest at speed ([\d.]+) km/h", rough.verdict)[1]
+    )  # type: ignore[index]
     assert lowest <= speeds[is_contact].min() + 0.1
     assert lowest >= rough.numbers["original_keeps_up_to"] - 0.1
 
 
 @pytest.mark.slow
-def test_without_a_search_for_counterexamples_no_speed_is_printed_and_nothing_is_kept(searched: Study) -> None:
-    options: dict[str, Any] = {"characteristics": ("treadDepth",), "limits": ("treadDepth >= 7.5",), "fits": 0}
+def test_without_a_search_for_counterexamples_no_speed_is_printed_and_nothing_is_kept(
+    searched: Study,
+) -> None:
+    options: dict[str, Any] = {
+        "characteristics": ("treadDepth",),
+        "limits": ("treadDepth >= 7.5",),
+        "fits": 0,
+    }
     answer = tolerance(searched, by="speed=20", attack=0, jobs=1, **options)
     assert (answer.numbers["up_to"], answer.numbers["kept"]) == (None, None)
     assert answer.values("limits.kept") == [None]
@@ -152,7 +180,9 @@ def test_every_sentence_of_a_limit_has_its_scope(rough: Answer) -> None:
 
 
 def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> None:
-    """Unsafe are values of the first from 7.13 to 7.1302 without the former: with up to three digits none is."""
+    """Unsafe are values of the first from 7.13 to 7.1302 without the former: with up to three
+    digits none is.
+    """
 
     def sliver(rows: FloatArray) -> BoolArray:
         return np.asarray((rows[:, 0] >= 7.13) & (rows[:, 0] <= 7.1302) & (rows[:, 0] != 7.13))
@@ -202,7 +232,9 @@ def test_a_falsification_names_the_model_that_fails() -> None:
 @pytest.mark.parametrize(
     ("value", "unit", "expected"), [(48.97, "km/h", 48.9), (48.9, "km/h", 48.9), (0.127, "s", 0.12)]
 )
-def test_values_are_rounded_down_as_they_are_printed(value: float, unit: str, expected: float) -> None:
+def test_values_are_rounded_down_as_they_are_printed(
+    value: float, unit: str, expected: float
+) -> None:
     assert rounded_down(value, 2, unit) == expected
 
 
@@ -229,7 +261,8 @@ def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> No
     other = load_study(str(file))
     answer = compare.compute(study, Evaluator(study, InlinePool(), verified=0), other, samples=20)
     said = re.match(
-        r"Do not release late: its original vehicle collides at ([\d.]+) m/s in the test (\w+) at ([\d.]+) km/h"
+        r"Do not release late: its original vehicle collides at ([\d.]+) m/s in the test (\w+) at"
+        r" ([\d.]+) km/h"
         r" with impact location ([\d.]+) %, where that of wear does not",
         answer.verdict,
     )

@@ -57,12 +57,24 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
     output = [str(handle) for handle in handles_of(case.solutions)]
     for row in answer["tables"]["solutions"]["rows"]:
         solution = case.solutions.iloc[output.index(row["solution"])]
-        assert (row["outcome"], row["safety_degree"]) == (solution["outcome"], solution["safety_degree"])
-        causes = [one for one in answer["tables"]["causes"]["rows"] if one["solution"] == row["solution"]]
+        assert (row["outcome"], row["safety_degree"]) == (
+            solution["outcome"],
+            solution["safety_degree"],
+        )
+        causes = [
+            one for one in answer["tables"]["causes"]["rows"] if one["solution"] == row["solution"]
+        ]
         assert causes
         for cause in causes:
-            assert cause["changes"].items() <= solution[list(case.characteristics.names)].to_dict().items()
-            assert cause["boundary"].keys() == cause["single_boundary"].keys() == cause["changes"].keys()
+            assert (
+                cause["changes"].items()
+                <= solution[list(case.characteristics.names)].to_dict().items()
+            )
+            assert (
+                cause["boundary"].keys()
+                == cause["single_boundary"].keys()
+                == cause["changes"].keys()
+            )
             assert cause["size"] == len(cause["changes"])
             assert 0 <= cause["fits_holding"] <= answer["numbers"]["fits"] == FITS
             assert cause["avoided_by"] == row["avoided_by"]
@@ -74,18 +86,24 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
 def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> None:
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     by_reason = {
-        reason: row for row in explained.tables["solutions"].to_dict("records") for reason in row["reason"].split("; ")
+        reason: row
+        for row in explained.tables["solutions"].to_dict("records")
+        for reason in row["reason"].split("; ")
     }
     assert by_reason["fewest changes"]["changed"] == crashes["f_num_diff"].min()
     assert by_reason["most severe"]["safety_degree"] == crashes["safety_degree"].min()
     distinct = len(crashes[list(case.characteristics.names)].drop_duplicates())
-    assert [explained.numbers[name] for name in ("failures", "analysed", "collisions")] == [distinct] * 3
+    assert [explained.numbers[name] for name in ("failures", "analysed", "collisions")] == [
+        distinct
+    ] * 3
     assert explained.numbers["explained"] == len(explained.tables["solutions"]) == 3
 
 
 @pytest.mark.slow
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
-    safe = case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()  # few changes have few subsets
+    safe = (
+        case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()
+    )  # few changes have few subsets
     handle = str(handles_of(case.solutions)[safe])
     evaluator = Evaluator(case.study, InlinePool())
     answer = explain.compute(case, evaluator, solution=(handle,), unsafe="collision", fits=0)
@@ -96,8 +114,12 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
         explain.compute(case, evaluator, solution=("nsga2:7:0",))
 
 
-def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(case: Case, explained: Answer) -> None:
-    """The limits are those of the first row, with values with which the vehicle collides; nothing names a solution."""
+def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
+    case: Case, explained: Answer
+) -> None:
+    """The limits are those of the first row, with values with which the vehicle collides; nothing
+    names a solution.
+    """
     leading, verdict = explained.tables["causes"].iloc[0], explained.verdict
     for item in case.characteristics:
         if item.name in leading["boundary"]:
@@ -109,12 +131,22 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(case:
             printed = case.characteristics.setting({**leading["boundary"], item.name: said})
             assert case.unsafe.of(evaluate(assemble(case.study), printed[np.newaxis]))[0]
     share = f"{100 * leading['robust_share']:.0f} % of its neighbours are unsafe too"
-    assert re.search(rf"^With .* the vehicle collides \(.*{share}; in {leading['fits_holding']} of {FITS} ", verdict)
+    assert re.search(
+        rf"^With .* the vehicle collides \(.*{share}; in {leading['fits_holding']} of {FITS} ",
+        verdict,
+    )
     assert leading["solution"] not in verdict
     numbers = explained.numbers
-    assert f"{numbers['failures']} of {numbers['settings']} different solutions of the search are unsafe" in verdict
+    assert (
+        f"{numbers['failures']} of {numbers['settings']} different solutions of the search are"
+        " unsafe" in verdict
+    )
     drivers = explained.tables["drivers"].set_index("driver")["avoided"]
-    assert drivers["competent_driver"] <= numbers["avoidable"] == numbers["collisions"] - numbers["unavoidable"]
+    assert (
+        drivers["competent_driver"]
+        <= numbers["avoidable"]
+        == numbers["collisions"] - numbers["unavoidable"]
+    )
 
 
 COLLISION = Unsafe()
@@ -122,7 +154,9 @@ COLLISION = Unsafe()
 
 @pytest.mark.slow
 @given(table=st.lists(st.booleans(), min_size=32, max_size=32), full=st.integers(0, 31))
-def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: list[bool], full: int) -> None:
+def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(
+    table: list[bool], full: int
+) -> None:
     def outcome(settings: FloatArray) -> BoolArray:
         """Any function of which characteristics are changed, monotone or not."""
         return np.array(table)[(settings != ORIGINAL) @ (1 << np.arange(5))]
@@ -144,11 +178,17 @@ def test_all_smallest_unsafe_subsets_and_no_other_whatever_the_outcomes(table: l
 
 
 def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> None:
-    """`a` above 9 or `b` below 2 collides; the failures with the fewest changes come first, equal ones count once."""
+    """`a` above 9 or `b` below 2 collides; the failures with the fewest changes come first, equal
+    ones count once.
+    """
     evaluator = made_up_evaluator(3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2))
-    settings = np.array([(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)])
+    settings = np.array(
+        [(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)]
+    )
     found = evaluator.evaluate(settings, "solutions")
-    frame = solutions_frame(evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([4]))])
+    frame = solutions_frame(
+        evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([4]))]
+    )
     finished = [("rs", 0), ("nsga2", 1), ("nsga2", 0)]
     case = build_case(evaluator.study, {"safety_degree": 2.0}, frame, frame, finished)
     counts = [causes_of_runs(case, evaluator, limit).to_numpy().tolist() for limit in (1, 9)]
@@ -190,15 +230,26 @@ def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
 def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
     study = made_up_study(1)
     evaluator = Evaluator(
-        study, Plant(study, lambda rows: rows[:, 0] > 7, failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7))
+        study,
+        Plant(
+            study,
+            lambda rows: rows[:, 0] > 7,
+            failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7),
+        ),
     )
     result = limits(evaluator, 9.0)
-    assert (result.boundary["a"], result.end) == (pytest.approx(7, abs=1e-3), BoundaryState.NOT_SIMULATED)
+    assert (result.boundary["a"], result.end) == (
+        pytest.approx(7, abs=1e-3),
+        BoundaryState.NOT_SIMULATED,
+    )
 
 
 def test_needed_and_changed_over_failures() -> None:
     evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
-    settings, members = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]]), evaluator.characteristics
+    settings, members = (
+        np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]]),
+        evaluator.characteristics,
+    )
     causes = find_minimal_causes(evaluator, settings, COLLISION)
     frame, of_four = (
         count_needed(members, members.changed(settings), causes, number).set_index("characteristic")
@@ -209,22 +260,38 @@ def test_needed_and_changed_over_failures() -> None:
     assert frame["needed_low"].equals(frame["needed"]), "of all failures the shares are exact"
     sampled = of_four.loc["c"]
     ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (1, 3)), (0.975, (2, 2)))]
-    assert sampled[["needed_low", "needed_high"]].tolist() == pytest.approx(ends), "1 of a sample of 3"
+    assert sampled[["needed_low", "needed_high"]].tolist() == pytest.approx(ends), (
+        "1 of a sample of 3"
+    )
     distinct = count_distinct_causes(members, causes)
-    assert distinct[["cause", "failures"]].to_numpy().tolist() == [[("a up", "b down"), 2], [("c up",), 1]]
+    assert distinct[["cause", "failures"]].to_numpy().tolist() == [
+        [("a up", "b down"), 2],
+        [("c up",), 1],
+    ]
 
 
 def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the own, only wider."""
+    """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the
+    own, only wider.
+    """
     wider = made_up_evaluator(3, lambda one: (one[:, 0] > 7) & (one[:, 1] < 5))
-    models = [*(made_up_evaluator(3, region) for region in (box, lambda one: one[:, 0] > 8, nowhere)), wider]
+    models = [
+        *(made_up_evaluator(3, region) for region in (box, lambda one: one[:, 0] > 8, nowhere)),
+        wider,
+    ]
     settings = np.array([[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]])
     evaluations = models[0].evaluate(settings, "settings")
     rows = COLLISION.of(evaluations)
-    causes = [cause for of_one in find_minimal_causes(models[0], settings[rows], COLLISION) for cause in of_one]
+    causes = [
+        cause
+        for of_one in find_minimal_causes(models[0], settings[rows], COLLISION)
+        for cause in of_one
+    ]
     holding = [are_causes(model, causes, COLLISION).tolist() for model in models]
     assert holding == [[holds] * len(causes) for holds in (True, False, False, True)]
-    monkeypatch.setattr(across_fits, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits])))
+    monkeypatch.setattr(
+        across_fits, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits]))
+    )
     nobody = pd.Series(dtype=float)
     needed = pd.Series({"a": 1.0, "b": 1.0, "c": 0.0})
     assert ranges_across_fits(models[0], 4, evaluations, COLLISION, needed, nobody) == {
@@ -233,7 +300,9 @@ def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> No
         ("needed", "b"): (0.0, 1.0),
         ("needed", "c"): (0.0, 0.0),
     }
-    safe = ranges_across_fits(models[0], 4, evaluations.take([3]), COLLISION, needed.head(0), nobody)
+    safe = ranges_across_fits(
+        models[0], 4, evaluations.take([3]), COLLISION, needed.head(0), nobody
+    )
     assert safe == {("unsafe", ""): (0.0, 0.0)}, "safe with each"
 
 
@@ -251,7 +320,9 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
 
 
 def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
-    """Two calls of 3 and 2 settings, the second by an evaluator of another study; about 4 were expected."""
+    """Two calls of 3 and 2 settings, the second by an evaluator of another study; about 4 were
+    expected.
+    """
     shown = list[tuple[str, int, int]]()
     evaluator = made_up_evaluator(1, nowhere)
     evaluator.progress = lambda *values: shown.append(values)
@@ -273,7 +344,9 @@ def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
     """A test of 3 settings, a search, another test of 2: alone, and within a whole."""
     shown = list[tuple[str, int, int]]()
     evaluator = made_up_evaluator(1, nowhere)
-    evaluator.progress = lambda *values: shown.append(values) if values[0] in ("test", "search", "whole") else None
+    evaluator.progress = lambda *values: (
+        shown.append(values) if values[0] in ("test", "search", "whole") else None
+    )
 
     def test_twice() -> None:
         for number, name in ((3, "test"), (4, "search"), (2, "test")):
@@ -282,7 +355,14 @@ def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
 
     test_twice()
     assert [*dict.fromkeys(shown)] == [
-        *[("test", 0, 3), ("test", 3, 3), ("search", 0, 0), ("search", 4, 0), ("test", 3, 5), ("test", 5, 5)]
+        *[
+            ("test", 0, 3),
+            ("test", 3, 3),
+            ("search", 0, 0),
+            ("search", 4, 0),
+            ("test", 3, 5),
+            ("test", 5, 5),
+        ]
     ]
     shown.clear()
     with evaluator.stage("whole"):
@@ -293,10 +373,17 @@ def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
 def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
     study = load_study("smoke")
-    answer = explain.compute(study, Evaluator(study, InlinePool(), verified=0), unsafe="below=99", fits=0, top=1)
+    answer = explain.compute(
+        study, Evaluator(study, InlinePool(), verified=0), unsafe="below=99", fits=0, top=1
+    )
     degree = f"{answer.numbers['original_degree']:.3g}"
-    said = f"The original itself has safety degree {degree} m, below 99 m: no change is needed. Demand less, with"
+    said = (
+        f"The original itself has safety degree {degree} m, below 99 m: no change is needed. Demand"
+        " less, with"
+    )
     assert answer.verdict.startswith(f"{said} --unsafe. 4 of 4 vehicles")
-    assert [len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")] == [0, 0, 0]
+    assert [
+        len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")
+    ] == [0, 0, 0]
     assert len(answer.tables["solutions"]) == 1
     assert "Minimal causes" not in answer.render("text")

@@ -1,5 +1,5 @@
-"""Every question about a study that searches its scenario: a setting is a vehicle and an encounter, and the original
-vehicle drives in the same one.
+"""Every question about a study that searches its scenario: a setting is a vehicle and an encounter,
+and the original vehicle drives in the same one.
 """
 
 from __future__ import annotations
@@ -41,8 +41,13 @@ population = 10
 evaluations = 80
 runs = 1
 """
-LEFT_OUT = r"in an encounter of its own \(distance\); left out: {} in which the original is not safe"
-DEMANDED = r"The original is safe in an encounter where it keeps at least 0\.4 m, scenario\.margin, between bodies\."
+LEFT_OUT = (
+    r"in an encounter of its own \(distance\); left out: {} in which the original is not safe"
+)
+DEMANDED = (
+    r"The original is safe in an encounter where it keeps at least 0\.4 m, scenario\.margin,"
+    r" between bodies\."
+)
 COUNTED = LEFT_OUT.format(r"[\d,]+")
 CAUSE = "in an encounter with .* where the original is safe, the vehicle collides"
 QUESTIONS = {
@@ -51,7 +56,9 @@ QUESTIONS = {
     "rules tiny.toml --samples 300": COUNTED,
     "explain tiny.toml --limit 500 --top 2 --fits 0": f"{CAUSE}.* {COUNTED}",
     "explain results --limit 500 --top 2 --fits 0": CAUSE,
-    "tables results": rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}",
+    "tables results": (
+        rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}"
+    ),
     "simulate results --fewest": "In this encounter the original vehicle stops",
 }
 
@@ -79,37 +86,59 @@ def _few_encounters(joint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    "typed", [pytest.param(typed, marks=pytest.mark.slow if typed.startswith("explain") else ()) for typed in QUESTIONS]
+    "typed",
+    [
+        pytest.param(typed, marks=pytest.mark.slow if typed.startswith("explain") else ())
+        for typed in QUESTIONS
+    ],
 )
 def test_a_question_says_which_encounters_count(typed: str) -> None:
     assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])
 
 
-def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(case: Case) -> None:
+def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(
+    case: Case,
+) -> None:
     drawn = case.evaluations
     limit = case.scoring.safe_original
     row = drawn[drawn["original_safety_degree"] < limit].iloc[0]
     values = [f"--set={name}={float(row[name])!r}" for name in case.characteristics.names]
     answer = json_of("simulate", "results", *values, "--no-filter")
-    degrees = next(one for one in answer["tables"]["results"]["rows"] if one["result"] == "safety_degree")
-    assert (degrees["original"], degrees["simulated"]) == (row["original_safety_degree"], row["safety_degree"])
+    degrees = next(
+        one for one in answer["tables"]["results"]["rows"] if one["result"] == "safety_degree"
+    )
+    assert (degrees["original"], degrees["simulated"]) == (
+        row["original_safety_degree"],
+        row["safety_degree"],
+    )
     assert "Here the original vehicle keeps less than a search demands" in answer["verdict"]
     sweep = json_of("simulate", "results", *values[:-1], "--set=distance=8..18:5", "--no-filter")
-    counted = [one["remark"] for one in sweep["tables"]["remarks"]["rows"] if "demands" in one["remark"]]
+    counted = [
+        one["remark"] for one in sweep["tables"]["remarks"]["rows"] if "demands" in one["remark"]
+    ]
     assert len(counted) == 1
-    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"]["algorithms"]["rows"]
+    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"]["algorithms"][
+        "rows"
+    ]
     safe = drawn[drawn["original_safety_degree"] >= limit]
-    expected = [((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum() for name in ("nsga2", "rs")]
+    expected = [
+        ((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum()
+        for name in ("nsga2", "rs")
+    ]
     assert [one["collisions"] for one in rows] == expected
     assert sum(expected) < (drawn["outcome"] == "collision").sum()
 
 
-def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feasible(case: Case) -> None:
+def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feasible(
+    case: Case,
+) -> None:
     assert case.scoring.safe_original == 0.4
     frame = case.evaluations
     assert (frame["feasible"] == (frame["original_safety_degree"] >= 0.4)).all()
     assert 0 < frame["feasible"].mean() < 1
-    evaluated = sv.evaluate(case.study, frame[[*case.characteristics.names]].head(8), filtered=False, jobs=1)
+    evaluated = sv.evaluate(
+        case.study, frame[[*case.characteristics.names]].head(8), filtered=False, jobs=1
+    )
     assert (evaluated["feasible"] == frame["feasible"].head(8)).all()
     assert "feasible" not in sv.evaluate("smoke", [{}], jobs=1)
     strict = load_study(case.study, scenario={"margin": 2.0})
@@ -125,12 +154,17 @@ def test_explain_counts_by_other_margins_what_the_search_simulated(case: Case) -
     answer = json_of("explain", "results", "--limit", "500", "--top", "1", "--fits", "0")
     names = [*case.characteristics.names]
     solutions = case.solutions.drop_duplicates(names)
-    is_further = ~case.evaluations["feasible"].astype(bool) & (case.evaluations["outcome"] == "collision")
+    is_further = ~case.evaluations["feasible"].astype(bool) & (
+        case.evaluations["outcome"] == "collision"
+    )
     further = case.evaluations[is_further].drop_duplicates(names)
     rows = answer["tables"]["margins"]["rows"]
     assert [row["margin"] for row in rows] == [0.2, 0.4, 0.8]
     for row in rows:
-        kept = [frame[frame["original_safety_degree"] >= row["margin"]] for frame in (solutions, further)]
+        kept = [
+            frame[frame["original_safety_degree"] >= row["margin"]]
+            for frame in (solutions, further)
+        ]
         assert row["settings"] == sum(map(len, kept))
         assert row["failures"] == sum((frame["outcome"] == "collision").sum() for frame in kept)
         assert row["boundary"] is None or row["robust_share"] >= 0.8
@@ -140,7 +174,9 @@ def test_explain_counts_by_other_margins_what_the_search_simulated(case: Case) -
 
 @pytest.mark.slow
 def test_limits_together_are_not_wider_than_those_alone() -> None:
-    answer = json_of("tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius")
+    answer = json_of(
+        "tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius"
+    )
     assert re.search(LEFT_OUT.format("those"), answer["verdict"])
     rows: list[dict[str, Any]] = answer["tables"]["limits"]["rows"]
     assert any(one["alone_low"] > 30 for one in rows)
@@ -152,7 +188,9 @@ def test_limits_together_are_not_wider_than_those_alone() -> None:
 def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody_drew_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """All corners of what is printed, each in a thousand new encounters in which the original vehicle is safe."""
+    """All corners of what is printed, each in a thousand new encounters in which the original
+    vehicle is safe.
+    """
     monkeypatch.undo()  # as many encounters as a user's answer has
     names = "tireFric,maxBrakeTorque,dampRateZeroT_CE"
     answer = json_of("tolerance", "sun_joint", "--fits", "0", "--characteristics", names)
@@ -178,13 +216,24 @@ WORN = {
         **{"payloadCentre": 2.2, "sensorRange": 23.8},
     },
     "sun_joint": {
-        **{"max_rpm": 6404, "dampRateFullT": 0.141, "dampRateZeroT_CE": 1.83, "dampRateZeroT_CD": 0.278},
-        **{"clutchStrength": 10.42, "mass": 2367.6, "dragCoeff": 0.2, "tireFric": 3.833, "dampRate": 0.215},
+        **{
+            "max_rpm": 6404,
+            "dampRateFullT": 0.141,
+            "dampRateZeroT_CE": 1.83,
+            "dampRateZeroT_CD": 0.278,
+        },
+        **{
+            "clutchStrength": 10.42,
+            "mass": 2367.6,
+            "dragCoeff": 0.2,
+            "tireFric": 3.833,
+            "dampRate": 0.215,
+        },
         **{"radius": 35.39, "maxBrakeTorque": 1466},
     },
 }
-"""Vehicles within limits that version 0.3 printed, which no corner broke, though each collides in a small pocket of the
-encounters, such as 0.15 km/h by 4 % of the path.
+"""Vehicles within limits that version 0.3 printed, which no corner broke, though each collides in a
+small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 """
 
 
@@ -194,14 +243,23 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name), jobs=2) as judging:
         members, model = judging.characteristics, Model(0, judging, Unsafe())
         vehicle = np.array(
-            [{**dict(zip(members.names, members.original, strict=True)), **WORN[name]}[one] for one in members.names]
+            [
+                {**dict(zip(members.names, members.original, strict=True)), **WORN[name]}[one]
+                for one in members.names
+            ]
         )
         box = Box(
             judging.region,
             np.where(members.of_vehicle, np.minimum(members.original, vehicle), members.lower),
             np.where(members.of_vehicle, np.maximum(members.original, vehicle), members.upper),
         )
-        found = attack(box, [lambda settings: model.left(settings, "attack")], [], 5000, np.random.default_rng(0))
+        found = attack(
+            box,
+            [lambda settings: model.left(settings, "attack")],
+            [],
+            5000,
+            np.random.default_rng(0),
+        )
     assert found.left[0] < 0
     assert found.simulated <= 5000
 
@@ -217,7 +275,9 @@ def test_changes_are_those_of_the_vehicle(case: Case) -> None:
 
 @pytest.mark.slow
 def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path) -> None:
-    (joint / "wider.toml").write_text(STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20"))
+    (joint / "wider.toml").write_text(
+        STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
+    )
     answer = json_of("compare", "results", "wider.toml", "--samples", "64")
     assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
     assert answer["numbers"]["margin"] == 0.1, "as in tolerance"
@@ -230,9 +290,18 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path
 @pytest.mark.parametrize(
     ("typed", "told"),
     [
-        ("compare tiny.toml rain", "characteristics of 'tiny' alone: distance [m]; of 'rain' alone: none"),
-        ("compare rain tiny.toml", "characteristics of 'rain' alone: none; of 'tiny' alone: distance [m]"),
-        ("risk unsafe.toml", "the original vehicle is not safe in the encounter of the original values"),
+        (
+            "compare tiny.toml rain",
+            "characteristics of 'tiny' alone: distance [m]; of 'rain' alone: none",
+        ),
+        (
+            "compare rain tiny.toml",
+            "characteristics of 'rain' alone: none; of 'tiny' alone: distance [m]",
+        ),
+        (
+            "risk unsafe.toml",
+            "the original vehicle is not safe in the encounter of the original values",
+        ),
     ],
 )
 def test_a_question_without_meaning_is_refused(typed: str, told: str, joint: Path) -> None:

@@ -37,7 +37,7 @@ title = "A pedestrian from the near side, at any speed"
 [matrix]
 tests = [{ name = "CPNA", parameters = { test = "CPNA" } }]
 [scenario.search]
-speed = { unit = "km/h", original = 40, lower = 10, upper = 60, meaning = "speed of the vehicle at the start" }
+speed = { unit = "km/h", original = 40, lower = 10, upper = 60, meaning = "speed at the start" }
 impact_location = { unit = "%", original = 50, lower = 25, upper = 75, meaning = "impact location" }
 """
 SPEEDS = (20, 30, 45, 60)
@@ -55,17 +55,38 @@ FITS = 3
                 "values up to 40 km/h, or the study wear_joint, whose scope is wider",
             ),
         ),
-        (("wear", "--by", "speed=5"), ("speed=5 is below every point of study 'wear'", "from 10 to 40 km/h")),
-        (("wear_joint", "--by", "speed=20,61"), ("outside the domain", "values above 10 and up to 60 km/h")),
-        (("wear", "--by", "sped=20"), ("study 'wear' does not vary 'sped'; did you mean 'speed'?",)),
+        (
+            ("wear", "--by", "speed=5"),
+            ("speed=5 is below every point of study 'wear'", "from 10 to 40 km/h"),
+        ),
+        (
+            ("wear_joint", "--by", "speed=20,61"),
+            ("outside the domain", "values above 10 and up to 60 km/h"),
+        ),
+        (
+            ("wear", "--by", "sped=20"),
+            ("study 'wear' does not vary 'sped'; did you mean 'speed'?",),
+        ),
         (("rain", "--by", "speed=20"), ("study 'rain' does not vary 'speed'", "[scenario.search]")),
         (("wear", "--by", "speed=fast"), ("'fast' is no number", "NAME=V1,V2,...")),
         (("wear", "--by", "speed"), ("'speed'", "NAME=V1,V2,...")),
-        (("wear", "--by", "speed=20", "--unsafe", "drac > 6"), ("beside --unsafe 'drac > 6'", "keep the margin")),
-        (("euro_ncap_rating", "--by", "speed=20"), ("study 'euro_ncap_rating' is rated", "not rated")),
+        (
+            ("wear", "--by", "speed=20", "--unsafe", "drac > 6"),
+            ("beside --unsafe 'drac > 6'", "keep the margin"),
+        ),
+        (
+            ("euro_ncap_rating", "--by", "speed=20"),
+            ("study 'euro_ncap_rating' is rated", "not rated"),
+        ),
         (("wear", "--by", "speed=20", "--point", "CPFA, speed 10, wet"), ("beside a point",)),
-        (("wear", "--by", "speed=20", "--together"), ("joint limits are not sought", "narrower domain")),
-        (("wear", "--by", "speed=20", "--fail-if", "limits.by_x > 3"), ("'limits.by_x'", "limits.by_speed")),
+        (
+            ("wear", "--by", "speed=20", "--together"),
+            ("joint limits are not sought", "narrower domain"),
+        ),
+        (
+            ("wear", "--by", "speed=20", "--fail-if", "limits.by_x > 3"),
+            ("'limits.by_x'", "limits.by_speed"),
+        ),
         (("wear", "--fail-if", "limits.by_speed > 3"), ("'limits.by_speed'", "limits.by_NAME")),
     ],
 )
@@ -78,18 +99,26 @@ def test_compare_has_no_limits_by_a_parameter() -> None:
 
 
 def test_a_level_of_a_matrix_drives_what_the_one_below_did_not() -> None:
-    """All points of `wear` up to 40 km/h stand in exactly one level, and a cell's ends are its points or values."""
+    """All points of `wear` up to 40 km/h stand in exactly one level, and a cell's ends are its
+    points or values.
+    """
     study = load_study("wear")
     by = Parameter.parse("speed=40,15,30", study)
     assert by.values == (15, 30, 40)
     lows = (None, *by.values)
-    levels = [study_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)]
+    levels = [
+        study_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)
+    ]
     names = [point.name for level in levels for point in assemble(level).points]
     whole = [point for point in assemble(study).points if dict(point.parameters)["speed"] <= 40]
     assert sorted(names) == sorted(point.name for point in whole)
-    cells = [cells_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)]
+    cells = [
+        cells_between(study, by, low, high) for low, high in zip(lows, by.values, strict=False)
+    ]
     assert [tests[0].over["speed"] for tests in cells] == [[10, 15], [15, 20, 30], [30, 40]]
-    assert "15 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in by.scope(study, 15, between=True)
+    assert "15 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in by.scope(
+        study, 15, between=True
+    )
     assert "only what the attack" not in by.scope(study, 30, between=True)
 
 
@@ -97,16 +126,23 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
     study = load_study("smoke")
     region = region_of(study)
     members = region.characteristics
-    boxes = [Box(region, members.lower, members.upper), Box(region, members.original, members.upper)]
+    boxes = [
+        Box(region, members.lower, members.upper),
+        Box(region, members.original, members.upper),
+    ]
 
     def judge(rows: FloatArray) -> FloatArray:
-        return np.asarray(np.abs((rows - members.lower) / (members.upper - members.lower) - 0.7).sum(axis=1) - 0.5)
+        return np.asarray(
+            np.abs((rows - members.lower) / (members.upper - members.lower) - 0.7).sum(axis=1) - 0.5
+        )
 
     def alone(number: int) -> Attack:
         return attack(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
 
     rngs = [np.random.default_rng(number) for number in (0, 1)]
-    for one, other in zip(attack_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True):
+    for one, other in zip(
+        attack_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True
+    ):
         assert np.array_equal(one.settings, other.settings)
         assert one.simulated == other.simulated
 
@@ -122,7 +158,9 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Study:
 def answer(searched: Study) -> Answer:
     by = f"speed={','.join(map(str, SPEEDS))}"
     names = ("brakeTorque,brakeResponse,sensorRange",)
-    return tolerance(searched, by=by, fits=FITS, jobs=2, characteristics=names, limits=["brakeTorque >= 0.55"])
+    return tolerance(
+        searched, by=by, fits=FITS, jobs=2, characteristics=names, limits=["brakeTorque >= 0.55"]
+    )
 
 
 def rows_of(answer: Answer) -> list[dict[str, Any]]:
@@ -130,8 +168,8 @@ def rows_of(answer: Answer) -> list[dict[str, Any]]:
 
 
 def unsafe_cars(study: Study, margin: float, settings: FloatArray) -> BoolArray:
-    """Which cars keep less than the margin with the study's own fit, or collide with another one, where the original
-    keeps that of the study.
+    """Which cars keep less than the margin with the study's own fit, or collide with another one,
+    where the original keeps that of the study.
     """
     are_unsafe = np.zeros(len(settings), dtype=bool)
     for fit, fitted in enumerate(studies_of_sets(study)[:FITS]):
@@ -142,8 +180,12 @@ def unsafe_cars(study: Study, margin: float, settings: FloatArray) -> BoolArray:
 
 
 @pytest.mark.slow
-def test_no_car_within_a_limit_is_unsafe_up_to_its_speed_and_one_beyond_is(searched: Study, answer: Answer) -> None:
-    """400 cars a row, at speeds up to its own; and up to 10 % of the domain beyond, in the encounter of its failure."""
+def test_no_car_within_a_limit_is_unsafe_up_to_its_speed_and_one_beyond_is(
+    searched: Study, answer: Answer
+) -> None:
+    """400 cars a row, at speeds up to its own; and up to 10 % of the domain beyond, in the
+    encounter of its failure.
+    """
     characteristics, rng = CharacteristicSet.of(searched), np.random.default_rng(3)
     margin = answer.numbers["margin"]
     beyond = 0
@@ -152,7 +194,9 @@ def test_no_car_within_a_limit_is_unsafe_up_to_its_speed_and_one_beyond_is(searc
         speed = characteristics.names.index("speed")
         settings = np.tile(characteristics.original, (400, 1))
         for item in characteristics.scenario:
-            settings[:, characteristics.names.index(item.name)] = rng.uniform(item.lower, item.upper, 400)
+            settings[:, characteristics.names.index(item.name)] = rng.uniform(
+                item.lower, item.upper, 400
+            )
         settings[:, speed] = rng.uniform(10, row["by_speed"], 400)
         settings[:, column] = rng.uniform(row["alone_low"], row["alone_high"], 400)
         settings[:100, column] = row["alone_low"]
@@ -187,11 +231,16 @@ def test_limits_are_wider_up_to_a_slower_speed_and_never_narrower(answer: Answer
 
 
 @pytest.mark.slow
-def test_the_verdict_says_up_to_which_speed_a_worn_car_may_drive(searched: Study, answer: Answer) -> None:
-    """Cars at the specified limit are safe at every speed up to the one that is said, and one a little above is not."""
+def test_the_verdict_says_up_to_which_speed_a_worn_car_may_drive(
+    searched: Study, answer: Answer
+) -> None:
+    """Cars at the specified limit are safe at every speed up to the one that is said, and one a
+    little above is not.
+    """
     reach = answer.numbers["up_to"]
-    assert f"On a wet road with brakeTorque at least 0.55, all others as in the original: up to {reach:g} km/h." in (
-        answer.verdict
+    assert (
+        "On a wet road with brakeTorque at least 0.55, all others as in the original: up to"
+        f" {reach:g} km/h." in (answer.verdict)
     )
     kept = [row["by_speed"] for row in rows_of(answer) if row["kept"]]
     assert max(kept) <= reach < 60
@@ -207,13 +256,26 @@ def test_the_verdict_says_up_to_which_speed_a_worn_car_may_drive(searched: Study
 
 
 @pytest.mark.slow
-def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(tmp_path: Path) -> None:
+def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(
+    tmp_path: Path,
+) -> None:
     study = load_study("wear")
     picture = tmp_path / "by.png"
-    names = ("--characteristics", "brakeTorque,sensorLatency", "--fits", "0", "--attack", "100", "--jobs", "2")
+    names = (
+        "--characteristics",
+        "brakeTorque,sensorLatency",
+        "--fits",
+        "0",
+        "--attack",
+        "100",
+        "--jobs",
+        "2",
+    )
     run("tolerance", "wear", "--by", "speed=20,35,40", *names, "--plot", str(picture))
     assert picture.stat().st_size > 10_000
-    answer = tolerance(study, by="speed=20,35,40", fits=0, attack=100, jobs=2, characteristics=names[1].split(","))
+    answer = tolerance(
+        study, by="speed=20,35,40", fits=0, attack=100, jobs=2, characteristics=names[1].split(",")
+    )
     characteristics = CharacteristicSet.of(study)
     rows = rows_of(answer)
     assert [row["by_speed"] for row in rows] == [20, 35, 40] * 2
@@ -222,12 +284,20 @@ def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(
         settings = np.tile(characteristics.original, (100, 1))
         settings[:, column] = np.linspace(row["alone_low"], row["alone_high"], 100)
         up_to = msgspec.structs.replace(
-            study, matrix=study_between(study, Parameter.parse("speed=40", study), None, row["by_speed"]).matrix
+            study,
+            matrix=study_between(
+                study, Parameter.parse("speed=40", study), None, row["by_speed"]
+            ).matrix,
         )
         for result in simulate_all_points(assemble(up_to), settings):
-            assert result.evaluations.f_safe.min() >= answer.numbers["margin"], (row, result.point.name)
+            assert result.evaluations.f_safe.min() >= answer.numbers["margin"], (
+                row,
+                result.point.name,
+            )
     assert any(row["fails_first"] for row in rows)
-    assert "up to 35 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in rows[1]["scope"]
+    assert (
+        "up to 35 km/h in CPFA, CPNA, CPNCO and CPLA only what the attack drove" in rows[1]["scope"]
+    )
 
 
 @pytest.mark.slow
@@ -238,13 +308,18 @@ def test_the_page_on_an_occurrence_says_what_explain_says(tmp_path: Path) -> Non
     found = explain(str(file), fits=0, jobs=2)
     assert len(text.splitlines()) <= 10
     assert found.verdict.partition(" (")[0] in (ROOT / "docs/occurrence.md").read_text()
-    shares = {row["characteristic"]: row["in_some"] for row in found.to_dict()["tables"]["characteristics"]["rows"]}
+    shares = {
+        row["characteristic"]: row["in_some"]
+        for row in found.to_dict()["tables"]["characteristics"]["rows"]
+    }
     assert [name for name, share in shares.items() if share == 0] == ["sensorRange"]
     assert found.numbers["original_outcome"] == "stopped"
 
 
 def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() -> None:
-    """Each failure alone would move in its cheapest limit; both are cut off at once by one limit of the first."""
+    """Each failure alone would move in its cheapest limit; both are cut off at once by one limit of
+    the first.
+    """
     study = made_up_study(2)
     region = region_of(study)
     model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
@@ -253,7 +328,9 @@ def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() 
     cut = Settlement(search).cut(whole)
     assert cut.upper.tolist() == pytest.approx([8.9, 10], abs=0.1)
     assert not cut.holds(search.unsafe_settings).any()
-    assert Settlement(search).cut(whole, attempts=10).upper[0] < cut.upper[0] - 0.2, "it keeps off by more"
+    assert Settlement(search).cut(whole, attempts=10).upper[0] < cut.upper[0] - 0.2, (
+        "it keeps off by more"
+    )
 
 
 @pytest.mark.slow
@@ -271,7 +348,9 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
     assert broken_promises(new_car, [model]) == {}
     assert evaluator.simulated == 16
     assert not _keeps_its_margin(worn, model)
-    assert not _keeps_its_margin(new_car, model._replace(unsafe=Unsafe(keep=study.scenario.margin + 0.1)))
+    assert not _keeps_its_margin(
+        new_car, model._replace(unsafe=Unsafe(keep=study.scenario.margin + 0.1))
+    )
 
 
 def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> None:

@@ -34,14 +34,18 @@ def linear(rows: FloatArray) -> BoolArray:
 
 
 @pytest.mark.parametrize(("limits", "largest"), [({}, 0.375), ({"c": Limit(at_most=7)}, 0.315)])
-def test_the_box_with_limits_is_nearly_the_largest(limits: dict[str, Limit], largest: float) -> None:
+def test_the_box_with_limits_is_nearly_the_largest(
+    limits: dict[str, Limit], largest: float
+) -> None:
     found = box_of(3, linear, limits)
     assert found.box is not None
     assert found.proof is not None
     assert 0.97 * largest < relative_volume(found) <= largest
     assert (found.box.upper - 5) @ LINEAR <= 10
     assert found.proof.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / found.proof.samples))
-    assert all(found.box.upper["abc".index(name)] == limit.at_most for name, limit in limits.items())
+    assert all(
+        found.box.upper["abc".index(name)] == limit.at_most for name, limit in limits.items()
+    )
 
 
 def test_no_limit_of_the_box_can_move_out_alone() -> None:
@@ -59,28 +63,40 @@ def test_no_limit_of_the_box_can_move_out_alone() -> None:
 
 
 def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together_met() -> None:
-    """A pocket between two values of the scan, in one of two fits, which no value of a limit alone hits."""
+    """A pocket between two values of the scan, in one of two fits, which no value of a limit alone
+    hits.
+    """
 
     def pocket(rows: FloatArray) -> BoolArray:
         return np.asarray((rows[:, 0] > 7.01) & (rows[:, 0] < 7.04))
 
     study = made_up_study(2)
-    own, other = (Model(k, Evaluator(study, Plant(study, one)), Unsafe()) for k, one in enumerate((nowhere, pocket)))
+    own, other = (
+        Model(k, Evaluator(study, Plant(study, one)), Unsafe())
+        for k, one in enumerate((nowhere, pocket))
+    )
     scans = scan(own.evaluator, [0, 1], Unsafe())
     alone = AloneSearch(scans, [0, 1], [own, other])
     alone.run(0)
     assert [each.safe for each in alone.limits()] == [(0.0, 10.0), (0.0, 10.0)]
     alone.meet([other], np.array([[7.02, 5.0]]))
-    assert [each.safe for each in alone.limits()] == [(0.0, pytest.approx(7.01, abs=0.01)), (0.0, 10.0)]
+    assert [each.safe for each in alone.limits()] == [
+        (0.0, pytest.approx(7.01, abs=0.01)),
+        (0.0, 10.0),
+    ]
     assert alone.limits()[0].safe[1] <= 7.01
     assert pocket(alone.failures).all()
 
 
 def test_a_tooth_between_corners_is_found_and_left_out() -> None:
-    """No corner and no value alone is unsafe: from 6 to 6.5 of the first with the others below 6."""
+    """No corner and no value alone is unsafe: from 6 to 6.5 of the first with the others below
+    6.
+    """
 
     def tooth(rows: FloatArray) -> BoolArray:
-        return np.asarray((np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1))
+        return np.asarray(
+            (np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1)
+        )
 
     found = box_of(3, tooth, {"a": Limit(at_least=3, at_most=7)})
     assert found.box is not None
@@ -111,14 +127,21 @@ def test_the_box_holds_in_every_fit() -> None:
     found = box_of(3, linear, {}, [second])
     assert found.box is not None
     assert [model.fit for model in found.members] == [0, 1]
-    settings = np.concatenate([found.box.corners(0, 0), found.box.at(np.random.default_rng(2).random((5000, 3)))])
+    settings = np.concatenate(
+        [found.box.corners(0, 0), found.box.at(np.random.default_rng(2).random((5000, 3)))]
+    )
     assert not linear(settings).any()
     assert not second(settings).any()
     assert {*found.corners} == {0, 1}
 
 
 def test_a_promise_that_a_fit_breaks_is_named_and_the_box_holds_in_the_others() -> None:
-    found = box_of(2, nowhere, {"a": Limit(at_most=9)}, [lambda rows: rows[:, 0] > 8, lambda rows: rows[:, 1] > 7])
+    found = box_of(
+        2,
+        nowhere,
+        {"a": Limit(at_most=9)},
+        [lambda rows: rows[:, 0] > 8, lambda rows: rows[:, 1] > 7],
+    )
     assert [*found.broken] == [1]
     assert [model.fit for model in found.members] == [0, 2]
     assert found.box is not None
@@ -134,7 +157,9 @@ def test_limits_that_the_own_fit_breaks_have_no_box() -> None:
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.4])
 def test_a_box_is_not_widened_through_what_fails_beside_it(gap: float) -> None:
-    """However far it keeps off known failures: those that the widening finds lie within that distance."""
+    """However far it keeps off known failures: those that the widening finds lie within that
+    distance.
+    """
 
     def wall(rows: FloatArray) -> BoolArray:
         return np.asarray((rows[:, 0] > 7) & (rows[:, 1] > 4))

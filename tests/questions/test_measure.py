@@ -1,4 +1,6 @@
-"""Any metric of a study as the criterion of every question, a user's own, too; in a matrix its worst point counts."""
+"""Any metric of a study as the criterion of every question, a user's own, too; in a matrix its
+worst point counts.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def hardest(runs, thresholds):
     loss = np.max(-np.diff(runs.trace.speed, axis=0), axis=0, initial=0.0) / runs.trace.step
     return np.where(np.isnan(runs.collision_speed), loss, np.nan)
 
-HARDEST = Measure(name="hardest", title="hardest", unit="m/s^2", more_is_unsafe=True, function=hardest)
+HARDEST = Measure(
+    name="hardest", title="hardest", unit="m/s^2", more_is_unsafe=True, function=hardest
+)
 """
 STUDY = """
 extends = "rain"
@@ -60,7 +64,9 @@ def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert Unsafe.parse(str(Unsafe.parse(text))) == Unsafe.parse(text)
 
 
-@pytest.mark.parametrize("text", ["drac", "drac >", "drac > x", "drac == 6", "> 6", "drac > inf", "a b > 6", "below<1"])
+@pytest.mark.parametrize(
+    "text", ["drac", "drac >", "drac > x", "drac == 6", "> 6", "drac > inf", "a b > 6", "below<1"]
+)
 def test_a_criterion_that_is_none_is_refused(text: str) -> None:
     if text == "below<1":  # a name of a metric like any other, which no study has
         with pytest.raises(InputError, match="no metric 'below'"):
@@ -80,10 +86,16 @@ def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
 
 @pytest.mark.slow
 def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
-    """The worn car stops nearest to a pedestrian at another point than where it had to brake hardest."""
+    """The worn car stops nearest to a pedestrian at another point than where it had to brake
+    hardest.
+    """
     study, worn = load_study("wear"), {"brakeTorque": 0.7}
-    by_drac = sv.evaluate(study_by(study, Unsafe.parse("drac > 5.7")), [worn], filtered=False, jobs=1)
-    by_degree = sv.evaluate(load_study("wear", metrics={"also": ["drac"]}), [worn], filtered=False, jobs=1)
+    by_drac = sv.evaluate(
+        study_by(study, Unsafe.parse("drac > 5.7")), [worn], filtered=False, jobs=1
+    )
+    by_degree = sv.evaluate(
+        load_study("wear", metrics={"also": ["drac"]}), [worn], filtered=False, jobs=1
+    )
     assert by_drac["drac"][0] == pytest.approx(5.87, abs=0.005)
     assert by_degree["drac"][0] == pytest.approx(2.14, abs=0.005)
     assert by_degree["f_safe"][0] < by_drac["f_safe"][0]
@@ -110,11 +122,18 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
 def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     criterion = ("--unsafe", "hardest > 6.8")
     studied = json_of("study", "tiny.toml", "--out", "results", "--quiet", *criterion)
-    counts = re.search(r"(\d+) of (\d+) different solutions are unsafe: hardest > 6.8, or a col", studied["verdict"])
+    counts = re.search(
+        r"(\d+) of (\d+) different solutions are unsafe: hardest > 6.8, or a col",
+        studied["verdict"],
+    )
     results = sv.load("results")
     solutions = results.solutions.drop_duplicates([*results.case.characteristics.names])
     assert counts is not None
-    assert 0 < int(counts[1]) == ((solutions["hardest"] > 6.8) | (solutions["outcome"] == "collision")).sum()
+    assert (
+        0
+        < int(counts[1])
+        == ((solutions["hardest"] > 6.8) | (solutions["outcome"] == "collision")).sum()
+    )
     assert re.search(r"With the fewest changes it .*, hardest [\d.]+: ", studied["verdict"])
     ask = ("--ask", "risk --samples 64", *criterion)
     run("report", "results", "--out", "page.html", *ask)
@@ -129,13 +148,17 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
 def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_its_own(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By `drac` another point of the matrix is the worst one than by the safety degree, of which one question asks."""
+    """By `drac` another point of the matrix is the worst one than by the safety degree, of which
+    one question asks.
+    """
     search = {"algorithms": ["rs"], "population": 10, "evaluations": 40, "runs": 1}
     searched(load_study("wear", search=search), in_tmp / "results")
     stages = []
     evaluate = Evaluator.evaluate
 
-    def noted(evaluator: Evaluator, settings: FloatArray, stage: str, **options: bool) -> Evaluations:
+    def noted(
+        evaluator: Evaluator, settings: FloatArray, stage: str, **options: bool
+    ) -> Evaluations:
         stages.append(stage)
         return evaluate(evaluator, settings, stage, **options)
 
@@ -153,16 +176,35 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
 
 
 def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
-    refused("study", "tiny.toml", "--unsafe", "hardness > 5", message=("study 'tiny' has no metric 'hardness'",))
+    refused(
+        "study",
+        "tiny.toml",
+        "--unsafe",
+        "hardness > 5",
+        message=("study 'tiny' has no metric 'hardness'",),
+    )
     assert not (folder / "results").exists()
-    refused("study", "tiny.toml", "--status", "--unsafe", "drac > 5", message=("--unsafe: beside status",))
+    refused(
+        "study",
+        "tiny.toml",
+        "--status",
+        "--unsafe",
+        "drac > 5",
+        message=("--unsafe: beside status",),
+    )
 
 
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
-    (folder / "nowhere.py").write_text(METRIC.replace("return np.where", "return np.nan * np.where"))
+    (folder / "nowhere.py").write_text(
+        METRIC.replace("return np.where", "return np.nan * np.where")
+    )
     (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
-    verdict = json_of("risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8")["verdict"]
-    (counts,) = re.findall(r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated", verdict)
+    verdict = json_of("risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8")[
+        "verdict"
+    ]
+    (counts,) = re.findall(
+        r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated", verdict
+    )
     undefined, simulated = (int(text.replace(",", "")) for text in counts)
     assert 0 < undefined < simulated, "some of all collide"
 
@@ -171,7 +213,17 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
 def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
     """300 cars within the limits together: none brakes harder, and none collides."""
     few = ("--characteristics", "tireFric,maxBrakeTorque")
-    answer = json_of("tolerance", "tiny.toml", "--fits", "0", "--attack", "500", "--unsafe", "hardest > 6.8", *few)
+    answer = json_of(
+        "tolerance",
+        "tiny.toml",
+        "--fits",
+        "0",
+        "--attack",
+        "500",
+        "--unsafe",
+        "hardest > 6.8",
+        *few,
+    )
     limits = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
     rng = np.random.default_rng(3)
     ends = {name: (row["together_low"], row["together_high"]) for name, row in limits.items()}
@@ -185,13 +237,18 @@ def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_limits_of_the_matrix_by_drac_are_obeyed_in_every_fit() -> None:
-    """500 cars within the limits together, in each fit, at all points of the matrix: the worst one by DRAC counts."""
+    """500 cars within the limits together, in each fit, at all points of the matrix: the worst one
+    by DRAC counts.
+    """
     answer = json_of("tolerance", "wear", "--unsafe", "drac > 8")
     rows = answer["tables"]["limits"]["rows"]
     ends = {row["characteristic"]: (row["together_low"], row["together_high"]) for row in rows}
     assert answer["numbers"]["box"]
     rng = np.random.default_rng(5)
-    cars = [{name: float(rng.choice([*both, rng.uniform(*both)])) for name, both in ends.items()} for _ in range(500)]
+    cars = [
+        {name: float(rng.choice([*both, rng.uniform(*both)])) for name, both in ends.items()}
+        for _ in range(500)
+    ]
     fits = studies_of_sets(study_by(load_study("wear"), Unsafe.parse("drac > 8")))
     assert answer["numbers"]["fits"] == answer["numbers"]["fits_tried"] == len(fits)
     assert f"in any of {len(fits)} fits" in answer["verdict"]

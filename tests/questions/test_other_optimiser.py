@@ -1,4 +1,6 @@
-"""Joint limits against another optimiser than the package's: random settings, then local search from the six worst."""
+"""Joint limits against another optimiser than the package's: random settings, then local search
+from the six worst.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
 
 SIMULATIONS, WORST, STEPS = 3000, 6, 20
-"""Simulations of the other optimiser, half of them random; settings from which it searches on; neighbours at once."""
+"""Simulations of the other optimiser, half of them random; settings from which it searches on;
+neighbours at once.
+"""
 
 
-def worst_within(lower: FloatArray, upper: FloatArray, models: tuple[Model, ...], seed: int) -> float:
+def worst_within(
+    lower: FloatArray, upper: FloatArray, models: tuple[Model, ...], seed: int
+) -> float:
     """The least that settings between two ends leave, shape (n,), in any of some models."""
     rng = np.random.default_rng(seed)
     n = len(lower)
@@ -57,7 +63,9 @@ def worst_within(lower: FloatArray, upper: FloatArray, models: tuple[Model, ...]
         ("smoke", {"fits": 4}),
     ],
 )
-def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(name: str, options: dict[str, Any]) -> None:
+def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
+    name: str, options: dict[str, Any]
+) -> None:
     study = load_study(name)
     members = CharacteristicSet.of(study)
     evaluator = Evaluator(study, InlinePool(), verified=0)
@@ -65,7 +73,9 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(name: str, o
     assert evaluator.simulated < 2 * MAX_SIMULATIONS
     assert answer.numbers["box"]
     rows = {row["characteristic"]: row for row in answer.to_dict()["tables"]["limits"]["rows"]}
-    lower, upper = (np.array([rows[one][f"together_{end}"] for one in members.names]) for end in ("low", "high"))
+    lower, upper = (
+        np.array([rows[one][f"together_{end}"] for one in members.names]) for end in ("low", "high")
+    )
     unsafe = limit_criterion(evaluator, study, None, None, evaluator.evaluate_original())
     models = models_of(evaluator, unsafe, options["fits"]).members
     assert min(worst_within(lower, upper, models, seed) for seed in range(2)) >= 0

@@ -29,8 +29,8 @@ from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
-"""Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the price of
-every promise, at least 10 m, is far longer than the 0.1 m of a step.
+"""Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
+price of every promise, at least 10 m, is far longer than the 0.1 m of a step.
 """
 
 MODELS = """
@@ -124,7 +124,7 @@ seed = 1
 
 [repair]
 gap = { lower = 4.0, upper = 64.0, unit = "m", meaning = "gap at which it brakes" }
-always = { lower = 0.0, upper = 1.0, unit = "-", meaning = "from a half on it brakes without reason" }
+always = { lower = 0.0, upper = 1.0, unit = "-", meaning = "brakes without reason from 0.5 on" }
 colour = { lower = 0.0, upper = 2.0, unit = "-", meaning = "colour of its box" }
 
 [repair.promise]
@@ -157,13 +157,17 @@ def gap_for(grip: float) -> float:
 def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Path) -> None:
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
-    needed = max(gap_for(5), gap_for(5 * 0.9) - MARGIN)  # another fit than the study's own needs not to collide
+    needed = max(
+        gap_for(5), gap_for(5 * 0.9) - MARGIN
+    )  # another fit than the study's own needs not to collide
     assert repair["parameters"] == {"gap": pytest.approx(needed, rel=0.01)}
     assert repair["fits"] == found.numbers["fits"] == found.numbers["fits_tried"] == 3
     assert "It holds in 3 of 3 fits of the vehicle, attacked with each." in found.verdict
     assert [repair["metres_earlier"]] == found.values("repairs.metres_earlier_mean")
     assert repair["metres_earlier"] == pytest.approx(needed - GAP_TODAY, rel=0.01)
-    assert len(str(repair["parameters"]["gap"])) <= 5  # four digits: what is printed is what was tried
+    assert (
+        len(str(repair["parameters"]["gap"])) <= 5
+    )  # four digits: what is printed is what was tried
     assert repair["proof_failures"] == 0
     assert repair["at_most"] <= 0.01
     assert max(map(len, found.render("text").split("Repairs\n")[1].splitlines()[:-1])) <= 80
@@ -173,11 +177,15 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Pat
 def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     planted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The gap of today decides the fastest of them; from there the worst promised sled needs a longer one."""
+    """The gap of today decides the fastest of them; from there the worst promised sled needs a
+    longer one.
+    """
     monkeypatch.setattr(attack, "BUDGET", 2000)
     search = 'search.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
     planted.write_text(
-        STUDY.replace("speed = 72.0, ", "").replace('model = "car_to_car"', f'model = "car_to_car"\n{search}')
+        STUDY.replace("speed = 72.0, ", "").replace(
+            'model = "car_to_car"', f'model = "car_to_car"\n{search}'
+        )
     )
     found = sv.repair(planted, change=["gap"], fits=0, pool=InlinePool())
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
@@ -189,7 +197,10 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
 
 @pytest.mark.slow
 def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
-    answers = [sv.repair(planted, change=["always"], pool=pool).to_dict() for pool in (InlinePool(), InlinePool(2))]
+    answers = [
+        sv.repair(planted, change=["always"], pool=pool).to_dict()
+        for pool in (InlinePool(), InlinePool(2))
+    ]
     assert answers[0] == answers[1]
     (repair,) = answers[0]["tables"]["repairs"]["rows"]
     assert repair["needless_braking"] == repair["benign_scenes"] >= 6
@@ -197,14 +208,18 @@ def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -
 
 
 class Adding:
-    """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what a vehicle needs."""
+    """A problem without simulations: the changes of the parameters, up to 0.85 each, add up to what
+    a vehicle needs.
+    """
 
     arrays = True
 
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self._need = np.full(parameters, 0.1), need
 
-    def lefts(self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()) -> tuple[FloatArray, Any]:
+    def lefts(
+        self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()
+    ) -> tuple[FloatArray, Any]:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
         left = gain[:, np.newaxis] - self._need * settings[:, 0]
         return left, np.zeros(left.size, dtype=int)
@@ -227,7 +242,9 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
     problem: Any = Adding(parameters, need)
     search = smallest.Search([problem], np.linspace(0.5, 0, 20)[:, np.newaxis])
     search.smallest_changes()
-    search.add(0, np.linspace(1, 0.5, 20)[:, np.newaxis])  # what was found before becomes a lower bound
+    search.add(
+        0, np.linspace(1, 0.5, 20)[:, np.newaxis]
+    )  # what was found before becomes a lower bound
     changes = [change - problem.today for change in search.smallest_changes()]
     found = {int(np.count_nonzero(change)): float(np.max(np.abs(change))) for change in changes}
     assert found == pytest.approx(changed, abs=0.005)
@@ -246,20 +263,37 @@ def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
 def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
-    done = run("repair", str(planted), "--promise", "grip>=7.9", "--change", "gap", "--out", str(out), "--json")
+    done = run(
+        "repair",
+        str(planted),
+        "--promise",
+        "grip>=7.9",
+        "--change",
+        "gap",
+        "--out",
+        str(out),
+        "--json",
+    )
     answer = json.loads(done.stdout)
     assert answer["numbers"]["repairs"] == 0
     assert answer["numbers"]["kept_today"]
     assert not out.exists()
 
 
-def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_does_not_have() -> None:
+def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_does_not_have() -> (
+    None
+):
     study = sv.load_study("rain")
     assert any(key.startswith("ads.parameters.") for key in study.spread)
     with open_evaluator(study, InlinePool()) as evaluator:
-        problem: Any = RepairProblem(evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3))  # type: ignore[arg-type]
+        problem: Any = RepairProblem(
+            evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3)
+        )  # type: ignore[arg-type]
         assert (
-            problem.best_driver.evaluator.evaluate(evaluator.characteristics.original[np.newaxis], "").f_safe[0] > 0.3
+            problem.best_driver.evaluator.evaluate(
+                evaluator.characteristics.original[np.newaxis], ""
+            ).f_safe[0]
+            > 0.3
         )
 
 
@@ -277,9 +311,14 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
         settings = problem.promise.draw(20, np.random.default_rng(1))
         driver = problem.best_driver
         assert driver is not None
-        is_safe = full_braking.lefts_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
+        is_safe = (
+            full_braking.lefts_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
+        )
         assert 0 < np.count_nonzero(is_safe) < len(settings)
-        for rows in (np.arange(20), np.flatnonzero(~is_safe)):  # the second time the hardest points are known
+        for rows in (
+            np.arange(20),
+            np.flatnonzero(~is_safe),
+        ):  # the second time the hardest points are known
             assert (driver.saves(settings[rows]) == is_safe[rows]).all()
 
 
@@ -288,8 +327,12 @@ def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
     assert Parameter("a", row, 1000.0).values(np.array([0.45678])).item() == 1000.457
 
 
-def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Without attacks and fresh wear: of the worst brakes promised, those in between and the best."""
+def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Without attacks and fresh wear: of the worst brakes promised, those in between and the
+    best.
+    """
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
     monkeypatch.setattr(survivors, "find_failures", lambda *_: {})
     monkeypatch.setattr(survivors, "prove_change", lambda *_: (attack.Proof(5, 0, 0.45, 0), {}))
@@ -297,7 +340,9 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pyte
     worst = kept.numbers["worst_today"]
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
-    assert f"has a safety degree of {words}, and of 5 fresh worn vehicles 0 are unsafe" in kept.verdict
+    assert (
+        f"has a safety degree of {words}, and of 5 fresh worn vehicles 0 are unsafe" in kept.verdict
+    )
     table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.
     for study in (kept.study, replace_in(kept.study, name="lost")):
@@ -316,7 +361,9 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(monkeypatch: pyte
         ("gap = 12.0, always", "gap = 'x', always", "gap", "bounds that hold the value of today"),
     ],
 )
-def test_what_cannot_be_repaired_is_refused(planted: Path, old: str, new: str, change: str, message: str) -> None:
+def test_what_cannot_be_repaired_is_refused(
+    planted: Path, old: str, new: str, change: str, message: str
+) -> None:
     planted.write_text(STUDY.replace(old, new))
     with pytest.raises(sv.InputError, match=re.escape(message)):
         sv.repair(planted, change=[change], pool=InlinePool())
@@ -327,7 +374,10 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
     parameters = sv.load_study(shipped[model]).ads.parameters if model in shipped else {}
     study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
-    names, system = tuple(CHANGEABLE[model]), replace(assemble(study), matrix=assemble(study).points[-1:])
+    names, system = (
+        tuple(CHANGEABLE[model]),
+        replace(assemble(study), matrix=assemble(study).points[-1:]),
+    )
     ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
     values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
@@ -336,7 +386,9 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     for row, one in enumerate(values):
         ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})
         alone = evaluate(replace(system, ads=ads), settings[:1])
-        assert not list(differences(together.take([row]).results, alone.results)), dict(zip(names, one, strict=True))
+        assert not list(differences(together.take([row]).results, alone.results)), dict(
+            zip(names, one, strict=True)
+        )
 
 
 @pytest.mark.slow

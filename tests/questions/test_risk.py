@@ -1,5 +1,5 @@
-"""Shares, probabilities and rules: against analytic volumes, moments, Ishigami's function, a linear model and regions
-that are known.
+"""Shares, probabilities and rules: against analytic volumes, moments, Ishigami's function, a linear
+model and regions that are known.
 """
 
 from __future__ import annotations
@@ -17,7 +17,16 @@ from safevar_sumo.questions.risk import deciding_in_words
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import load_study
-from tests.questions.conftest import Plant, Region, box, diagonal_band, everywhere, made_up_study, nowhere, two_islands
+from tests.questions.conftest import (
+    Plant,
+    Region,
+    box,
+    diagonal_band,
+    everywhere,
+    made_up_study,
+    nowhere,
+    two_islands,
+)
 
 
 def of(region: Region, **options: Any) -> Answer:
@@ -26,7 +35,8 @@ def of(region: Region, **options: Any) -> Answer:
 
 
 @pytest.mark.parametrize(
-    ("region", "volume"), [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)]
+    ("region", "volume"),
+    [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)],
 )
 def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -> None:
     numbers = of(region, samples=8000, confidence=0.999).numbers
@@ -38,32 +48,47 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
 
 def ishigami(settings: FloatArray) -> FloatArray:
     x = (settings - 5) / 5 * math.pi
-    return np.asarray(np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0]))
+    return np.asarray(
+        np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+    )
 
 
 def test_sobol_indices_of_ishigamis_function() -> None:
-    """Analytic values of Saltelli et al., Global Sensitivity Analysis (2008), for a = 7, b = 0.1."""
+    """Analytic values of Saltelli et al., Global Sensitivity Analysis (2008), for a = 7, b =
+    0.1.
+    """
     study = made_up_study(3)
-    table = risk(study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami)).tables["sensitivity"]
+    table = risk(
+        study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami)
+    ).tables["sensitivity"]
     frame = table.set_index("characteristic")
-    assert frame["degree_first"].to_dict() == pytest.approx({"a": 0.3139, "b": 0.4424, "c": 0.0}, abs=0.05)
-    assert frame["degree_total"].to_dict() == pytest.approx({"a": 0.5576, "b": 0.4424, "c": 0.2437}, abs=0.05)
+    assert frame["degree_first"].to_dict() == pytest.approx(
+        {"a": 0.3139, "b": 0.4424, "c": 0.0}, abs=0.05
+    )
+    assert frame["degree_total"].to_dict() == pytest.approx(
+        {"a": 0.5576, "b": 0.4424, "c": 0.2437}, abs=0.05
+    )
     assert (frame["degree_first_low"] < frame["degree_first"]).all()
     assert frame["unsafe_total"].isna().all()
     assert table["characteristic"].iloc[0] == "a", "what decides most stands first"
 
 
 def test_first_order_indices_of_correlated_characteristics() -> None:
-    """Y = a + b of normal variables with correlation r: knowing one leaves (1 - r^2) of the other's variance 1, so that
-    the index is 1 - (1 - r^2) / (2 + 2 r). Sobol's design does not exist, and total indices are undefined.
+    """Y = a + b of normal variables with correlation r: knowing one leaves (1 - r^2) of the other's
+    variance 1, so that the index is 1 - (1 - r^2) / (2 + 2 r). Sobol's design does not exist, and
+    total indices are undefined.
     """
     normal = {"distribution": "normal", "deviation": 1.0}
     pair = {"between": ["a", "b"], "value": 0.5}
-    study = load_study(made_up_study(3), variation={"a": normal, "b": normal, "c": normal}, correlations=[pair])
+    study = load_study(
+        made_up_study(3), variation={"a": normal, "b": normal, "c": normal}, correlations=[pair]
+    )
     plant = Plant(study, nowhere, lambda settings: settings[:, 0] + settings[:, 1])
     answer = risk(study, unsafe="collision", samples=4000, pool=plant)
     frame = answer.tables["sensitivity"].set_index("characteristic")
-    assert frame["degree_first"].to_dict() == pytest.approx({"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04)
+    assert frame["degree_first"].to_dict() == pytest.approx(
+        {"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04
+    )
     assert frame["degree_total"].isna().all()
     assert "if vehicles vary as specified, a normal, b normal and c normal" in answer.verdict
 
@@ -76,11 +101,14 @@ def drawn(**variation: dict[str, Any]) -> FloatArray:
 
 def test_every_distribution_has_its_moments() -> None:
     normal, triangular = drawn(
-        a={"distribution": "normal", "deviation": 0.5, "mean": 6.0}, b={"distribution": "triangular", "upper": 8.0}
+        a={"distribution": "normal", "deviation": 0.5, "mean": 6.0},
+        b={"distribution": "triangular", "upper": 8.0},
     ).T
     assert (normal.mean(), normal.std()) == pytest.approx((6.0, 0.5), abs=0.02)
     assert (triangular.mean(), triangular.max()) == pytest.approx((13 / 3, 8.0), abs=0.1)
-    fixed, uniform = drawn(a={"distribution": "fixed", "value": 7.0}, b={"distribution": "uniform", "lower": 2.0}).T
+    fixed, uniform = drawn(
+        a={"distribution": "fixed", "value": 7.0}, b={"distribution": "uniform", "lower": 2.0}
+    ).T
     assert set(fixed) == {7.0}
     assert (uniform.min(), uniform.mean()) == pytest.approx((2.0, 6.0), abs=0.05)
     tight = drawn(a={"distribution": "normal", "deviation": 50.0})[:, 0]
@@ -106,13 +134,20 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert (row.density, row.coverage) == pytest.approx((1, 1), abs=0.02)
     assert row.density_low <= row.density <= row.density_high
     assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(0.09, abs=0.005)
-    assert "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
+    assert (
+        "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
+    )
 
 
 def test_rules_draw_as_the_variation_says() -> None:
-    """A characteristic that is always 8 of 0 to 10 decides nothing, and the share is that of `risk`."""
+    """A characteristic that is always 8 of 0 to 10 decides nothing, and the share is that of
+    `risk`.
+    """
     study = load_study(made_up_study(3), variation={"a": {"distribution": "fixed", "value": 8.0}})
-    by_rules, by_risk = (ask(study, unsafe="collision", samples=1000, pool=Plant(study, box)) for ask in (rules, risk))
+    by_rules, by_risk = (
+        ask(study, unsafe="collision", samples=1000, pool=Plant(study, box))
+        for ask in (rules, risk)
+    )
     assert by_rules.numbers["failures"] == by_risk.numbers["failures"]
     assert "1,000 vehicles drawn as [variation] says are unsafe" in by_rules.verdict
     (rule,) = by_rules.tables["rules"]["rule"]
@@ -120,14 +155,24 @@ def test_rules_draw_as_the_variation_says() -> None:
 
 
 def test_the_verdict_says_which_shares_are_unsure() -> None:
-    """Of the safety degree an interval of 0.2, of the outcome one of 3.27; nothing of a table without shares."""
+    """Of the safety degree an interval of 0.2, of the outcome one of 3.27; nothing of a table
+    without shares.
+    """
     columns = {"degree_total": (0.6, 0.5, 0.7), "unsafe_total": (1.37, -0.26, 3.01)}
-    values = {f"{name}{end}": [x] for name, row in columns.items() for end, x in zip(("", LOW, HIGH), row, strict=True)}
+    values = {
+        f"{name}{end}": [x]
+        for name, row in columns.items()
+        for end, x in zip(("", LOW, HIGH), row, strict=True)
+    }
     frame = pd.DataFrame({"characteristic": ["a"], **values})
     words = deciding_in_words(frame, 120)
     assert "a has the largest share of the safety degree's variance, 0.60 (0.50 to 0.70)." in words
-    assert words.endswith("Shares of whether the vehicle is unsafe are unsure: intervals of up to 3.27.")
-    unknown = frame.assign(**dict.fromkeys([name for name in values if name.startswith("unsafe")], np.nan))
+    assert words.endswith(
+        "Shares of whether the vehicle is unsafe are unsure: intervals of up to 3.27."
+    )
+    unknown = frame.assign(
+        **dict.fromkeys([name for name in values if name.startswith("unsafe")], np.nan)
+    )
     assert "Too few vehicles of the design are unsafe" in deciding_in_words(unknown, 1)
     assert "Too few" not in deciding_in_words(unknown, 0)
     assert deciding_in_words(frame.iloc[:0], 0) == ""
@@ -151,14 +196,19 @@ def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
 
 @pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
 def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
-    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each estimate lies in the
-    other's interval.
+    """The same vehicles in both, the first ones of a longer sequence in a shorter one: each
+    estimate lies in the other's interval.
     """
     study = made_up_study(2)
     study = load_study(study, constraints=[constraint]) if constraint else study
     asked = {number: Plant(study, box) for number in (400, 1000)}
-    numbers = {size: rules(study, unsafe="collision", pool=pool, samples=size).numbers for size, pool in asked.items()}
-    estimate = risk(study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000).numbers
+    numbers = {
+        size: rules(study, unsafe="collision", pool=pool, samples=size).numbers
+        for size, pool in asked.items()
+    }
+    estimate = risk(
+        study, unsafe="collision", pool=(plant := Plant(study, box)), samples=1000
+    ).numbers
     assert asked[400].seen < asked[1000].seen <= plant.seen
     assert numbers[1000]["share"] == estimate["probability"]
     assert numbers[1000]["interval"] == pytest.approx(estimate["interval"])

@@ -54,9 +54,14 @@ def test_islands_and_the_safe_interval_around_the_original() -> None:
     unsafe = first.of_state("unsafe")
     assert first.safe == (0.0, pytest.approx(6.5, abs=1e-4))
     assert first.safe[1] <= 6.5
-    assert unsafe[0][0] - first.safe[1] <= 1.001 * 0.05 / 4096, "a 4096th of the distance of two values"
+    assert unsafe[0][0] - first.safe[1] <= 1.001 * 0.05 / 4096, (
+        "a 4096th of the distance of two values"
+    )
     assert [pytest.approx(interval, abs=1e-4) for interval in [(6.5, 7.0), (9.0, 10.0)]] == unsafe
-    assert [first.degree(end) for end in first.safe] == [pytest.approx(3.0), pytest.approx(6.5, abs=1e-3)]
+    assert [first.degree(end) for end in first.safe] == [
+        pytest.approx(3.0),
+        pytest.approx(6.5, abs=1e-3),
+    ]
     assert (second.safe, second.of_state("unsafe")) == ((0.0, 10.0), [])
     assert len(first.profile) > 201
 
@@ -68,16 +73,24 @@ def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: lis
     low, high = ends
     (alone,) = scans_of(1, lambda rows: (rows[:, 0] >= low) & (rows[:, 0] <= high))
     if high - low > 0.05:
-        assert alone.of_state("unsafe") == [(pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))]
+        assert alone.of_state("unsafe") == [
+            (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
+        ]
     if low <= 5 <= high:
         assert alone.safe is None
     elif high - low > 0.05:
-        assert alone.safe == ((0.0, pytest.approx(low, abs=1e-4)) if low > 5 else (pytest.approx(high, abs=1e-4), 10.0))
+        assert alone.safe == (
+            (0.0, pytest.approx(low, abs=1e-4))
+            if low > 5
+            else (pytest.approx(high, abs=1e-4), 10.0)
+        )
 
 
 @pytest.mark.slow
 def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
-    answer = answer_of(2, two_islands, lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75), unsafe="collision")
+    answer = answer_of(
+        2, two_islands, lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75), unsafe="collision"
+    )
     frame = answer.tables["intervals"]
     first = frame[frame["characteristic"] == "a"].set_index("low")
     assert first["state"].tolist() == ["safe", "not_simulated", "unsafe", "safe", "unsafe"]
@@ -87,7 +100,9 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     samples, failed = answer.numbers["samples"], answer.numbers["not_simulated"]
     assert failed / samples > 0.05, "the box holds what could not be simulated"
     test = scipy.stats.binomtest(failed, samples, alternative="less")
-    exact = [test.proportion_ci(1 - 0.05 / 2**number, method="exact").high for number in range(1, 14)]  # of each test
+    exact = [
+        test.proportion_ci(1 - 0.05 / 2**number, method="exact").high for number in range(1, 14)
+    ]  # of each test
     assert any(answer.numbers["at_most"] == pytest.approx(high) for high in exact)
     assert f"{failed} could not be simulated" in answer.verdict
 
@@ -98,9 +113,17 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.Mo
     assert answer.verdict.startswith(
         "The specified limits are kept with all others as in the original. No limits toget"
     )
-    assert "1 box was tried, and each held an unsafe vehicle. That is no proof that there are none." in answer.verdict
+    assert (
+        "1 box was tried, and each held an unsafe vehicle. That is no proof that there are none."
+        in answer.verdict
+    )
     assert answer.tables["limits"]["together_low"].isna().all()
-    assert [answer.numbers[name] for name in ("box", "boxes", "kept", "attacked")] == [False, 0, True, None]
+    assert [answer.numbers[name] for name in ("box", "boxes", "kept", "attacked")] == [
+        False,
+        0,
+        True,
+        None,
+    ]
     assert not answer.failures, "no limit is broken"
     assert answer.values("limits.sentence") == [
         "A: no limits together were found.",
@@ -109,13 +132,15 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.Mo
 
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
-    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no corner of the domain
-    hits it.
+    """A sliver that begins half of the way to the domain's end; no scan, no random setting and no
+    corner of the domain hits it.
     """
 
     def sliver(rows: FloatArray) -> BoolArray:
         return np.asarray(
-            (np.abs(rows[:, 0] - rows[:, 1]) < 0.001) & (rows[:, 0] > 7) & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5)
+            (np.abs(rows[:, 0] - rows[:, 1]) < 0.001)
+            & (rows[:, 0] > 7)
+            & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5)
         )
 
     study = made_up_study(4)
@@ -124,7 +149,11 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     case = case_of(study, found.take([1]), found)
     bare, known, two = (
         tolerance.compute(subject, Evaluator(study, pool), unsafe=unsafe, characteristics=names)
-        for subject, unsafe, names in ((study, "collision", ()), (case, None, ()), (case, None, ("a,b",)))
+        for subject, unsafe, names in (
+            (study, "collision", ()),
+            (case, None, ()),
+            (case, None, ("a,b",)),
+        )
     )
     assert known.numbers["unsafe"] == "collision", "as the solutions do, and as `explain` takes it"
     assert share_of_domain(bare) == pytest.approx(1, abs=0.01)
@@ -134,8 +163,8 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
 
 @pytest.mark.slow
 def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
-    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box: any box with a bound
-    below q is wrong.
+    """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box:
+    any box with a bound below q is wrong.
 
     Boxes that are drawn anew until a sample of one has no unsafe setting would all be wrong.
     """
@@ -149,7 +178,9 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
         for attempt in range(1, 12):
             box = Box(region, np.full(2, attempt / 3), np.full(2, 10 - attempt / 3))
             rng = np.random.default_rng((seed, attempt))
-            proof, found = prove(lambda number, box=box, rng=rng: box.draw(number, rng), judge, 0.03, attempt)
+            proof, found = prove(
+                lambda number, box=box, rng=rng: box.draw(number, rng), judge, 0.03, attempt
+            )
             if not len(found):
                 wrong += proof.at_most < q
                 break
@@ -165,17 +196,31 @@ def share_of_domain(answer: Answer) -> float:
 def test_the_names_that_others_read() -> None:
     answer = answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",))
     record = json.loads(answer.render("json"))
-    numbers = "unsafe margin kept scope box boxes samples failures at_most fits fits_tried attacked least_attacked"
+    numbers = (
+        "unsafe margin kept scope box boxes samples failures at_most fits fits_tried attacked"
+        " least_attacked"
+    )
     assert {*numbers.split()} <= record["numbers"].keys()
-    keys = "characteristic unit original alone_low alone_high together_low together_high specified_low specified_high"
-    assert list(record["tables"]["limits"]["rows"][0]) == [*keys.split(), "kept", "fails_first", "fails_at", "sentence"]
+    keys = (
+        "characteristic unit original alone_low alone_high together_low together_high specified_low"
+        " specified_high"
+    )
+    assert list(record["tables"]["limits"]["rows"][0]) == [
+        *keys.split(),
+        "kept",
+        "fails_first",
+        "fails_at",
+        "sentence",
+    ]
     assert record["verdict"].startswith("Keeps all limits")
     assert "up to 8" in answer.render("text")
     assert len(answer.figure().get_axes()) == 2
 
 
 def test_limits_that_other_fits_move_are_uncertain() -> None:
-    """Brake torque: from 0.5301, inwards 0.54, with the own fit, and from 0.58 with all; the tread's limit stays."""
+    """Brake torque: from 0.5301, inwards 0.54, with the own fit, and from 0.58 with all; the
+    tread's limit stays.
+    """
     tread, torque, *_ = CharacteristicSet.of(load_study("wear"))
     scans: list[Any] = [
         SimpleNamespace(characteristic=tread, safe=(1.6, 8.0)),
@@ -191,26 +236,47 @@ def test_limits_that_other_fits_move_are_uncertain() -> None:
         ("a <= 6.8", "Do not release: a 6.8 N m: the car hits"),
         (
             "a <= 6.812",
-            "Do not release: a 6.812 N m: the car hits a crossing pedestrian with 3.6 km/h (outside by 0.312 N m)",
+            (
+                "Do not release: a 6.812 N m: the car hits a crossing pedestrian with 3.6 km/h"
+                " (outside by 0.312 N m)"
+            ),
         ),
         ("a <= 8", "Do not release: a 6.6 N m: the car hits"),
-        ("a <= 6", "Keeps all limits in one model: within them no vehicle that was tried is unsafe (collision)."),
+        (
+            "a <= 6",
+            (
+                "Keeps all limits in one model: within them no vehicle that was tried is unsafe"
+                " (collision)."
+            ),
+        ),
     ],
 )
 def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
-    """Unsafe: from 6.5 to 7, and from 9 on; a limit on the safe island between lets what is unsafe in, too."""
+    """Unsafe: from 6.5 to 7, and from 9 on; a limit on the safe island between lets what is unsafe
+    in, too.
+    """
     answer = answer_of(2, two_islands, unsafe="collision", limits=(limit,))
     assert answer.verdict.startswith(said)
     assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
 
 
 def test_a_refusal_says_what_would_do() -> None:
-    answer = answer_of(2, lambda rows: rows[:, 0] + rows[:, 1] > 15, unsafe="collision", limits=("a <= 9", "b <= 8"))
-    (first, second) = answer.to_dict()["tables"]["nearest"]["rows"]
-    assert [first["nearest"], second["nearest"]] == [pytest.approx(6.95, abs=0.06), pytest.approx(5.95, abs=0.06)]
+    answer = answer_of(
+        2,
+        lambda rows: rows[:, 0] + rows[:, 1] > 15,
+        unsafe="collision",
+        limits=("a <= 9", "b <= 8"),
+    )
+    first, second = answer.to_dict()["tables"]["nearest"]["rows"]
+    assert [first["nearest"], second["nearest"]] == [
+        pytest.approx(6.95, abs=0.06),
+        pytest.approx(5.95, abs=0.06),
+    ]
     assert answer.numbers["kept"] is False
     assert re.search(
-        r"What would do: a [67][.\d]* N m or b [56][.\d]* N m, the other specified limits as they are", answer.verdict
+        r"What would do: a [67][.\d]* N m or b [56][.\d]* N m, the other specified limits as"
+        r" they are",
+        answer.verdict,
     )
 
 
@@ -218,19 +284,27 @@ def test_a_refusal_says_what_would_do() -> None:
 @pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
 def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
     study = tmp_path / "mine.toml"
-    study.write_text(f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n')
+    study.write_text(
+        f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n'
+    )
     flags = ("--characteristics", "decel,brakeGain", "--margin", "0", "--jobs", "1", "--json")
     done = run("tolerance", str(study), *flags, expect=code)
     answer = json.loads(done.stdout)
     decel, gain = answer["tables"]["limits"]["rows"]
     assert (decel["specified_low"], decel["specified_high"]) == (float(limit), None)
     assert [decel["kept"], answer["numbers"]["kept"], gain["kept"]] == [code == 0, code == 0, None]
-    assert ("failed: limit of decel 4.6 m/s^2: the car hits a standing vehicle" in done.stderr) == (code == 3)
+    assert ("failed: limit of decel 4.6 m/s^2: the car hits a standing vehicle" in done.stderr) == (
+        code == 3
+    )
     if code == 0:
         assert decel["together_low"] == float(limit)
         return
-    assert [row[name] for row in (decel, gain) for name in ("together_low", "together_high")] == [None] * 4
-    assert [row["sentence"].endswith(": no limits together were found.") for row in (decel, gain)] == [True, True]
+    assert [row[name] for row in (decel, gain) for name in ("together_low", "together_high")] == [
+        None
+    ] * 4
+    assert [
+        row["sentence"].endswith(": no limits together were found.") for row in (decel, gain)
+    ] == [True, True]
 
 
 MANUAL = re.compile(r"(at least|at most) ([\d.]+)")
@@ -249,8 +323,8 @@ MANUAL = re.compile(r"(at least|at most) ([\d.]+)")
 def test_a_car_that_keeps_all_printed_limits_is_safe_at_every_point_in_every_fit(
     name: str, limit: str, own: str
 ) -> None:
-    """All sentences obeyed at once, in every combination of ends and by 200 cars within them: it keeps the margin with
-    the study's own fit, and collides with none.
+    """All sentences obeyed at once, in every combination of ends and by 200 cars within them: it
+    keeps the margin with the study's own fit, and collides with none.
     """
     study = load_study(name)
     answer = tolerance(study, limits=[limit], attack=500, jobs=2)
@@ -260,14 +334,18 @@ def test_a_car_that_keeps_all_printed_limits_is_safe_at_every_point_in_every_fit
     characteristics = CharacteristicSet.of(study)
     ends = []
     for item, row in zip(characteristics, limits, strict=True):
-        keep = {word: float(text) for word, text in MANUAL.findall(row["sentence"].partition(";")[0])}
+        keep = {
+            word: float(text) for word, text in MANUAL.findall(row["sentence"].partition(";")[0])
+        }
         ends.append((keep.get("at least", item.lower), keep.get("at most", item.upper)))
         assert ends[-1] == (row["together_low"], row["together_high"]), "as printed"
     (specified,) = (row["sentence"] for row in limits if row["specified_low"] is not None)
     assert own in specified
     lower, upper = np.transpose(ends)
     corners = np.unique(np.array(list(product(*ends))), axis=0)
-    settings = np.concatenate([corners, np.random.default_rng(7).uniform(lower, upper, (200, len(ends)))])
+    settings = np.concatenate(
+        [corners, np.random.default_rng(7).uniform(lower, upper, (200, len(ends)))]
+    )
     studies = studies_of_sets(study) if study.spread else [study]
     left_out = {
         row["fit"]
@@ -281,7 +359,10 @@ def test_a_car_that_keeps_all_printed_limits_is_safe_at_every_point_in_every_fit
             if fit in left_out:
                 continue
             assert not result.evaluations.collided.any(), (fit, result.point.name)
-            assert np.nanmin(result.evaluations.f_safe) >= contact + (0.0 if fit else margin), (fit, result.point.name)
+            assert np.nanmin(result.evaluations.f_safe) >= contact + (0.0 if fit else margin), (
+                fit,
+                result.point.name,
+            )
 
 
 @pytest.mark.slow
@@ -292,7 +373,11 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
         study = made_up_study(1)
         pool = Plant(study, lambda rows: rows[:, 0] > 9, lambda rows: 8 - np.abs(rows[:, 0] - 5))
         answer = tolerance(study, pool=pool, **options)
-        return answer.numbers["unsafe"], answer.numbers["margin"], answer.tables["limits"]["alone_high"][0]
+        return (
+            answer.numbers["unsafe"],
+            answer.numbers["margin"],
+            answer.tables["limits"]["alone_high"][0],
+        )
 
     assert ends() == ("collision", 0.446, 9.0), "the error of the study's model"
     assert ends(margin=5) == ("collision", 5, 8.0)
@@ -318,4 +403,6 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
         assert answer.failures == (f"t{refusal}",), "a limit is not blamed"
         assert answer.verdict.startswith(f"T{refusal}. Demand less, with --unsafe.")
         assert answer.numbers["kept"] is False
-        assert answer.tables["limits"]["kept"].tolist() == ([False, None] if limits else [None, None])
+        assert answer.tables["limits"]["kept"].tolist() == (
+            [False, None] if limits else [None, None]
+        )

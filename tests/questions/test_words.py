@@ -54,8 +54,12 @@ def silence(patch: pytest.MonkeyPatch) -> int:
     """Replace what every function of words says by X; the number of replaced functions."""
     replaced = 0
     for name, module in list(sys.modules.items()):
-        for attribute, value in list(vars(module).items()) if name.startswith("safevar_sumo.") else ():
-            if inspect.isfunction(value) and (attribute.endswith("_in_words") or value.__module__ == words.__name__):
+        for attribute, value in (
+            list(vars(module).items()) if name.startswith("safevar_sumo.") else ()
+        ):
+            if inspect.isfunction(value) and (
+                attribute.endswith("_in_words") or value.__module__ == words.__name__
+            ):
                 said = ["X"] if "list" in str(inspect.signature(value).return_annotation) else "X"
                 patch.setattr(module, attribute, lambda *_, said=said, **__: said)
                 replaced += 1
@@ -83,7 +87,10 @@ def test_without_words_every_number_stays(
     assert silence(monkeypatch) > 20
     silent = json_of(*typed)
     assert numbers_of(silent["numbers"]) == numbers_of(said["numbers"])
-    tables = [{name: table["rows"] for name, table in answer["tables"].items()} for answer in (said, silent)]
+    tables = [
+        {name: table["rows"] for name, table in answer["tables"].items()}
+        for answer in (said, silent)
+    ]
     for table in tables:
         table.pop("remarks", None)
     assert numbers_of(tables[0]) == numbers_of(tables[1])
@@ -91,8 +98,12 @@ def test_without_words_every_number_stays(
 
 
 @pytest.mark.slow
-def test_half_of_the_originals_is_said_by_every_question(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also by one that asks another question first: nothing collides among the solutions of a short search."""
+def test_half_of_the_originals_is_said_by_every_question(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by one that asks another question first: nothing collides among the solutions of a short
+    search.
+    """
     (tmp_path / "tiny.toml").write_text(STUDY.replace("evaluations = 100", "evaluations = 60"))
     searched(load_study(str(tmp_path / "tiny.toml")), tmp_path / "results")
     monkeypatch.chdir(tmp_path)

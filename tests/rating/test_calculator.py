@@ -1,5 +1,6 @@
-"""Euro NCAP's official calculator, from PyPI, computes equal points and colours; it runs in an environment of its own,
-since it needs another version of pandas than this package, and reads two spreadsheets.
+"""Euro NCAP's official calculator, from PyPI, computes equal points and colours; it runs in an
+environment of its own, since it needs another version of pandas than this package, and reads two
+spreadsheets.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from safevar_sumo.records import CellResults
 pytestmark = pytest.mark.slow
 PROTOCOL = protocol_of(EURO_NCAP_2026)
 N = len(PROTOCOL.cells)
-CLAIMS = {"CCRs": ["Driver input pre-crash", "Illumination (Sun glare)"], "CPNCO": ["Driver input pre-crash", "Type"]}
+CLAIMS = {
+    "CCRs": ["Driver input pre-crash", "Illumination (Sun glare)"],
+    "CPNCO": ["Driver input pre-crash", "Type"],
+}
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +40,11 @@ def template(calculator: Calculator, tmp_path_factory: pytest.TempPathFactory) -
     return calculator.template(tmp_path_factory.mktemp("template"))
 
 
-def agrees(rater: Rater, cells: CellResults, calculator: Calculator, template: Path, place: Path) -> None:
-    """Asserts that the calculator's points of every simulated test and its colour of every cell that it draws equal
-    this package's.
+def agrees(
+    rater: Rater, cells: CellResults, calculator: Calculator, template: Path, place: Path
+) -> None:
+    """Asserts that the calculator's points of every simulated test and its colour of every cell
+    that it draws equal this package's.
     """
     place.mkdir(exist_ok=True)
     fill_template(template, place / "predicted.xlsx", rater, cells)
@@ -67,18 +73,28 @@ def test_the_protocols_data_is_what_the_calculator_has(calculator: Calculator) -
 def test_vehicles_with_any_colours_score_alike(
     seed: int, calculator: Calculator, template: Path, tmp_path: Path
 ) -> None:
-    """Colours at random, with speeds that round to a bound; layers as their cells or at random, some claimed."""
+    """Colours at random, with speeds that round to a bound; layers as their cells or at random,
+    some claimed.
+    """
     rng = np.random.default_rng(seed)
     speeds = rng.choice([0.004, 5, 9.996, 10, 15, 20, 25, 30, 40], (1, N))
     impact = np.where(rng.random((1, N)) < rng.choice([0.1, 0.3, 0.7]), speeds, np.nan)
     if seed:
         impact[
-            :, [k for k, cell in enumerate(PROTOCOL.cells) if cell.matrix.test_name == "CCRs" and cell.vut_speed <= 20]
+            :,
+            [
+                k
+                for k, cell in enumerate(PROTOCOL.cells)
+                if cell.matrix.test_name == "CCRs" and cell.vut_speed <= 20
+            ],
         ] = np.nan
     warning = np.where(rng.random((1, N)) < 0.7, 1.9, rng.choice([np.nan, 1.2, 1.696], (1, N)))
     nominal = list(range(N))
     if seed % 2:
-        nominal = [PROTOCOL.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column] for cell in PROTOCOL.cells]
+        nominal = [
+            PROTOCOL.matrix_cell_numbers[cell.matrix.name, cell.row, cell.column]
+            for cell in PROTOCOL.cells
+        ]
     cells, claims = (
         CellResults(impact[:, nominal], warning[:, nominal], np.ones((1, N), dtype=bool)),
         CLAIMS if seed % 3 else {},
@@ -101,14 +117,18 @@ class Calculator:
 
     @classmethod
     def built(cls, folder: Path) -> Calculator:
-        """Install the calculator from PyPI, in the version from which the protocol's data was derived."""
+        """Install the calculator from PyPI, in the version from which the protocol's data was
+        derived.
+        """
         if os.environ.get(ENVIRONMENT):
             return cls(Path(os.environ[ENVIRONMENT]))
         venv.create(folder, with_pip=True)
         calculator = cls(folder)
         version = protocol_of(EURO_NCAP_2026).calculator_version
         packages = [f"euroncap-rating-2026=={version}", "pandas<3"]
-        subprocess.run([calculator.python, "-m", "pip", "install", "-q", *packages], check=True, timeout=900)
+        subprocess.run(
+            [calculator.python, "-m", "pip", "install", "-q", *packages], check=True, timeout=900
+        )
         return calculator
 
     def run(self, command: str, place: Path, *options: str) -> str:
@@ -135,7 +155,9 @@ class Calculator:
     def derived(self) -> str:
         """Derive the protocol's data again."""
         script = Path(__file__).parents[2] / "calibration/euro_ncap.py"
-        return subprocess.run([self.python, script], capture_output=True, text=True, check=True, timeout=300).stdout
+        return subprocess.run(
+            [self.python, script], capture_output=True, text=True, check=True, timeout=300
+        ).stdout
 
 
 class CalculatorScores:
@@ -155,11 +177,19 @@ class CalculatorScores:
                 if "Test point" in values:
                     heads = values
                 elif heads and values[heads.index("Test point")]:
-                    self.verified.append({str(head): value for head, value in zip(heads, values, strict=True) if head})
+                    self.verified.append(
+                        {
+                            str(head): value
+                            for head, value in zip(heads, values, strict=True)
+                            if head
+                        }
+                    )
 
 
 def fill_template(template: Path, output: Path, rater: Rater, results: CellResults) -> None:
-    """Write a vehicle's colours, rows' functions, layers that hold or are claimed, and self-claimed tests."""
+    """Write a vehicle's colours, rows' functions, layers that hold or are claimed, and self-claimed
+    tests.
+    """
     book, protocol, scores = openpyxl.load_workbook(template), rater.protocol, rater.points(results)
     for (_, row, column), number in protocol.matrix_cell_numbers.items():
         matrix = protocol.cells[number].matrix
@@ -183,10 +213,15 @@ def fill_template(template: Path, output: Path, rater: Rater, results: CellResul
 
 
 def fill_drawn_cells(preprocessed: Path, output: Path, rater: Rater, results: CellResults) -> None:
-    """Write each drawn cell's simulated value and, if a variation is drawn with it, whether that passes."""
+    """Write each drawn cell's simulated value and, if a variation is drawn with it, whether that
+    passes.
+    """
     book, protocol = openpyxl.load_workbook(preprocessed), rater.protocol
     passes = passing_cells(protocol, rater.points(results).colours)[0]
-    numbers, matrices = {cell.name: number for number, cell in enumerate(protocol.cells)}, protocol.matrices
+    numbers, matrices = (
+        {cell.name: number for number, cell in enumerate(protocol.cells)},
+        protocol.matrices,
+    )
     for sheet in dict.fromkeys(matrix.sheet.removesuffix("pred.") for matrix in matrices):
         headings = []
         for row in book[f"{sheet}verif."].iter_rows():
@@ -196,15 +231,24 @@ def fill_drawn_cells(preprocessed: Path, output: Path, rater: Rater, results: Ce
                 continue
             cells = dict(zip(headings, row, strict=False))
             texts = dict(zip(headings, values, strict=False))
-            if texts.get("Scenario") not in {matrix.name for matrix in matrices} or not texts["Test point"]:
+            if (
+                texts.get("Scenario") not in {matrix.name for matrix in matrices}
+                or not texts["Test point"]
+            ):
                 continue
-            number = protocol.matrix_cell_numbers[texts["Scenario"], *map(int, re.findall(r"\d+", texts["Test point"]))]
+            number = protocol.matrix_cell_numbers[
+                texts["Scenario"], *map(int, re.findall(r"\d+", texts["Test point"]))
+            ]
             # 0 km/h without an impact; 0 s without a warning.
-            of_kind = results.warning if protocol.cells[number].judged_by == WARNING else results.impact
+            of_kind = (
+                results.warning if protocol.cells[number].judged_by == WARNING else results.impact
+            )
             measured = np.maximum(np.nan_to_num(of_kind[0, number]), 0.0)
             cells["Value"].value = float(round_half_up(measured, DECIMALS))
             if "Verification condition" in cells and "Robustness" in cells:
-                layer, condition = (cells[name].value for name in ("Robustness layer", "Verification condition"))
+                layer, condition = (
+                    cells[name].value for name in ("Robustness layer", "Verification condition")
+                )
                 varied = numbers.get(f"{protocol.cells[number].name}, {layer} {condition}")
                 if varied is not None:
                     cells["Robustness"].value = "PASS" if passes[varied] else "FAIL"

@@ -1,4 +1,6 @@
-"""Colours and points against the protocol's tables; a worse vehicle never earns more; equal losses."""
+"""Colours and points against the protocol's tables; a worse vehicle never earns more; equal
+losses.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ BANDS = {
     50: [0.01, 10, 20, 30],
     130: [0.01, 10, 20, 30],
 }
-"""From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle (protocol 5.2); one
-number: red alone.
+"""From which relative speed on a cell is yellow, orange, brown, red, by the speed of the vehicle
+(protocol 5.2); one number: red alone.
 """
 
 
@@ -68,15 +70,20 @@ def test_a_bound_belongs_to_the_worse_colour(vut: int) -> None:
 
 
 def test_a_warning_is_green_from_1_7_s_and_measured_values_have_two_decimals() -> None:
-    (row,) = {CELLS[k].row for k in numbers("CBLA") if CELLS[k].judged_by == "warning" and CELLS[k].vut_speed == 70}
+    (row,) = {
+        CELLS[k].row
+        for k in numbers("CBLA")
+        if CELLS[k].judged_by == "warning" and CELLS[k].vut_speed == 70
+    }
     number = next(k for k in numbers("CBLA", "standard") if CELLS[k].row == row)
     shown = [
-        COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]] for warning in (1.7, 1.695, 1.694, np.nan)
+        COLOURS[colours_of(PROTOCOL, results(50.0, warning))[0, number]]
+        for warning in (1.7, 1.695, 1.694, np.nan)
     ]
     assert shown == ["green", "green", "red", "red"]
 
 
-def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_that_never_brakes_none() -> None:
+def test_avoiding_every_impact_earns_all_simulated_points_and_never_braking_none() -> None:
     whole = points_of(
         results(vehicles=2),
         {
@@ -89,7 +96,9 @@ def test_a_vehicle_that_avoids_every_impact_earns_all_simulated_points_and_one_t
     assert points_of(results(60.0, np.nan)).total.tolist() == [0.0]
 
 
-@pytest.mark.parametrize(("good", "share"), [(16, 1), (15, 0.75), (12, 0.75), (11, 0.5), (8, 0.5), (7, 0)])
+@pytest.mark.parametrize(
+    ("good", "share"), [(16, 1), (15, 0.75), (12, 0.75), (11, 0.5), (8, 0.5), (7, 0)]
+)
 def test_the_extended_range_is_stepped(good: int, share: float) -> None:
     impact, extended = np.full(N, np.nan), numbers("CMRs", "extended")
     assert len(extended) == 16
@@ -100,15 +109,17 @@ def test_the_extended_range_is_stepped(good: int, share: float) -> None:
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.5, 40))
 def test_faster_impacts_never_gain_points_in_a_matrix(seed: int, share: float, more: float) -> None:
-    """Where a layer asks for the colour of its cell or better, a cell that turns worse lowers what the layer must
-    reach.
+    """Where a layer asks for the colour of its cell or better, a cell that turns worse lowers what
+    the layer must reach.
     """
     rng = np.random.default_rng(seed)
     impact = np.where(rng.random(N) < share, rng.uniform(0, 45, N), np.nan)
     worse = np.where(rng.random(N) < 0.3, np.nan_to_num(impact, nan=0.0) + more, impact)
     before, after = points_of(results(impact)), points_of(results(worse))
     for name in before.tests:
-        assert (after.tests[name][0, :2] <= before.tests[name][0, :2] + 1e-12).all() or before.fails[0]
+        assert (
+            after.tests[name][0, :2] <= before.tests[name][0, :2] + 1e-12
+        ).all() or before.fails[0]
         assert not after.fails[0] or (after.tests[name] == 0).all()
 
 
@@ -124,9 +135,19 @@ def test_a_weather_by_night_keeps_its_road_and_multiplies_both_visibilities() ->
 def answer_about(*impacts: Any, claims: dict[str, list[str]] | None = None) -> Answer:
     """The answer about the original and a variant with worn tyres, from the impacts of both."""
     characteristics = CharacteristicSet.of(STUDY)
-    vehicles = {"original": characteristics.original, "variant": characteristics.setting({"treadDepth": 3.0})}
-    cells = CellResults(*(np.concatenate(values) for values in zip(*map(results, impacts), strict=True)))
-    return rate(STUDY, Rater(protocol=PROTOCOL, claims=claims or {}), dict([*vehicles.items()][: len(impacts)]), cells)
+    vehicles = {
+        "original": characteristics.original,
+        "variant": characteristics.setting({"treadDepth": 3.0}),
+    }
+    cells = CellResults(
+        *(np.concatenate(values) for values in zip(*map(results, impacts), strict=True))
+    )
+    return rate(
+        STUDY,
+        Rater(protocol=PROTOCOL, claims=claims or {}),
+        dict([*vehicles.items()][: len(impacts)]),
+        cells,
+    )
 
 
 def hits(cells: list[int], speed: float) -> Any:
@@ -137,13 +158,19 @@ def hits(cells: list[int], speed: float) -> Any:
 
 def test_a_claim_is_shown_as_a_claim() -> None:
     table = answer_about(np.nan, claims={"CPNA": ["Type"]}).tables["tests"]
-    assert table.set_index("test")["claimed_layers"].dropna().to_dict() == {"CPNA day": "Type", "CPNA night": "Type"}
+    assert table.set_index("test")["claimed_layers"].dropna().to_dict() == {
+        "CPNA day": "Type",
+        "CPNA night": "Type",
+    }
 
 
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     answer = answer_about(np.nan, hits(numbers("CPNCO", "standard", "night"), 40.0))
     assert answer.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
-    assert " of them in CPNCO night. Euro NCAP tests on a dry road; this rating has the weather" in answer.verdict
+    assert (
+        " of them in CPNCO night. Euro NCAP tests on a dry road; this rating has the weather"
+        in answer.verdict
+    )
     equal = answer_about(np.nan, hits(numbers("CBNA") + numbers("CBFA"), 60.0))
     assert " of them in each of CBNA and CBFA." in equal.verdict
 
@@ -166,7 +193,9 @@ def test_numbers_and_tables_say_the_same() -> None:
 
 
 def test_what_costs_everything_and_what_the_calculator_does_not_check_is_remarked() -> None:
-    answer = answer_about(hits(numbers("CCRs", "standard"), 9.0), hits(numbers("CPNA", "standard"), 9.0))
+    answer = answer_about(
+        hits(numbers("CCRs", "standard"), 9.0), hits(numbers("CPNA", "standard"), 9.0)
+    )
     remarks = answer.tables["vehicles"]["remark"]
     assert "earns nothing" in remarks[0]
     assert "does not check this" in remarks[1]

@@ -1,5 +1,5 @@
-"""Tolerance, explain, report and the summary of a rated study, in a protocol of two matrices, computed in this
-process.
+"""Tolerance, explain, report and the summary of a rated study, in a protocol of two matrices,
+computed in this process.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def test_what_is_shipped_passes_the_check() -> None:
 @pytest.mark.slow
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
-    answer = tolerance.compute(STUDY, evaluator, characteristics=("brakeTorque",), unsafe="points=4.0")
+    answer = tolerance.compute(
+        STUDY, evaluator, characteristics=("brakeTorque",), unsafe="points=4.0"
+    )
     column = list(evaluator.characteristics.names).index("brakeTorque")
     (alone,) = scan(evaluator, [column], Unsafe(points=4.0))
     points = alone.profile.set_index("value")["rating_points"]
@@ -77,31 +79,44 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_explain_names_the_cells_of_a_worse_colour_and_the_end_of_a_study_the_points_that_are_kept() -> None:
+def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     members = evaluator.characteristics
-    settings = np.array([members.setting({"brakeTorque": value, "payload": 200.0}) for value in (0.5, 0.6)])
+    settings = np.array(
+        [members.setting({"brakeTorque": value, "payload": 200.0}) for value in (0.5, 0.6)]
+    )
     original, evaluations = evaluator.evaluate_original(), evaluator.evaluate(settings, "it")
     case = case_of(STUDY, original, evaluations)
     points = float(original.column("rating_points")[0])
     assert points > evaluations.column("rating_points")[1]
-    answer = explain.compute(case, evaluator, solution=("nsga2:0:0",), unsafe=f"points={points - 1e-3}")
+    answer = explain.compute(
+        case, evaluator, solution=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"
+    )
     (failure,) = answer.tables["solutions"].to_dict("records")
     assert failure["points"]
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure["points"])
     assert [sorted(changes) for changes in answer.tables["causes"]["changes"]] == [["brakeTorque"]]
-    assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [None] * 3
+    assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [
+        None
+    ] * 3
     results = SimpleNamespace(case=case, study=case.study, original=record(original, row=0))
     verdict = _verdict(results, case, assemble(case.study))
-    kept = evaluations.column("rating_points")[case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]]
+    kept = evaluations.column("rating_points")[
+        case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]
+    ]
     assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither cells of a better colour nor cells of an unknown colour, of either vehicle, count as worse."""
+    """Neither cells of a better colour nor cells of an unknown colour, of either vehicle, count as
+    worse.
+    """
     evaluator, matrix = Evaluator(STUDY, InlinePool(2)), assemble(STUDY).matrix
     colours = np.zeros((2, len(matrix)), dtype=np.int8)
-    colours[:, :5] = [[0, 2, -1, 1, 0], [1, 0, 4, -1, 3]]  # worse, better, unknown before, unknown after, worst
+    colours[:, :5] = [
+        [0, 2, -1, 1, 0],
+        [1, 0, 4, -1, 3],
+    ]  # worse, better, unknown before, unknown after, worst
     monkeypatch.setattr(Evaluator, "at_each_point", lambda self, settings, stage: None)
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
     original = evaluator.characteristics.original[np.newaxis]
@@ -129,13 +144,17 @@ def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
 def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -> None:
     """`repair` alone refuses a rated study, whatever the criterion."""
     criterion = ("--unsafe", "rating_points < 2.2")
-    study = 'extends = "euro_ncap_rating"\nname = "rated"\n[search]\npopulation = 8\nevaluations = 32\n'
+    study = (
+        'extends = "euro_ncap_rating"\nname = "rated"\n[search]\npopulation = 8\nevaluations = 32\n'
+    )
     Path("rated.toml").write_text(study)
     studied = json_of("study", "rated.toml", "--out", "results", "--quiet", *criterion)
     solutions = sv.load("results").solutions
     count = (solutions["rating_points"] < 2.2).sum()
     assert count > 0
-    assert studied["verdict"].startswith(f"{count} of {len(solutions)} different solutions are unsafe")
+    assert studied["verdict"].startswith(
+        f"{count} of {len(solutions)} different solutions are unsafe"
+    )
     found = {}
     for typed in (
         ("risk", "rated.toml", "--samples", "64"),
@@ -148,17 +167,33 @@ def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -
         assert answer["numbers"]["unsafe"] == "rating_points < 2.2", typed
     assert 0 < found["risk"]["numbers"]["failures"] == found["rules"]["numbers"]["failures"] < 64
     assert found["explain"]["numbers"]["failures"] == count
-    (solution, *_), (cause, *_) = (found["explain"]["tables"][name]["rows"] for name in ("solutions", "causes"))
+    (solution, *_), (cause, *_) = (
+        found["explain"]["tables"][name]["rows"] for name in ("solutions", "causes")
+    )
     assert solution["points"]
-    changes = [cause["changes"], {name: cause["changes"][name] for name in list(cause["changes"])[1:]}]
+    changes = [
+        cause["changes"],
+        {name: cause["changes"][name] for name in list(cause["changes"])[1:]},
+    ]
     failed, without = sv.evaluate("rated.toml", changes, filtered=False, jobs=1)["rating_points"]
     assert failed < 2.2 <= without, "each change of a cause is needed"
     (limit,) = found["tolerance"]["tables"]["limits"]["rows"]
     cars = [{"treadDepth": value} for value in (limit["alone_low"], limit["alone_high"])]
     assert (sv.evaluate("rated.toml", cars, filtered=False, jobs=1)["rating_points"] >= 2.2).all()
-    assert found["compare"]["numbers"]["only_a_unsafe"] == found["compare"]["numbers"]["only_b_unsafe"] == 0
+    assert (
+        found["compare"]["numbers"]["only_a_unsafe"]
+        == found["compare"]["numbers"]["only_b_unsafe"]
+        == 0
+    )
     assert found["compare"]["numbers"]["both"] > 0
-    refused("repair", "rated.toml", "--promise", "treadDepth >= 7", *criterion, message=("'rated' is rated",))
+    refused(
+        "repair",
+        "rated.toml",
+        "--promise",
+        "treadDepth >= 7",
+        *criterion,
+        message=("'rated' is rated",),
+    )
     run("report", "results", "--out", "page.html", "--ask", "rules --samples 64", *criterion)
     assert "--unsafe &#39;rating_points &lt; 2.2&#39;" in Path("page.html").read_text()
     run("evidence", "results", "--out", "pack.zip", "--ask", "rules --samples 64", *criterion)
@@ -169,4 +204,6 @@ def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -
 @pytest.mark.slow
 def test_a_rating_begins_with_the_reason_and_a_robot_drives_who_does_nothing(still: str) -> None:
     rated = json_of("rating", still)
-    assert rated["numbers"]["driven"] is (rated["numbers"]["points"] == 0)  # 0 points: everything collides
+    assert rated["numbers"]["driven"] is (
+        rated["numbers"]["points"] == 0
+    )  # 0 points: everything collides

@@ -10,7 +10,12 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
-from safevar_sumo.reference.agreement import count_collisions, measure_agreement, rank_correlation, shipped_agreement
+from safevar_sumo.reference.agreement import (
+    count_collisions,
+    measure_agreement,
+    rank_correlation,
+    shipped_agreement,
+)
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
@@ -25,7 +30,12 @@ ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
     values = np.array(safety)
     tet_values = np.where(values <= 0, np.nan, np.array(tet))
-    metrics = {"safety_degree": values, "tet": tet_values, "tit": tet_values, "ave_dece": values * np.nan}
+    metrics = {
+        "safety_degree": values,
+        "tet": tet_values,
+        "tit": tet_values,
+        "ave_dece": values * np.nan,
+    }
     return ReferenceData(np.linspace(1, 9, len(values))[:, np.newaxis], metrics)
 
 
@@ -37,18 +47,27 @@ def here(safety: list[float], tet: list[float]) -> Evaluations:
 
 def test_every_number_is_what_it_says() -> None:
     there = reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0])
-    table = measure_agreement(there, here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0])).set_index("metric")
+    table = measure_agreement(there, here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0])).set_index(
+        "metric"
+    )
     degrees = table.loc["safety_degree"]
     assert degrees["mean_absolute_error"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
     assert degrees["bias"] == pytest.approx((0.5 + 0 - 1 + 2) / 4)
-    assert table.loc["tet", "bias"] == pytest.approx((0.1 + 0 - 0.2) / 3), "over rows without collision on either side"
+    assert table.loc["tet", "bias"] == pytest.approx((0.1 + 0 - 0.2) / 3), (
+        "over rows without collision on either side"
+    )
     assert table.loc["ave_dece"].drop("unit").isna().all()
 
 
 def test_collisions_are_counted_on_each_side_and_on_both() -> None:
     there = reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6)
     counts = count_collisions(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6))
-    assert counts == {"rows": 6, "collisions_here": 4, "collisions_reference": 4, "collisions_both": 3}
+    assert counts == {
+        "rows": 6,
+        "collisions_here": 4,
+        "collisions_reference": 4,
+        "collisions_both": 3,
+    }
 
 
 def test_a_study_that_simulates_alike_shares_the_shipped_agreement() -> None:
@@ -111,17 +130,23 @@ def table(characteristics: CharacteristicSet, columns: list[str]) -> pd.DataFram
     )
 
 
-@pytest.mark.parametrize(("characteristics", "columns"), [(SUN, SUN_COLUMNS), (LGSVL, LGSVL_COLUMNS)])
+@pytest.mark.parametrize(
+    ("characteristics", "columns"), [(SUN, SUN_COLUMNS), (LGSVL, LGSVL_COLUMNS)]
+)
 def test_both_published_formats_are_read(
     tmp_path: Path, characteristics: CharacteristicSet, columns: list[str]
 ) -> None:
-    """The lgsvl files have negative decelerations. A row outside the domains is counted and left out."""
+    """The lgsvl files have negative decelerations. A row outside the domains is counted and left
+    out.
+    """
     frame = table(characteristics, columns).assign(Dece=[-5.0, -3.0, -6.0])
     frame.loc[0, columns[0]] = characteristics.lower[0]
     frame.loc[3] = frame.loc[0]
     frame.loc[3, "mass"] = 1e6
     frame.to_csv(tmp_path / "data.csv", index=False)
-    with pytest.warns(UserWarning, match="data.csv: 1 rows with values outside the domains are left out"):
+    with pytest.warns(
+        UserWarning, match="data.csv: 1 rows with values outside the domains are left out"
+    ):
         data = read_reference(tmp_path / "data.csv", characteristics)
     assert data.settings[0].tolist() == [characteristics.lower[0], *characteristics.original[1:]]
     assert data.metrics["safety_degree"].tolist() == [2.5, -1.5, 3.0]
@@ -137,11 +162,21 @@ PUBLISHED_HEADER = ",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"])
     ("text", "expected"),
     [
         ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
-        (",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n", "lacks the columns SaftyDegree, TET, TIT"),
+        (
+            ",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n",
+            "lacks the columns SaftyDegree, TET, TIT",
+        ),
         ("mass,radius\n1,2\n1,2,3\n", "is not CSV: .*line 3"),
         *(
-            (f"{PUBLISHED_HEADER},{name}\n{','.join(['1'] * 16)}\n", f"more than one column for {column}\n")
-            for name, column in (("Mass", "Mass"), ("SaftyDegree", "SaftyDegree"), ("radius ", "radius"))
+            (
+                f"{PUBLISHED_HEADER},{name}\n{','.join(['1'] * 16)}\n",
+                f"more than one column for {column}\n",
+            )
+            for name, column in (
+                ("Mass", "Mass"),
+                ("SaftyDegree", "SaftyDegree"),
+                ("radius ", "radius"),
+            )
         ),
     ],
 )
@@ -151,8 +186,12 @@ def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected
         read_reference(tmp_path / "data.csv", SUN)
 
 
-@pytest.mark.parametrize(("column", "cell"), [("mass", "heavy"), ("mass", "inf"), ("TET", "-5"), ("Dece", "1e9")])
-def test_a_cell_that_cannot_be_used_is_told_with_row_and_column(tmp_path: Path, column: str, cell: str) -> None:
+@pytest.mark.parametrize(
+    ("column", "cell"), [("mass", "heavy"), ("mass", "inf"), ("TET", "-5"), ("Dece", "1e9")]
+)
+def test_a_cell_that_cannot_be_used_is_told_with_row_and_column(
+    tmp_path: Path, column: str, cell: str
+) -> None:
     """By its line in the file, though lines are blank."""
     frame = table(SUN, SUN_COLUMNS)
     frame.loc[1, column] = cell
@@ -171,7 +210,8 @@ PUBLISHED_EFFECTS = {
     "max_rpm": 0.2,
     "dampRateZeroT_CD": 0.2,
 }
-"""Linear effect on the safety degree over a whole domain in the published random search in sun [m]."""
+"""Linear effect on the safety degree over a whole domain in the published random search in sun [m].
+"""
 
 
 @pytest.mark.parametrize(
@@ -182,7 +222,9 @@ PUBLISHED_EFFECTS = {
         ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05}),
     ],
 )
-def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: str, within: dict[str, float]) -> None:
+def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(
+    study: str, within: dict[str, float]
+) -> None:
     """Rain's published vehicle is one simulation, 0.3 to 0.4 m above its own neighbours."""
     read = load_study(study)
     system = assemble(read)
@@ -194,13 +236,15 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(study: 
 
 @pytest.mark.parametrize("study", ["sun", "rain"])
 def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None:
-    """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of what saturates or comes
-    together.
+    """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of
+    what saturates or comes together.
     """
     system = assemble(load_study(study))
     characteristics = system.characteristics
     width = characteristics.upper - characteristics.lower
-    settings = np.random.default_rng(14).uniform(characteristics.lower, characteristics.upper, (150, len(width)))
+    settings = np.random.default_rng(14).uniform(
+        characteristics.lower, characteristics.upper, (150, len(width))
+    )
     effects = np.array([PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names])
     here = score(system, settings, simulate(system, settings)).f_safe
     assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) > 0.55

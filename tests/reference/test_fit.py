@@ -1,5 +1,5 @@
-"""The script that fits studies to published rows: its loss, its space, and a search that improves a planted parameter;
-and the uncertainty that parameter sets make of a setting.
+"""The script that fits studies to published rows: its loss, its space, and a search that improves a
+planted parameter; and the uncertainty that parameter sets make of a setting.
 """
 
 from __future__ import annotations
@@ -14,7 +14,12 @@ import pytest
 from calibration import fit
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.model_spread import compute_model_spreads, prediction_band, value_of, with_values
+from safevar_sumo.questions.model_spread import (
+    compute_model_spreads,
+    prediction_band,
+    value_of,
+    with_values,
+)
 from safevar_sumo.questions.tolerance import scans, tolerance
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study, load_study
@@ -32,7 +37,9 @@ PLANS = sorted((Path(fit.__file__).parent).glob("*.toml"))
 def data() -> ReferenceData:
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
-    settings = np.random.default_rng(3).uniform(characteristics.lower, characteristics.upper, (24, 12))
+    settings = np.random.default_rng(3).uniform(
+        characteristics.lower, characteristics.upper, (24, 12)
+    )
     return ReferenceData(settings, dict(evaluate(system, settings).metrics))
 
 
@@ -41,18 +48,36 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
     data: ReferenceData, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From a gap of 8 m towards the 6.9 m that the rows were made with."""
-    Path("mine.toml").write_text('extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n')
+    Path("mine.toml").write_text(
+        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
+    )
     Path("plan.toml").write_text(
         "population = 4\nhold_out = 4\ntolerance = 0.045\n[[parameters]]\n"
         f'key = "{GAP}"\nlower = 6\nupper = 12\nunit = "m"\nmeaning = "gap"\n'
-        '[studies."mine.toml"]\nfiles = ["rows.csv"]\noriginal = 1.0\nrank = 5.0\ncollisions = 10.0\n'
+        '[studies."mine.toml"]\nfiles = ["rows.csv"]\noriginal = 1.0\nrank = 5.0\ncollisions ='
+        " 10.0\n"
         "weights = { safety_degree = 1.0 }\n"
     )
     names = load_study("sun").vehicle.characteristics
     columns = {column: np.nan_to_num(data.metrics[name]) for name, column in COLUMNS.items()}
-    pd.DataFrame(data.settings, columns=list(names)).assign(**columns).to_csv("rows.csv", index=False)
+    pd.DataFrame(data.settings, columns=list(names)).assign(**columns).to_csv(
+        "rows.csv", index=False
+    )
     for seed, number in (("1", "13"), ("2", "5")):
-        fit.main(["plan.toml", ".", "--log", "log.csv", "--trials", number, "--seed", seed, "--jobs", "1"])
+        fit.main(
+            [
+                "plan.toml",
+                ".",
+                "--log",
+                "log.csv",
+                "--trials",
+                number,
+                "--seed",
+                seed,
+                "--jobs",
+                "1",
+            ]
+        )
     trials = pd.read_csv("log.csv")
     assert list(trials) == ["loss", GAP]
     assert len(trials) == (1 + 12) + (1 + 4), "the study's own values, and whole generations"
@@ -69,11 +94,17 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
 def test_a_plan_has_the_values_of_its_studies_within_its_bounds(path: Path) -> None:
     plan = msgspec.toml.decode(path.read_bytes(), type=fit.Plan)
     values = fit.Fit(plan, {name: load_study(name) for name in plan.studies}, {}).own_values()
-    assert all(row.lower <= value <= row.upper for row, value in zip(plan.parameters, values, strict=True))
+    assert all(
+        row.lower <= value <= row.upper for row, value in zip(plan.parameters, values, strict=True)
+    )
 
 
-def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(data: ReferenceData) -> None:
-    """All of the loss is sum(w error / repeatability): a repeatability of 2 halves what one of 1 makes of it."""
+def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
+    data: ReferenceData,
+) -> None:
+    """All of the loss is sum(w error / repeatability): a repeatability of 2 halves what one of 1
+    makes of it.
+    """
     nearer = with_values(load_study("sun"), {GAP: 0.8 * OWN})
     here = evaluate(assemble(nearer), data.settings)
     error = np.abs(here.f_safe - data.metrics["safety_degree"]).mean()
@@ -86,7 +117,9 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     here = made_up_evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12)))
     collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
     loss = fit.loss_of_file(there, here, nearer, collisions)
-    assert loss == pytest.approx(6 * 2 / 6), "four there and four here, three of them the same: two rows of six differ"
+    assert loss == pytest.approx(6 * 2 / 6), (
+        "four there and four here, three of them the same: two rows of six differ"
+    )
 
 
 def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
@@ -103,14 +136,20 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
 
 
 def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: ReferenceData) -> None:
-    """Rows of one file lie in the middle of the band, those of the other beyond it: 1 to 24 distances from the
-    original, at least 0.3.
+    """Rows of one file lie in the middle of the band, those of the other beyond it: 1 to 24
+    distances from the original, at least 0.3.
     """
     sets = {GAP: [value_of(load_study("sun"), GAP)] * 2}
-    study = msgspec.structs.replace(load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9})
+    study = msgspec.structs.replace(
+        load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9}
+    )
     ch = assemble(study).characteristics
-    away = np.maximum(np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)), 0.3)
-    far = data._replace(metrics={"safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)})
+    away = np.maximum(
+        np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)), 0.3
+    )
+    far = data._replace(
+        metrics={"safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)}
+    )
     # Of 24 rows the 23rd: ceil(0.9 * 25); another file without a miss changes nothing.
     assert fit.model_error(study, [far]) == pytest.approx(23, abs=1e-6)
     assert fit.model_error(study, [data, far]) == pytest.approx(23, abs=1e-6)
@@ -118,17 +157,23 @@ def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: Refe
 
 
 def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
-    lower, upper = prediction_band(np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1)
+    lower, upper = prediction_band(
+        np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1
+    )
     assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
     assert np.isnan([lower[1], upper[1]]).all()
 
 
-def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> None:
-    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras. The original counts as
-    0.3 away.
+def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> (
+    None
+):
+    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras.
+    The original counts as 0.3 away.
     """
     sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
-    bare, study = (load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4}))
+    bare, study = (
+        load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4})
+    )
     ch = assemble(study).characteristics
     settings = np.stack([ch.original, ch.original])
     for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
@@ -142,12 +187,17 @@ def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_origin
     ):
         assert here.lower is not None
         assert here.upper is not None
-        assert (wide.lower, wide.upper) == pytest.approx((here.lower - more, here.upper + more), abs=1e-9)
+        assert (wide.lower, wide.upper) == pytest.approx(
+            (here.lower - more, here.upper + more), abs=1e-9
+        )
 
 
 def test_the_sets_are_simulated_one_by_one() -> None:
     study = load_study(
-        "sun", spread={GAP: [OWN, OWN - 1, OWN + 1]}, repeatability={"safety_degree": 1e-9}, model_error={}
+        "sun",
+        spread={GAP: [OWN, OWN - 1, OWN + 1]},
+        repeatability={"safety_degree": 1e-9},
+        model_error={},
     )
     setting = assemble(study).characteristics.setting({"tireFric": 1.3})[np.newaxis]
     alone = [
@@ -156,7 +206,9 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     ]
     (band,) = compute_model_spreads(study, setting)
     degrees = [float(one.f_safe[0]) for one in alone]
-    assert (band.lower, band.upper) == pytest.approx(np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6)
+    assert (band.lower, band.upper) == pytest.approx(
+        np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6
+    )
     assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
 
 
@@ -183,7 +235,9 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.M
     asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
     answer = tolerance(study, **asked, attack=200)
     (row,) = answer.to_dict()["tables"]["limits"]["rows"]
-    assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, "the strictest fit decides, rounded to the safe side"
+    assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, (
+        "the strictest fit decides, rounded to the safe side"
+    )
     states = answer.tables["fits"].set_index("fit")["specified"]
     assert {*states[np.isfinite(of_each)]} == {"kept"}
     assert answer.numbers["fits"] == np.isfinite(of_each).sum()

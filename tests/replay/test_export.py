@@ -1,4 +1,6 @@
-"""Exported solutions: second libraries read the same places, lanes and values as the simulation has."""
+"""Exported solutions: second libraries read the same places, lanes and values as the simulation
+has.
+"""
 
 from __future__ import annotations
 
@@ -52,15 +54,22 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
     solutions = made_up_evaluations(
         [1.0], settings=setting[np.newaxis], metrics={"safety_degree": np.array([1.0]), **undefined}
     )
-    write_imported(folder / "results", study, {"made": solutions}, {"safety_degree": 1.0}, {"made": "made.csv"})
+    write_imported(
+        folder / "results", study, {"made": solutions}, {"safety_degree": 1.0}, {"made": "made.csv"}
+    )
     return folder / "results", system, setting
 
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(name, marks=() if name == "lead_vehicle_stopped" else pytest.mark.slow) for name in SCENES],
+    params=[
+        pytest.param(name, marks=() if name == "lead_vehicle_stopped" else pytest.mark.slow)
+        for name in SCENES
+    ],
 )
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
+def exported(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Comparison]:
     study, point = SCENES[request.param]
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out = results.with_name("out")
@@ -68,12 +77,18 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     done = run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
     (results / "printed.txt").write_text(done.stdout)
     there = assemble(at_point(load_study(study), point)) if point else system
-    return out, comparison_of(simulate_with_original(load_study(study), there, setting, filtered=False))
+    return out, comparison_of(
+        simulate_with_original(load_study(study), there, setting, filtered=False)
+    )
 
 
-def test_export_says_that_no_study_takes_a_file_in_which_ego_stands(exported: tuple[Path, Comparison]) -> None:
+def test_export_says_that_no_study_takes_a_file_in_which_ego_stands(
+    exported: tuple[Path, Comparison],
+) -> None:
     out, _ = exported
-    stands = "Ego starts from standstill" in out.with_name("results").joinpath("printed.txt").read_text()
+    stands = (
+        "Ego starts from standstill" in out.with_name("results").joinpath("printed.txt").read_text()
+    )
     with pytest.raises(InputError, match="Ego stands at the start") if stands else nullcontext():
         assemble(load_study("wear", scenario={"file": str(out / "scenario.xosc")}))
 
@@ -84,23 +99,33 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
     scenario = xosc.ParseOpenScenario(str(out / "scenario.xosc"))
     row = comparison.rows[-1]
     samples = slice(0, comparison.moments[row].end + 1)
-    boxes = {item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects}
+    boxes = {
+        item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects
+    }
     groups = scenario.storyboard.stories[0].acts[0].maneuvergroup
-    assert {group.actors.actors[0].entity for group in groups} == {"Ego", *comparison.tracks} - {"vut"}
+    assert {group.actors.actors[0].entity for group in groups} == {"Ego", *comparison.tracks} - {
+        "vut"
+    }
     for group in groups:
         name = group.actors.actors[0].entity
         track = comparison.tracks["vut" if name == "Ego" else name]
         box = boxes[name]
         trajectory = group.maneuvers[0].events[0].action[0].action.trajectory
         places = trajectory.shapes.positions
-        x, y, heading = (np.array([getattr(place, axis) for place in places], dtype=float) for axis in "xyh")
-        assert np.allclose(trajectory.shapes.time, comparison.runs.trace.time[samples], rtol=0, atol=1e-9)
+        x, y, heading = (
+            np.array([getattr(place, axis) for place in places], dtype=float) for axis in "xyh"
+        )
+        assert np.allclose(
+            trajectory.shapes.time, comparison.runs.trace.time[samples], rtol=0, atol=1e-9
+        )
         front = 0.0 if track.is_person else box.center.x + box.boundingbox.length / 2
         assert np.abs(x + front * np.cos(heading) - track.x[samples, row]).max() < 0.01
         assert np.abs(y + front * np.sin(heading) - track.y[samples, row]).max() < 0.01
 
 
-def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[Path, Comparison]) -> None:
+def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
+    exported: tuple[Path, Comparison],
+) -> None:
     carla = pytest.importorskip("carla")
     out, comparison = exported
     road = carla.Map("road", (out / "road.xodr").read_text())
@@ -114,7 +139,9 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(exported: tuple[P
         assert waypoint is not None
         assert waypoint.lane_type == carla.LaneType.Driving
         assert any(np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes)
-        assert np.isclose(np.cos(np.deg2rad(waypoint.transform.rotation.yaw) + heading), 1, atol=1e-3)
+        assert np.isclose(
+            np.cos(np.deg2rad(waypoint.transform.rotation.yaw) + heading), 1, atol=1e-3
+        )
 
 
 @pytest.mark.slow
@@ -122,12 +149,16 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
     if not ASAM.is_dir() and os.environ.get("SAFEVAR_ASAM") != "required":
         pytest.skip("make .venv/installed-asam installs ASAM's checks")
     out, _ = exported
-    for kind, program, file in (("xodr", "qc_opendrive", "road.xodr"), ("xosc", "qc_openscenario", "scenario.xosc")):
+    for kind, program, file in (
+        ("xodr", "qc_opendrive", "road.xodr"),
+        ("xosc", "qc_openscenario", "scenario.xosc"),
+    ):
         report = out.with_name(f"{kind}.xqar")
         config = out.with_name(f"{kind}.xml")
         config.write_text(
-            f'<Config><Param name="InputFile" value="{out / file}"/><CheckerBundle application="{kind}Bundle">'
-            f'<Param name="resultFile" value="{report}"/></CheckerBundle></Config>'
+            f'<Config><Param name="InputFile" value="{out / file}"/><CheckerBundle'
+            f' application="{kind}Bundle"><Param name="resultFile"'
+            f' value="{report}"/></CheckerBundle></Config>'
         )
         subprocess.run([ASAM / program, "-c", config], check=True, capture_output=True)
         states = re.findall(r'<Checker status="(\w+)" checkerId="(\w+)"', report.read_text())
@@ -142,7 +173,9 @@ ForCarla = tuple[Any, JsonObject, np.ndarray]
 @pytest.fixture
 def for_carla(tmp_path: Path) -> ForCarla:
     """The exported script's functions, its record, and the setting."""
-    pytest.importorskip("carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12")
+    pytest.importorskip(
+        "carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12"
+    )
     results, _, setting = results_of("rain", tmp_path)
     run("export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out"))
     script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))
@@ -157,7 +190,8 @@ def test_carla_gets_all_twelve_values_in_its_units(for_carla: ForCarla) -> None:
     physics = script.apply_values(empty, scene)
     assert len(physics.wheels) == 4
     wheel_values = [
-        [wheel.tire_friction, wheel.damping_rate, wheel.radius, wheel.max_brake_torque] for wheel in physics.wheels
+        [wheel.tire_friction, wheel.damping_rate, wheel.radius, wheel.max_brake_torque]
+        for wheel in physics.wheels
     ]
     body_values = [
         physics.max_rpm,
@@ -179,12 +213,16 @@ def test_carla_gets_pedals_places_and_walker(for_carla: ForCarla) -> None:
 
     script, scene, setting = for_carla
     comparison = comparison_of(
-        simulate_with_original(load_study("rain"), assemble(load_study("rain")), setting, filtered=False)
+        simulate_with_original(
+            load_study("rain"), assemble(load_study("rain")), setting, filtered=False
+        )
     )
     control = script.pedals(scene, 3)
     end = comparison.moments[-1].end
     assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])
-    assert script.pedals(scene, end + 9).brake == pytest.approx(comparison.runs.trace.brake[end, -1])
+    assert script.pedals(scene, end + 9).brake == pytest.approx(
+        comparison.runs.trace.brake[end, -1]
+    )
     vut, (walker,) = comparison.tracks["vut"], scene["actors"]
     start = script.place(**scene["start"])
     assert start.location.x == pytest.approx(vut.x[0, -1] - vut.length / 2)
@@ -192,7 +230,9 @@ def test_carla_gets_pedals_places_and_walker(for_carla: ForCarla) -> None:
     _, x, y, _ = walker["places"][10]
     step = script.walk(walker["places"], 10, scene["step"], carla.Location(x, -y, 0))
     assert step.speed == pytest.approx(1.8, abs=0.01)
-    assert np.sign(step.direction.y) == -np.sign(walker["places"][11][2] - y), "y points to the right in CARLA"
+    assert np.sign(step.direction.y) == -np.sign(walker["places"][11][2] - y), (
+        "y points to the right in CARLA"
+    )
 
 
 def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
@@ -204,11 +244,17 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
     walker = MagicMock()
     world = MagicMock()
     world.spawn_actor.side_effect = [vehicle, walker, MagicMock()]
-    vehicle.get_physics_control.return_value = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl()] * 4)
+    vehicle.get_physics_control.return_value = carla.VehiclePhysicsControl(
+        wheels=[carla.WheelPhysicsControl()] * 4
+    )
     vehicle.get_velocity.return_value = carla.Vector3D()
     walker.get_location.return_value = carla.Location()
     assert script.play(world, scene, None) is None
-    assert vehicle.apply_control.call_count == world.tick.call_count == len(scene["pedals"]) + script.SETTLING
+    assert (
+        vehicle.apply_control.call_count
+        == world.tick.call_count
+        == len(scene["pedals"]) + script.SETTLING
+    )
     assert walker.set_transform.call_count == len(scene["pedals"])
     assert vehicle.destroy.called
 
@@ -217,8 +263,16 @@ def test_bad_input_is_refused(tmp_path: Path) -> None:
     results, _, _ = results_of("rain", tmp_path)
     out = tmp_path / "out"
     common = ("export", str(results), "--to", "carla", "--out")
-    refused(*common, str(out), "--solution", "made:0:7", message=("there is no solution made:0:7", "expected"))
-    refused(*common, str(results), *HANDLE, message=("--out", f"{results} exists", "a new directory"))
+    refused(
+        *common,
+        str(out),
+        "--solution",
+        "made:0:7",
+        message=("there is no solution made:0:7", "expected"),
+    )
+    refused(
+        *common, str(results), *HANDLE, message=("--out", f"{results} exists", "a new directory")
+    )
     refused(*common, str(out), *HANDLE, "--point", "nowhere", message=("--point", "nowhere"))
     worn, _, _ = results_of("wear", tmp_path / "worn")
     message = ("treadDepth, brakeTorque", "no counterpart in CARLA", "--to openscenario")

@@ -1,4 +1,6 @@
-"""Solutions of a results directory are simulated again with the same results, seen from above, and animated."""
+"""Solutions of a results directory are simulated again with the same results, seen from above, and
+animated.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +34,20 @@ from safevar_sumo.sumo.system import assemble
 
 def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
     comparison = comparison_of(
-        simulate_with_original(case.study, assemble(case.study), case.characteristics.original, filtered=False)
+        simulate_with_original(
+            case.study, assemble(case.study), case.characteristics.original, filtered=False
+        )
     )
-    result = list_differences(comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"})
+    result = list_differences(
+        comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"}
+    )
     rated = dataclasses.replace(
-        comparison.evaluations, metrics={**comparison.evaluations.metrics, "rating_points": np.array([np.nan])}
+        comparison.evaluations,
+        metrics={**comparison.evaluations.metrics, "rating_points": np.array([np.nan])},
     )
-    assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], "a single cell has no points"
+    assert list_differences(rated, {"rating_points": 3.0, "outcome": "stopped"}) == [], (
+        "a single cell has no points"
+    )
     assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
 
 
@@ -73,7 +82,9 @@ def test_moments_of_a_drive(comparison: Comparison) -> None:
 def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -> None:
     figure = draw_comparison(comparison)
     trace = comparison.runs.trace
-    for axis, values in zip(figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False):
+    for axis, values in zip(
+        figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False
+    ):
         drives = [line.get_xydata().tolist() for line in axis.lines if len(line.get_xdata()) > 9]
         for row in comparison.rows:
             end = comparison.moments[row].end + 1
@@ -110,7 +121,9 @@ def of_colour(picture: np.ndarray, colour: str) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("screen")
-def test_both_vehicles_are_in_the_window_at_the_nearest_moment(comparison: Comparison, tmp_path: Path) -> None:
+def test_both_vehicles_are_in_the_window_at_the_nearest_moment(
+    comparison: Comparison, tmp_path: Path
+) -> None:
     show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
     first, second = comparison.moments
     assert {path.stem for path in tmp_path.iterdir()} == {
@@ -194,9 +207,13 @@ def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
 def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) -> None:
     page = animation_page(lay_out_scene(comparison))
     scene = lay_out_scene(comparison)
-    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1])  # type: ignore[index]
+    data = json.loads(
+        re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1]
+    )  # type: ignore[index]
     assert data["step"] == scene.step
     vuts = [body for body in data["bodies"] if body["drive"] is not None]
     for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
         assert np.allclose(shown["x"], body.x, atol=0.0051)
-    assert [drive["end"] for drive in data["drives"]] == [moments.end for moments in comparison.moments]
+    assert [drive["end"] for drive in data["drives"]] == [
+        moments.end for moments in comparison.moments
+    ]

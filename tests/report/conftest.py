@@ -24,17 +24,27 @@ ASK = (
 def page_of(*directories: Path, **options: Any) -> str:
     """The page that `report` writes."""
     with tempfile.TemporaryDirectory() as folder:
-        return report(*directories, out=Path(folder, "page.html"), **options).read_text(encoding="utf-8")
+        return report(*directories, out=Path(folder, "page.html"), **options).read_text(
+            encoding="utf-8"
+        )
 
 
 @pytest.fixture(scope="session")
 def page(slippery: Path, case: Case) -> str:
-    """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1 to 3.9."""
+    """The whole page; of the domain it asks a formula: tyre frictions from 1 to 1.5 collide, of 1
+    to 3.9.
+    """
     friction = list(case.study.vehicle.characteristics).index("tireFric")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local, "ProcessWorker", lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5))
+        patch.setattr(
+            local,
+            "ProcessWorker",
+            lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5),
+        )
         shows: list[tuple[str, int, int]] = []
-        page = page_of(slippery, ask=ASK, paper=True, jobs=1, progress=lambda *values: shows.append(values))
+        page = page_of(
+            slippery, ask=ASK, paper=True, jobs=1, progress=lambda *values: shows.append(values)
+        )
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"
         assert all(done <= total or not total for _, done, total in shows)

@@ -1,4 +1,6 @@
-"""The pages in a real browser, opened as files: nothing fetched, nothing wrong on the console, everything works."""
+"""The pages in a real browser, opened as files: nothing fetched, nothing wrong on the console,
+everything works.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,10 @@ from safevar_sumo.sumo.system import assemble
 
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
 """The part of a page within its margins [px]."""
-TOO_WIDE = """return [...document.querySelectorAll(".wide")].filter((one) => one.scrollWidth > one.clientWidth + 1
-    || one.getBoundingClientRect().right > innerWidth).map((one) => one.getAttribute("aria-label"))"""
+TOO_WIDE = """return [...document.querySelectorAll(".wide")]
+    .filter((one) => one.scrollWidth > one.clientWidth + 1
+        || one.getBoundingClientRect().right > innerWidth)
+    .map((one) => one.getAttribute("aria-label"))"""
 """The tables that reach into what is beside them, or beyond the page."""
 
 
@@ -58,12 +62,18 @@ def opened(browser: Chrome, page: Path) -> None:
     browser.get_log("browser")
     browser.get_log("performance")
     browser.get(page.as_uri())
-    browser.execute_script("document.querySelectorAll('details.section').forEach((one) => { one.open = true; })")
+    browser.execute_script(
+        "document.querySelectorAll('details.section').forEach((one) => { one.open = true; })"
+    )
 
 
 def requests_of(browser: Chrome) -> list[str]:
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
-    return [one["params"]["request"]["url"] for one in messages if one["method"] == "Network.requestWillBeSent"]
+    return [
+        one["params"]["request"]["url"]
+        for one in messages
+        if one["method"] == "Network.requestWillBeSent"
+    ]
 
 
 def shown_time(player: object) -> float:
@@ -74,7 +84,9 @@ def try_player(browser: Chrome, player: object) -> None:
     """Play it, pause it, scrub it, jump to a moment."""
     find = player.find_element  # type: ignore[attr-defined]
     button, slider = find(By.CSS_SELECTOR, ".play"), find(By.CSS_SELECTOR, ".when")
-    browser.execute_script("arguments[0].value = 0; arguments[0].dispatchEvent(new Event('input'))", slider)
+    browser.execute_script(
+        "arguments[0].value = 0; arguments[0].dispatchEvent(new Event('input'))", slider
+    )
     assert shown_time(player) == 0
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
     start = find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform")
@@ -85,7 +97,8 @@ def try_player(browser: Chrome, player: object) -> None:
     assert button.text == "Play"
     assert 0.1 < shown_time(player) < 5
     browser.execute_script(
-        "arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider
+        "arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))",
+        slider,
     )
     assert find(By.CSS_SELECTOR, "[data-body]:has(.changed)").get_attribute("transform") != start
     assert "collides at" in player.text  # type: ignore[attr-defined]
@@ -94,10 +107,14 @@ def try_player(browser: Chrome, player: object) -> None:
 
 
 @pytest.mark.slow
-def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, case: Case, tmp_path: Path) -> None:
+def test_an_animation_plays_and_scrubs_as_a_file(
+    browser: Chrome, case: Case, tmp_path: Path
+) -> None:
     setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
     animate(
-        comparison_of(simulate_with_original(case.study, assemble(case.study), setting, filtered=False)),
+        comparison_of(
+            simulate_with_original(case.study, assemble(case.study), setting, filtered=False)
+        ),
         tmp_path / "it.html",
     )
     opened(browser, tmp_path / "it.html")
@@ -107,13 +124,20 @@ def test_an_animation_plays_and_scrubs_as_a_file(browser: Chrome, case: Case, tm
 
 
 @pytest.mark.slow
-def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(browser: Chrome, report: Path) -> None:
+def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
+    browser: Chrome, report: Path
+) -> None:
     opened(browser, report)
-    browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    browser.execute_script(
+        "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
+    )
     time.sleep(0.5)
     assert [entry["message"] for entry in browser.get_log("browser")] == []
     assert {url.partition(":")[0] for url in requests_of(browser)} <= {"file", "data"}
-    assert [url for url in requests_of(browser) if url.startswith("file:")] in ([], [report.as_uri()])
+    assert [url for url in requests_of(browser) if url.startswith("file:")] in (
+        [],
+        [report.as_uri()],
+    )
     broken = "return [...document.images].filter((one) => one.complete && !one.naturalWidth).length"
     assert browser.execute_script(broken) == 0
 
@@ -121,14 +145,18 @@ def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(browser: Chrome, r
 @pytest.mark.slow
 def test_a_link_opens_its_answer_and_the_keyboard_plays(browser: Chrome, report: Path) -> None:
     opened(browser, report)
-    browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = false; })")
+    browser.execute_script(
+        "document.querySelectorAll('details').forEach((one) => { one.open = false; })"
+    )
     link = browser.find_element(By.CSS_SELECTOR, ".verdicts a")
     link.send_keys(Keys.ENTER)
     time.sleep(0.3)
     section = browser.find_element(By.ID, str(link.get_attribute("href")).partition("#")[2])
     assert section.get_attribute("open") is not None
     assert browser.execute_script(
-        "const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top < innerHeight", section
+        "const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top <"
+        " innerHeight",
+        section,
     )
     replay = browser.find_element(By.CSS_SELECTOR, "details.replay")
     replay.find_element(By.TAG_NAME, "summary").send_keys(Keys.ENTER)
@@ -149,7 +177,9 @@ def test_it_fits_the_screen_and_everybody_can_read_it(
     try:
         opened(browser, report)
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
-        browser.execute_script("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        browser.execute_script(
+            "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
+        )
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width
         assert violations(browser, axe) == []
     finally:
@@ -170,27 +200,37 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
 BROKEN_NAMES = """
     const text = document.createRange();
     const lines = (cell) => { text.selectNodeContents(cell); return text.getClientRects().length; };
-    const names = [...document.querySelectorAll("td.label")].filter((cell) => !/\\s/.test(cell.textContent.trim()));
+    const names = [...document.querySelectorAll("td.label")]
+        .filter((cell) => !/\\s/.test(cell.textContent.trim()));
     return names.filter((cell) => lines(cell) > 1).map((cell) => cell.textContent);
 """
 """Labels of one word that are on several lines."""
 
 
 @pytest.mark.slow
-def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Chrome, report: Path) -> None:
+def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
+    browser: Chrome, report: Path
+) -> None:
     opened(browser, report)
-    printed = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})["data"])
+    printed = base64.b64decode(
+        browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})["data"]
+    )
     assert printed.startswith(b"%PDF")
     assert 3 <= printed.count(b"/Type /Page\n") <= 14
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False})
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False}
+    )
     try:
         assert browser.execute_script(TOO_WIDE) == []
         assert browser.execute_script(BROKEN_NAMES) == []
         front = "return document.querySelector('.front').getBoundingClientRect().bottom + scrollY"
         assert browser.execute_script(front) <= A4["height"], "verdicts and limits are one page"
         every = "return document.querySelectorAll(arguments[0]).length"
-        seen = "return [...document.querySelectorAll(arguments[0])].filter((one) => one.checkVisibility()).length"
+        seen = (
+            "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
+            " one.checkVisibility()).length"
+        )
         assert browser.execute_script(seen, ".controls, .play") == 0
         stills = browser.execute_script(seen, ".player")
         assert stills == browser.execute_script(every, ".replay") > 1, "a still for each replay"
@@ -204,7 +244,9 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(browser: Ch
 
 
 @pytest.mark.slow
-def test_without_javascript_it_stands_still_and_tells_the_same(browser: Chrome, report: Path) -> None:
+def test_without_javascript_it_stands_still_and_tells_the_same(
+    browser: Chrome, report: Path
+) -> None:
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         opened(browser, report)
@@ -246,7 +288,8 @@ def program(*names: str) -> str:
 def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> None:
     """Make it a screen of that width, in light or dark."""
     browser.execute_cdp_cmd(
-        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        "Emulation.setEmulatedMedia",
+        {"features": [{"name": "prefers-color-scheme", "value": scheme}]},
     )
     browser.execute_cdp_cmd(
         "Emulation.setDeviceMetricsOverride",

@@ -70,7 +70,9 @@ def mine(in_tmp: Path) -> Path:
     shutil.copytree(NETWORKS / "pedestrian_crossing", there / "roads")
     for name, text in {"mine.py": MINE, "mine.toml": STUDY, "limits.txt": "6.0"}.items():
         (there / name).write_text(text)
-    run("study", str(there / "mine.toml"), "--out", str(there / "results"), "--quiet", "--jobs", "1")
+    run(
+        "study", str(there / "mine.toml"), "--out", str(there / "results"), "--quiet", "--jobs", "1"
+    )
     return there / "results"
 
 
@@ -90,12 +92,17 @@ def changed(source: Path, target: Path, name: str, change: Callable[[str], str])
 
 
 def written(target: Path, files: dict[str, bytes], *, named: bool = True) -> str:
-    """Write an archive, whose pack.json names the files unless `named` is false; returns its path."""
+    """Write an archive, whose pack.json names the files unless `named` is false; returns its
+    path.
+    """
     with suppress(KeyError, ValueError, RecursionError):
         described = json.loads(files[DESCRIPTION])
         others = {name: content for name, content in files.items() if name != DESCRIPTION}
         if named:
-            files = {**files, DESCRIPTION: json.dumps({**described, "files": digests_of(others)}).encode()}
+            files = {
+                **files,
+                DESCRIPTION: json.dumps({**described, "files": digests_of(others)}).encode(),
+            }
     with zipfile.ZipFile(target, "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
@@ -118,7 +125,9 @@ def not_same(*arguments: str) -> list[dict[str, str]]:
     """The claims that `verify` does not find the same; it must end with exit code 1."""
     result = json.loads(run("verify", *arguments, "--json", expect=1).stdout)
     numbers, claims = result["numbers"], result["tables"]["claims"]["rows"]
-    assert numbers["same"] + numbers["differs"] + numbers["cannot"] == numbers["claims"] == len(claims)
+    assert (
+        numbers["same"] + numbers["differs"] + numbers["cannot"] == numbers["claims"] == len(claims)
+    )
     return [claim for claim in claims if claim["verdict"] != "same"]
 
 
@@ -140,12 +149,17 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
     assert {name.removeprefix("1-slippery/") for name in files} == {
         "manifest.json", "solutions.csv", "study.toml", "answers.json", "report.html",
     }  # fmt: skip
-    answers, page = json.loads(files["1-slippery/answers.json"]), files["1-slippery/report.html"].decode()
+    answers, page = (
+        json.loads(files["1-slippery/answers.json"]),
+        files["1-slippery/report.html"].decode(),
+    )
     assert [answer["question"] for answer in answers] == ["explain", "risk"]
     for answer in answers:
         command = answer.pop("command")
         assert html.escape(command) in page
-        words = [str(slippery) if word == "results/slippery" else word for word in command.split()[3:]]
+        words = [
+            str(slippery) if word == "results/slippery" else word for word in command.split()[3:]
+        ]
         assert answer == json_of(*words), "the page's answer is the command's"
     shares = re.search(r"(\d+) different vehicles in all", page)
     assert shares is not None
@@ -161,12 +175,19 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
         "report",
     ]
     assert verified(str(pack)) == claims
-    (claim,) = not_same(changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)')))
+    (claim,) = not_same(
+        changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)'))
+    )
     assert claim["claim"] == "answer risk --samples 300"
     assert claim["packed"].startswith('"probability": 0.')
     assert claim["here"] == f'"probability": {answers[1]["numbers"]["probability"]},'
     (claim,) = not_same(
-        changed(pack, tmp_path / "it.zip", "report.html", lambda text: text.replace("-&gt; ", "-&gt; 9", 1))
+        changed(
+            pack,
+            tmp_path / "it.zip",
+            "report.html",
+            lambda text: text.replace("-&gt; ", "-&gt; 9", 1),
+        )
     )
     assert claim["claim"] == "report"
 
@@ -180,22 +201,37 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     (code,) = re.findall(r'```python title="my_questions.py"\n(.*?)```', manual, re.DOTALL)
     Path("my_questions.py").write_text(code)
     monkeypatch.syspath_prepend(str(in_tmp))
-    run("report", str(slippery), "--ask", "my_questions:ends --unsafe below=0.5", "--out", "it.html")
+    run(
+        "report", str(slippery), "--ask", "my_questions:ends --unsafe below=0.5", "--out", "it.html"
+    )
     page = Path("it.html").read_text()
     assert "Unsafe at an end of the domain: " in page
     assert "<caption>Ends of the domains</caption>" in page
     assert f"python -m safevar_sumo my_questions:ends {slippery} --unsafe below=0.5" in page
     run("evidence", str(slippery), "--ask", "my_questions:ends", "--out", "it.zip")
     Path("my_questions.py").unlink()
-    refused("verify", "it.zip", message=("would run code", "my_questions.py, my_questions:ends", "--run-code"))
+    refused(
+        "verify",
+        "it.zip",
+        message=("would run code", "my_questions.py, my_questions:ends", "--run-code"),
+    )
     command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)  # in a process that never had the module
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=True
+    )  # in a process that never had the module
     assert done.stdout.startswith("7 of 7 claims are the same")
 
 
 @pytest.mark.slow
 def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: Path) -> None:
-    run("evidence", str(slippery), "--ask", "rules --samples 20", "--out", str(tmp_path / "again.zip"))
+    run(
+        "evidence",
+        str(slippery),
+        "--ask",
+        "rules --samples 20",
+        "--out",
+        str(tmp_path / "again.zip"),
+    )
     assert bare.read_bytes() == (tmp_path / "again.zip").read_bytes()
 
 
@@ -213,14 +249,21 @@ def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: P
 def test_a_changed_digit_differs_and_is_named(
     bare: Path, tmp_path: Path, name: str, pattern: str, claims: set[str]
 ) -> None:
-    assert {claim["claim"] for claim in not_same(changed(bare, tmp_path / "it.zip", name, digit_of(pattern)))} == claims
+    assert {
+        claim["claim"]
+        for claim in not_same(changed(bare, tmp_path / "it.zip", name, digit_of(pattern)))
+    } == claims
 
 
 @pytest.mark.slow
-def test_a_solution_that_was_removed_and_files_that_nobody_named_are_found(bare: Path, tmp_path: Path) -> None:
+def test_a_solution_that_was_removed_and_files_that_nobody_named_are_found(
+    bare: Path, tmp_path: Path
+) -> None:
     texts = texts_of(bare)
     rows = texts["1-slippery/solutions.csv"].splitlines(keepends=True)
-    path = written(tmp_path / "it.zip", {**texts, "1-slippery/solutions.csv": b"".join(rows[:-1])}, named=False)
+    path = written(
+        tmp_path / "it.zip", {**texts, "1-slippery/solutions.csv": b"".join(rows[:-1])}, named=False
+    )
     refused("verify", path, message=("it.zip", "solutions.csv has other rows than pack.json says"))
     answers = texts["1-slippery/answers.json"] + b" "
     path = written(tmp_path / "it.zip", {**texts, "1-slippery/answers.json": answers}, named=False)
@@ -228,7 +271,10 @@ def test_a_solution_that_was_removed_and_files_that_nobody_named_are_found(bare:
     assert '"1-slippery/answers.json": "' in claims["files"]
     path = written(tmp_path / "it.zip", {**texts, "1-slippery/code/mine.py": b""}, named=False)
     refused("verify", path, message=("it.zip", "1-slippery/code/mine.py is not named in pack.json"))
-    lines = written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": texts["1-slippery/report.html"] + b"\n"})
+    lines = written(
+        tmp_path / "it.zip",
+        {**texts, "1-slippery/report.html": texts["1-slippery/report.html"] + b"\n"},
+    )
     (claim,) = not_same(lines)
     assert (claim["claim"], claim["packed"], claim["here"]) == ("report", "'\\n'", "nothing")
 
@@ -243,34 +289,72 @@ def test_what_is_missing_torn_or_too_much_is_damage(bare: Path, tmp_path: Path) 
         ("1-slippery/solutions.csv", b"[" * 100_000, "1-slippery is damaged"),
         ("1-slippery/answers.json", b"[]", "answers.json answers other questions"),
         ("1-slippery/answers.json", nan, "NaN is no JSON"),
-        ("1-slippery/manifest.json", texts["1-slippery/manifest.json"].replace(b"2.", b"Infinity, 2.", 1), "damaged"),
+        (
+            "1-slippery/manifest.json",
+            texts["1-slippery/manifest.json"].replace(b"2.", b"Infinity, 2.", 1),
+            "damaged",
+        ),
         ("1-slippery/report.html", b"\xff", "can't decode byte"),
-        ("1-slippery/solutions.csv", texts["1-slippery/solutions.csv"].replace(b"rs", b"r" * 200_000), "other rows"),
+        (
+            "1-slippery/solutions.csv",
+            texts["1-slippery/solutions.csv"].replace(b"rs", b"r" * 200_000),
+            "other rows",
+        ),
         (
             DESCRIPTION,
             re.sub(rb'"collision": \d+', b'"collision": 99999999', texts[DESCRIPTION]),
             "than 2 runs may have",
         ),
-        (DESCRIPTION, texts[DESCRIPTION].replace(b'"collision":', b'"exploded":'), "no outcome 'exploded'"),
+        (
+            DESCRIPTION,
+            texts[DESCRIPTION].replace(b'"collision":', b'"exploded":'),
+            "no outcome 'exploded'",
+        ),
         (DESCRIPTION, re.sub(rb'"rs",\s*0', b'"rs",7', texts[DESCRIPTION]), "no such runs"),
-        (DESCRIPTION, texts[DESCRIPTION].replace(b"rules --samples 20", b"repair --out /tmp/x"), "writes a file"),
+        (
+            DESCRIPTION,
+            texts[DESCRIPTION].replace(b"rules --samples 20", b"repair --out /tmp/x"),
+            "writes a file",
+        ),
         (DESCRIPTION, b"[" * 100_000, "pack.json is damaged"),
         (DESCRIPTION, texts[DESCRIPTION].replace(b"1-slippery", b"../slippery"), "is missing"),
-        (DESCRIPTION, re.sub(rb'"libsumo": "', b'"libsumo": "0.', texts[DESCRIPTION]), "made with libsumo 0."),
+        (
+            DESCRIPTION,
+            re.sub(rb'"libsumo": "', b'"libsumo": "0.', texts[DESCRIPTION]),
+            "made with libsumo 0.",
+        ),
     ):
-        refused("verify", written(tmp_path / "it.zip", {**texts, name: content}), message=("it.zip", message))
+        refused(
+            "verify",
+            written(tmp_path / "it.zip", {**texts, name: content}),
+            message=("it.zip", message),
+        )
     for name in ("pack.json", "1-slippery/manifest.json"):
         rest = {path: content for path, content in texts.items() if path != name}
-        refused("verify", written(tmp_path / "it.zip", rest), message=(name.removeprefix("1-slippery/"),))
+        refused(
+            "verify",
+            written(tmp_path / "it.zip", rest),
+            message=(name.removeprefix("1-slippery/"),),
+        )
     torn = bytearray(bare.read_bytes())
     torn[len(torn) // 2] ^= 1
     (tmp_path / "torn.zip").write_bytes(torn)
     refused("verify", str(tmp_path / "torn.zip"), message=("is no zip archive, or damaged",))
-    refused("verify", str(tmp_path / "none.zip"), message=("none.zip", "cannot be read", "evidence"))
+    refused(
+        "verify", str(tmp_path / "none.zip"), message=("none.zip", "cannot be read", "evidence")
+    )
 
 
 @pytest.mark.parametrize(
-    "name", ["../out.py", "/tmp/out.py", "a/../../out.py", "1/code//tmp/out.py", "1/./out.py", "C:\\out.py"]
+    "name",
+    [
+        "../out.py",
+        "/tmp/out.py",
+        "a/../../out.py",
+        "1/code//tmp/out.py",
+        "1/./out.py",
+        "C:\\out.py",
+    ],
 )
 def test_paths_that_leave_the_pack_are_refused(in_tmp: Path, name: str) -> None:
     with zipfile.ZipFile("it.zip", "w") as archive:
@@ -298,7 +382,9 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
 
 
 @pytest.mark.slow
-def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: Path, in_tmp: Path) -> None:
+def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(
+    mine: Path, in_tmp: Path
+) -> None:
     run("evidence", str(mine), "--ask", "rules --samples 20", "--out", "it.zip")
     shutil.rmtree(mine.parent)
     code = ("mine.py", "limits.txt", "roads/scenario.sumocfg")  # SUMO's options may name outputs
@@ -311,7 +397,9 @@ def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(mine: 
 
 
 class Careless(NamedTuple):
-    """A change of the user's code with which it needs what no pack holds, and the error elsewhere."""
+    """A change of the user's code with which it needs what no pack holds, and the error
+    elsewhere.
+    """
 
     code: str
     file: str
@@ -341,14 +429,23 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     Path("mine.py").write_text(careless.code)
     run("study", "mine.toml", "--out", "own", "--quiet", "--jobs", "1")
     run("evidence", "own", "--ask", "rules --samples 20", "--out", "it.zip")
-    texts = {name: content for name, content in texts_of(Path("it.zip")).items() if not name.endswith(careless.file)}
+    texts = {
+        name: content
+        for name, content in texts_of(Path("it.zip")).items()
+        if not name.endswith(careless.file)
+    }
     manifest = json.loads(texts["1-mine/manifest.json"])
     manifest["files"].pop(careless.file, None)
-    written(Path("it.zip"), {**texts, "1-mine/manifest.json": json.dumps(manifest, indent=2).encode() + b"\n"})
+    written(
+        Path("it.zip"),
+        {**texts, "1-mine/manifest.json": json.dumps(manifest, indent=2).encode() + b"\n"},
+    )
     claims = {claim["claim"]: claim["here"] for claim in not_same("it.zip", "--run-code")}
     assert careless.error in claims["solutions"]
     command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
-    done = subprocess.run(command, capture_output=True, text=True)  # with processes of its own as workers
+    done = subprocess.run(
+        command, capture_output=True, text=True
+    )  # with processes of its own as workers
     assert (done.returncode, done.stdout[:11]) == (1, "2 of 7 clai")
     assert os.getcwd() == str(there)
     assert "mine" not in sys.modules
@@ -357,23 +454,38 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 @pytest.mark.slow
 def test_a_pack_without_a_file_on_which_its_results_depend_is_damaged(mine: Path) -> None:
     run("evidence", str(mine), "--ask", "rules --samples 20", "--out", "it.zip")
-    texts = {name: content for name, content in texts_of(Path("it.zip")).items() if not name.endswith("mine.py")}
-    refused("verify", written(Path("it.zip"), texts), "--run-code", message=("mine.py, on which the results depend",))
+    texts = {
+        name: content
+        for name, content in texts_of(Path("it.zip")).items()
+        if not name.endswith("mine.py")
+    }
+    refused(
+        "verify",
+        written(Path("it.zip"), texts),
+        "--run-code",
+        message=("mine.py, on which the results depend",),
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("planted")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
-    study = study.replace("at_least = 5", "at_least = 7.9").replace("step_length = 0.005", "step_length = 0.02")
-    Path("planted.toml").write_text(re.sub(r"(always|colour) = \{ .*\n", "", study))  # which it keeps already
+    study = study.replace("at_least = 5", "at_least = 7.9").replace(
+        "step_length = 0.005", "step_length = 0.02"
+    )
+    Path("planted.toml").write_text(
+        re.sub(r"(always|colour) = \{ .*\n", "", study)
+    )  # which it keeps already
     run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
     run("evidence", "results", "--out", "it.zip", "--ask", "repair")
     assert "answer repair" in verified("it.zip", "--run-code")
 
 
 @pytest.mark.slow
-def test_a_study_that_names_code_outside_the_pack_is_user_code_too(bare: Path, tmp_path: Path) -> None:
+def test_a_study_that_names_code_outside_the_pack_is_user_code_too(
+    bare: Path, tmp_path: Path
+) -> None:
     path = changed(
         bare,
         tmp_path / "it.zip",
@@ -387,7 +499,10 @@ def test_a_study_that_names_code_outside_the_pack_is_user_code_too(bare: Path, t
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
     assert verified(str(bare), "--search")[-2:] == ["search: outcomes", "search: solutions"]
     path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"collision": (\d)'))
-    assert {claim["claim"] for claim in not_same(path, "--search")} == {"report", "search: outcomes"}
+    assert {claim["claim"] for claim in not_same(path, "--search")} == {
+        "report",
+        "search: outcomes",
+    }
 
 
 def test_what_cannot_be_run_has_its_reason() -> None:

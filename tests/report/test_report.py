@@ -1,5 +1,5 @@
-"""The page: what it says is in the results and in the answers, text of others stays text, and its commands make the
-study and every answer again.
+"""The page: what it says is in the results and in the answers, text of others stays text, and its
+commands make the study and every answer again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ from tests.report.conftest import ASK, page_of
 def words_of(page: str) -> str:
     """The text of a page, between single blanks."""
     return " ".join(
-        html.unescape(re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)).split()
+        html.unescape(
+            re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)
+        ).split()
     )
 
 
@@ -77,12 +79,19 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     assert outline.open == []
     headings = [int(tag[1]) for tag, _ in outline.tags if re.fullmatch("h[1-6]", tag)]
     assert headings[0] == 1
-    assert all(later - earlier <= 1 for earlier, later in pairwise(headings)), "no heading is skipped"
+    assert all(later - earlier <= 1 for earlier, later in pairwise(headings)), (
+        "no heading is skipped"
+    )
     ids = [group["id"] for _, group in outline.tags if "id" in group]
     assert len(ids) == len(set(ids))
-    assert {group["href"] for tag, group in outline.tags if tag == "a"} <= {f"#{one}" for one in ids}
+    assert {group["href"] for tag, group in outline.tags if tag == "a"} <= {
+        f"#{one}" for one in ids
+    }
     fetched = [
-        group[name] for _, group in outline.tags for name in ("src", "srcset", "data", "poster") if name in group
+        group[name]
+        for _, group in outline.tags
+        for name in ("src", "srcset", "data", "poster")
+        if name in group
     ]
     assert all(str(source).startswith("data:") for source in fetched)
     assert all(group.get("alt") for tag, group in outline.tags if tag == "img")
@@ -91,18 +100,32 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(page: str, case: Case) -> None:
+def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(
+    page: str, case: Case
+) -> None:
     front, _, details = page.partition('class="replays"')
     headings = re.findall(r'<dt><a href="#(.*?)">(.*?)</a></dt>', front)
-    assert [heading for _, heading in headings] == ["Explain", "Risk", "Rules", "Limits and trust", "Tables"]
+    assert [heading for _, heading in headings] == [
+        "Explain",
+        "Risk",
+        "Rules",
+        "Limits and trust",
+        "Tables",
+    ]
     assert all(f'id="{anchor}"' in details for anchor, _ in headings)
-    lead = re.findall(r'<div class="first">\s*<p>(.*?)</p>\s*<div class="wide".*?<caption>(.*?)</caption>', front)
+    lead = re.findall(
+        r'<div class="first">\s*<p>(.*?)</p>\s*<div class="wide".*?<caption>(.*?)</caption>', front
+    )
     assert len(lead) == 1
     assert lead[0][0] in re.findall(r"<h3>Tolerance</h3></summary>\s*<p>(.*?)</p>", details)
     assert "^2" not in words_of(page)
-    low, high, unsafe = re.findall(r"from ([\d.]+) to ([\d.]+) % with 95 % confidence, (\d+) of 400 vehicles", front)[0]
+    low, high, unsafe = re.findall(
+        r"from ([\d.]+) to ([\d.]+) % with 95 % confidence, (\d+) of 400 vehicles", front
+    )[0]
     assert float(low) < 100 * 0.5 / 2.9 < float(high)
-    assert f"{int(unsafe) / 4:.2f} % of 400 vehicles" in front, "the share of unsafe vehicles is one"
+    assert f"{int(unsafe) / 4:.2f} % of 400 vehicles" in front, (
+        "the share of unsafe vehicles is one"
+    )
     order = [
         "Tolerance",
         "Explain",
@@ -118,14 +141,21 @@ def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(page: 
 
 
 @pytest.mark.slow
-def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(page: str, case: Case) -> None:
+def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
+    page: str, case: Case
+) -> None:
     players = re.findall(
-        r'<details class="replay".*?<summary>(.*?)</summary>.*?<script type="application/json">(.*?)</script>',
+        r'<details class="replay".*?<summary>(.*?)</summary>.*?<script'
+        r' type="application/json">(.*?)</script>',
         page,
         re.DOTALL,
     )
-    rows = dict(zip(map(str, handles_of(case.solutions)), case.solutions.to_dict("records"), strict=True))
-    solutions = {title.partition(" (")[0]: json.loads(data) for title, data in players if " (" in title}
+    rows = dict(
+        zip(map(str, handles_of(case.solutions)), case.solutions.to_dict("records"), strict=True)
+    )
+    solutions = {
+        title.partition(" (")[0]: json.loads(data) for title, data in players if " (" in title
+    }
     assert 1 <= len(solutions) <= 3
     for handle, data in solutions.items():
         changed, row = data["drives"][1], rows[handle]
@@ -133,17 +163,27 @@ def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(page: str
             assert changed["verdict"] == f"collides at {-row['f_safe']:.1f} m/s"
         else:
             assert changed["gap"][changed["nearest"]] == pytest.approx(row["f_safe"], abs=0.006)
-    assert sum(title.startswith("Only ") for title, _ in players) >= 1, "a replay of a minimal cause"
+    assert sum(title.startswith("Only ") for title, _ in players) >= 1, (
+        "a replay of a minimal cause"
+    )
 
 
-def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(case: Case, slippery: Path) -> None:
+def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
+    case: Case, slippery: Path
+) -> None:
     changes = [{"tireFric": 1.2}, {"tireFric": 1.3}, {"mass": 2600.0, "tireFric": 1.4}, {}]
-    answer = SimpleNamespace(tables={"causes": pd.DataFrame({"changes": changes}), "others": pd.DataFrame()})
+    answer = SimpleNamespace(
+        tables={"causes": pd.DataFrame({"changes": changes}), "others": pd.DataFrame()}
+    )
     study = ReportedStudy(directory=slippery, case=case, versions={}, answers=[answer])  # type: ignore[list-item]
     played = list(sections.replays(study, show_no_progress))
-    names = [entry["title"].partition(":")[0] for entry in played if entry["title"].startswith("Only ")]
+    names = [
+        entry["title"].partition(":")[0] for entry in played if entry["title"].startswith("Only ")
+    ]
     assert names == ["Only tireFric", "Only mass, tireFric"]
-    assert played[len(study.choices)]["changes"][0].startswith("tireFric 3.5 -> 1.20 "), "the first of them"
+    assert played[len(study.choices)]["changes"][0].startswith("tireFric 3.5 -> 1.20 "), (
+        "the first of them"
+    )
 
 
 @pytest.mark.slow
@@ -152,7 +192,9 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 ) -> None:
     """Somebody's driving system was edited since: here another one drives."""
     assert "differs from the results" not in page
-    monkeypatch.setattr(sections, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking()))
+    monkeypatch.setattr(
+        sections, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking())
+    )
     with pytest.warns(UserWarning, match="simulated again with different results: "):
         other = page_of(slippery, ask=["rules --samples 20"], jobs=1)
     assert re.search(r"the outcome was collision and is \w+ now", other)
@@ -161,8 +203,15 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 
 @pytest.mark.slow
 def test_answers_stand_on_the_page_as_they_are_with_their_commands(slippery: Path) -> None:
-    page = html.unescape(page_of(slippery, ask=["risk --samples 40 --unsafe below=0.5", "rules --samples 40"], jobs=1))
-    for name, values in (("risk", {"samples": 40, "unsafe": "below=0.5"}), ("rules", {"samples": 40})):
+    page = html.unescape(
+        page_of(
+            slippery, ask=["risk --samples 40 --unsafe below=0.5", "rules --samples 40"], jobs=1
+        )
+    )
+    for name, values in (
+        ("risk", {"samples": 40, "unsafe": "below=0.5"}),
+        ("rules", {"samples": 40}),
+    ):
         answer = find_question(name)(str(slippery), **values)
         assert html.unescape(answer.render("html")) in page.replace("²", "^2").replace("³", "^3")
         assert answer.command in page
@@ -181,7 +230,9 @@ def test_answers_stand_on_the_page_as_they_are_with_their_commands(slippery: Pat
         ("compare", "compare cannot be asked about 1"),
     ],
 )
-def test_a_question_that_cannot_be_asked_is_refused(text: str, expected: str, slippery: Path) -> None:
+def test_a_question_that_cannot_be_asked_is_refused(
+    text: str, expected: str, slippery: Path
+) -> None:
     with pytest.raises(InputError, match=expected):
         page_of(slippery, ask=[text], jobs=1)
 
@@ -204,7 +255,9 @@ def test_every_question_may_be_asked_first_alone_and_twice(text: str, slippery: 
         assert first in words_of(page_of(slippery, ask=ask, jobs=1))
 
 
-@pytest.mark.parametrize("text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"])
+@pytest.mark.parametrize(
+    "text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"]
+)
 def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     question, values = parse_question(text)
     assert question.command_line([], None, values) == f"python -m safevar_sumo {text}"
@@ -227,7 +280,9 @@ def test_the_sentence_about_a_model_is_whole() -> None:
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
-    assert [text.partition(" ")[0] for text in usual_questions(case)] == [one.partition(" ")[0] for one in ASK]
+    assert [text.partition(" ")[0] for text in usual_questions(case)] == [
+        one.partition(" ")[0] for one in ASK
+    ]
     limited = replace(case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}}))
     assert usual_questions(limited)[-1] == "repair"
     rated = replace(case, study=load_study("euro_ncap_rating"))
@@ -237,14 +292,20 @@ def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> No
 
 
 def test_a_study_that_has_speeds_is_asked_for_the_limits_up_to_some_of_them(case: Case) -> None:
-    """Those of all tests of a matrix; of a domain from 10 to 60 whose original is 40 the middle, that and the end."""
+    """Those of all tests of a matrix; of a domain from 10 to 60 whose original is 40 the middle,
+    that and the end.
+    """
     wear, joint = (replace(case, study=load_study(name)) for name in ("wear", "wear_joint"))
     assert usual_questions(wear)[1] == "tolerance --by speed=10,20,30,40"
     assert usual_questions(joint)[1] == "tolerance --by speed=25,40,60"
     stops = replace(case, study=load_study("stop"))
-    assert usual_questions(stops)[1] == "tolerance --by speed=30,80,120", "every second point: at most four"
+    assert usual_questions(stops)[1] == "tolerance --by speed=30,80,120", (
+        "every second point: at most four"
+    )
     for options in ({"point": "CPFA, speed 10"}, {"unsafe": "drac > 6"}):
-        assert [text.split()[0] for text in usual_questions(wear, **options)].count("tolerance") == 1
+        assert [text.split()[0] for text in usual_questions(wear, **options)].count(
+            "tolerance"
+        ) == 1
 
 
 @pytest.mark.slow
@@ -263,7 +324,9 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
 @pytest.mark.slow
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(
-        slippery, tmp_path / "begun", ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv")
+        slippery,
+        tmp_path / "begun",
+        ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"),
     )
     page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1, paper=True)
     assert "There is no solution to replay" in page
@@ -272,7 +335,9 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     assert Outline(page).open == []
 
 
-def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_is_carried_out_from_what_its_results_record(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     study = load_study("smoke", name="pilot", step_length=0.02)
     case: Any = SimpleNamespace(study=study, has_runs=True, solutions=np.empty(0))
     one = ReportedStudy(directory=Path("its results"), case=case, versions={}, answers=[])
@@ -282,7 +347,9 @@ def test_a_study_is_carried_out_from_what_its_results_record(monkeypatch: pytest
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
     monkeypatch.setattr(safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study)))
-    monkeypatch.setattr(safevar_sumo, "run", lambda study, **others: asked.update(study=study, **others))
+    monkeypatch.setattr(
+        safevar_sumo, "run", lambda study, **others: asked.update(study=study, **others)
+    )
     exec(script, {})
     assert asked["study"] == ("its results", study)
     assert asked["out"] == "its results-again"
@@ -310,7 +377,10 @@ def test_a_picture_on_a_page_has_all_digits_of_its_texts() -> None:
 
 def test_an_answer_that_cannot_be_given_has_no_command() -> None:
     case: Any = SimpleNamespace(study=load_study("smoke"), has_runs=False)
-    missing: Any = [SimpleNamespace(question="risk", command=""), SimpleNamespace(question="rules", command="rules it")]
+    missing: Any = [
+        SimpleNamespace(question="risk", command=""),
+        SimpleNamespace(question="rules", command="rules it"),
+    ]
     one = ReportedStudy(directory=Path("it"), case=case, versions={}, answers=missing)
     vars(one)["choices"] = {}
     assert [*sections.commands(one)] == [("The answer rules", "rules it")]
@@ -322,9 +392,13 @@ def test_every_printed_command_gives_the_answer_of_the_page(slippery: Path, tmp_
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
     page = html.unescape(page_of(place, ask=ASK, jobs=2))
     printed = list(commands_of(page))
-    assert [words[0] for words in printed] == ["tolerance", "explain", "risk", "rules", *["simulate"] * 3][
-        : len(printed)
-    ]
+    assert [words[0] for words in printed] == [
+        "tolerance",
+        "explain",
+        "risk",
+        "rules",
+        *["simulate"] * 3,
+    ][: len(printed)]
     for words in printed[: len(ASK)]:
         answer = html.unescape(run(*words, "--format", "html").stdout).strip()
         assert answer.replace("^2", "²").replace("^3", "³") in page, words
@@ -347,14 +421,23 @@ def test_limits_up_to_each_speed_are_the_second_thing_of_a_page(tmp_path: Path) 
     asked = [f"tolerance {options} --attack 100", f"tolerance --by speed=20,40 {options}"]
     page = page_of(place, ask=[*asked, "risk --samples 20"], jobs=1)
     front = page[page.index('<div class="second">') : page.index('<dl class="verdicts">')]
-    answer = find_question("tolerance")(str(place), by="speed=20,40", fits=0, characteristics=options.split()[-1:])
+    answer = find_question("tolerance")(
+        str(place), by="speed=20,40", fits=0, characteristics=options.split()[-1:]
+    )
     limits = answer.tables["limits"]
     cells = dict(re.findall(r"<tr><td[^>]*>(\w+)</td>(.*?)</tr>", front))
     assert list(cells) == ["brakeTorque", "sensorLatency"]
     for name, rows in limits.groupby("characteristic"):
-        texts = [f"{low:.10g} to {high:.10g}" for low, high in rows[["alone_low", "alone_high"]].to_numpy()]
+        texts = [
+            f"{low:.10g} to {high:.10g}"
+            for low, high in rows[["alone_low", "alone_high"]].to_numpy()
+        ]
         assert re.findall(">([^<]*)</td>", cells[name])[-2:] == texts
-    assert [*dict.fromkeys(re.findall("<h3>(.*?)</h3>", page))][:3] == ["Tolerance", "Limits up to each speed", "Risk"]
+    assert [*dict.fromkeys(re.findall("<h3>(.*?)</h3>", page))][:3] == [
+        "Tolerance",
+        "Limits up to each speed",
+        "Risk",
+    ]
     assert Outline(page).open == []
 
 
@@ -364,9 +447,14 @@ DAY, RAIN = "crossing, clear", "crossing, hard_rain"
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A crossing in the clear, where less collides, and in hard_rain."""
-    matrix = {"aggregate": "worst", "tests": [{"name": "crossing", "weathers": ["clear", "hard_rain"]}]}
+    matrix = {
+        "aggregate": "worst",
+        "tests": [{"name": "crossing", "weathers": ["clear", "hard_rain"]}],
+    }
     study = load_study(
-        "smoke", matrix=matrix, search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]}
+        "smoke",
+        matrix=matrix,
+        search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]},
     )
     return searched(study, tmp_path_factory.mktemp("matrix") / "results")
 
@@ -378,7 +466,11 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     (whole,) = load_cases([results])
     assert f" --point &#39;{DAY}&#39;" in page
     worst = re.findall(
-        r"\(.*most severe\): collides at ([\d.]+) m/s|\(.*most severe\): \w+ with ([\d.]+) m to spare", page
+        r"\(.*most severe\): collides at ([\d.]+) m/s|\(.*most severe\): \w+ with ([\d.]+) m to"
+        r" spare",
+        page,
     )
     speed, gap = worst[0]
-    assert (-float(speed) if speed else float(gap)) > whole.solutions["f_safe"].min(), "elsewhere is the worst"
+    assert (-float(speed) if speed else float(gap)) > whole.solutions["f_safe"].min(), (
+        "elsewhere is the worst"
+    )

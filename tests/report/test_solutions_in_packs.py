@@ -1,5 +1,5 @@
-"""The table of solutions in a pack: columns or rows that are there twice, missing or new are refused, and every byte is
-compared with the table computed anew.
+"""The table of solutions in a pack: columns or rows that are there twice, missing or new are
+refused, and every byte is compared with the table computed anew.
 """
 
 from __future__ import annotations
@@ -34,7 +34,17 @@ from tests.report.test_evidence import bare as bare, changed, not_same, texts_of
         (r"(?s)\n(\w+,)0(,[^\n]+)$", r"\n\g<1>0\2\n\g<1>7\2", "rows"),
         (r"rs,", "rt,", "rows"),
     ],
-    ids=["first", "missing", "new", "renamed", "row twice", "row missing", "row replaced", "run", "algorithm"],
+    ids=[
+        "first",
+        "missing",
+        "new",
+        "renamed",
+        "row twice",
+        "row missing",
+        "row replaced",
+        "run",
+        "algorithm",
+    ],
 )
 def test_columns_and_rows_that_are_twice_missing_or_new_are_refused(
     old: str, new: str, word: str, bare: Path, tmp_path: Path
@@ -50,8 +60,12 @@ def test_columns_and_rows_that_are_twice_missing_or_new_are_refused(
 @pytest.mark.parametrize(
     ("old", "new"), [("\n", "\r\n"), ("0,", "0000,"), ("nsga2", '"nsga2"'), ("tet,tit", "tit,tet")]
 )
-def test_the_bytes_are_compared_and_not_the_values(old: str, new: str, bare: Path, tmp_path: Path) -> None:
-    claims = not_same(changed(bare, tmp_path / "it.zip", "solutions.csv", lambda text: text.replace(old, new, 1)))
+def test_the_bytes_are_compared_and_not_the_values(
+    old: str, new: str, bare: Path, tmp_path: Path
+) -> None:
+    claims = not_same(
+        changed(bare, tmp_path / "it.zip", "solutions.csv", lambda text: text.replace(old, new, 1))
+    )
     assert "solutions" in {claim["claim"] for claim in claims}
 
 
@@ -64,7 +78,9 @@ def test_a_solution_that_a_run_returns_twice_is_no_damage(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(method: int, bare: Path, tmp_path: Path) -> None:
+def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(
+    method: int, bare: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "it.zip"
     with zipfile.ZipFile(path, "w", method) as archive:
         for name, content in texts_of(bare).items():

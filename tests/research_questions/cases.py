@@ -31,8 +31,12 @@ def made_up_study(
 ) -> Study:
     smoke = load_study("smoke")
     vehicle = msgspec.structs.replace(smoke.vehicle, characteristics=dict(characteristics))
-    search = msgspec.structs.replace(smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100)
-    return msgspec.structs.replace(smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes})
+    search = msgspec.structs.replace(
+        smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100
+    )
+    return msgspec.structs.replace(
+        smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes}
+    )
 
 
 def row(
@@ -47,7 +51,9 @@ def row(
 ) -> JsonObject:
     """A solution; a safety degree of 0 or less is a collision, without TET and TIT."""
     crash = sd <= 0
-    changes = [abs(value - original) / original for value, original in zip(values, UNCHANGED, strict=True)]
+    changes = [
+        abs(value - original) / original for value, original in zip(values, UNCHANGED, strict=True)
+    ]
     return {
         "algorithm": algorithm,
         "run": run,
@@ -76,22 +82,34 @@ def made_up(
     finished: Sequence[tuple[str, int]] | None = None,
     has_runs: bool = True,
 ) -> Case:
-    """A case with these solutions; unless `finished` is given, the finished runs are those with a solution."""
-    done = list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows)) if finished is None else finished
+    """A case with these solutions; unless `finished` is given, the finished runs are those with a
+    solution.
+    """
+    done = (
+        list(dict.fromkeys((one["algorithm"], one["run"]) for one in rows))
+        if finished is None
+        else finished
+    )
     seen = frame(evaluations)
     seen.insert(2, "evaluation", [one["evaluation"] for one in evaluations])
-    return build_case(study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs)
+    return build_case(
+        study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs
+    )
 
 
 RUNS = 12
 
 
 def three_algorithms() -> Case:
-    """The second finds more severe solutions than the first, the third as the first; run 3 of the third finds none."""
+    """The second finds more severe solutions than the first, the third as the first; run 3 of the
+    third finds none.
+    """
     study = made_up_study(algorithms=["nsga2", "rs", "safe_fuzzer"], runs=RUNS)
     rng = np.random.default_rng(1)
     rows = []
-    for (name, worse), run in itertools.product((("nsga2", 0.0), ("rs", 1.0), ("safe_fuzzer", 0.0)), range(RUNS)):
+    for (name, worse), run in itertools.product(
+        (("nsga2", 0.0), ("rs", 1.0), ("safe_fuzzer", 0.0)), range(RUNS)
+    ):
         if (name, run) != ("safe_fuzzer", 3):
             rows += [
                 row(
@@ -103,4 +121,8 @@ def three_algorithms() -> Case:
                 )
                 for share in (0.2, 0.5, 0.8)
             ]
-    return made_up(*rows, study=study, finished=list(itertools.product(("nsga2", "rs", "safe_fuzzer"), range(RUNS))))
+    return made_up(
+        *rows,
+        study=study,
+        finished=list(itertools.product(("nsga2", "rs", "safe_fuzzer"), range(RUNS))),
+    )

@@ -1,5 +1,5 @@
-"""Tables and figures of all that runs have evaluated, whatever they return: convergence, and RQ2 by one rule for all
-algorithms; and which tests so few runs can decide.
+"""Tables and figures of all that runs have evaluated, whatever they return: convergence, and RQ2 by
+one rule for all algorithms; and which tests so few runs can decide.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence
-from safevar_sumo.questions.research_questions.fronts import compute_indicators, nondominated_evaluations
+from safevar_sumo.questions.research_questions.fronts import (
+    compute_indicators,
+    nondominated_evaluations,
+)
 from safevar_sumo.questions.research_questions.statistics import can_be_significant
 from safevar_sumo.questions.subject import load
 from safevar_sumo.study import load_study
@@ -57,7 +60,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def case(study: Path) -> Case:
-    """Runs whose settings are evaluated by a formula: the sum of all changes makes a vehicle unsafe."""
+    """Runs whose settings are evaluated by a formula: the sum of all changes makes a vehicle
+    unsafe.
+    """
     carried_out(load_study(str(study)), study.parent / "out")
     return load(study.parent / "out").case
 
@@ -70,13 +75,20 @@ def answer(case: Case) -> Answer:
 def test_random_search_returns_what_the_common_rule_takes(case: Case) -> None:
     common, returned = nondominated_evaluations(case), case.solutions
     columns = ["run", *case.characteristics.names]
-    sets = [{*frame.query("algorithm == 'rs'")[columns].itertuples(index=False)} for frame in (common, returned)]
+    sets = [
+        {*frame.query("algorithm == 'rs'")[columns].itertuples(index=False)}
+        for frame in (common, returned)
+    ]
     assert sets[0] == sets[1]
     assert set(common["algorithm"]) == {"nsga2", "rs", "FiveWorst"}
 
 
-def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(answer: Answer, case: Case) -> None:
-    over_runs, common = (answer.tables[name].set_index(["baseline", "metric"]) for name in ("rq2-runs", "rq2-common"))
+def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
+    answer: Answer, case: Case
+) -> None:
+    over_runs, common = (
+        answer.tables[name].set_index(["baseline", "metric"]) for name in ("rq2-runs", "rq2-common")
+    )
     worst = ("FiveWorst", "safety_degree")
     assert over_runs.loc[worst, "effect_size"] == 0, "its mean is better in every run"
     assert common.loc[worst, "effect_size"] > 0.5
@@ -89,13 +101,17 @@ def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(answer: A
     assert "by different rules: those of FiveWorst, NSGA-II are not all" in remarks
 
 
-def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far(answer: Answer, case: Case) -> None:
+def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far(
+    answer: Answer, case: Case
+) -> None:
     front = moocore.filter_dominated(case.solutions[OBJECTIVES].to_numpy(float))
     low = front.min(axis=0)
     width = front.max(axis=0) - low
     rows = answer.to_dict()["tables"]["convergence"]["rows"]
     for name, count in product(("nsga2", "FiveWorst"), (40, 400)):
-        so_far = case.evaluations.query(f"algorithm == '{name}' and evaluation < {count}").groupby("run")
+        so_far = case.evaluations.query(f"algorithm == '{name}' and evaluation < {count}").groupby(
+            "run"
+        )
         points = [(group[OBJECTIVES].to_numpy(float) - low) / width for _, group in so_far]
         volumes = [moocore.hypervolume(run, ref=[1.1] * 3) for run in points]
         (found,) = [one for one in rows if (one["algorithm"], one["evaluations"]) == (name, count)]
@@ -104,7 +120,9 @@ def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far
         assert [found[key] for key in ("hypervolume", "low", "high")] == pytest.approx(expected)
 
 
-def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(answer: Answer, case: Case) -> None:
+def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(
+    answer: Answer, case: Case
+) -> None:
     (axis,) = draw_convergence(case).axes
     medians = answer.tables["convergence"].groupby("algorithm")["hypervolume"].last()
     returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median()
@@ -115,20 +133,32 @@ def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(answ
 
 
 @pytest.mark.parametrize(("m", "n"), [(3, 3), (3, 12), (5, 5), (2, 30)])
-def test_whether_runs_can_be_significant_follows_from_the_exact_distribution(m: int, n: int) -> None:
+def test_whether_runs_can_be_significant_follows_from_the_exact_distribution(
+    m: int, n: int
+) -> None:
     smallest = {
         "RQ1": scipy.stats.wilcoxon(np.arange(1, m + 1), method="exact").pvalue,
         "RQ2": scipy.stats.mannwhitneyu(range(m), range(m, m + n), method="exact").pvalue,
     }
     for question, p_value in smallest.items():
-        found = [can_be_significant(question, m, n, 7 * p_value * share, 7) for share in (0.999, 1.001)]
+        found = [
+            can_be_significant(question, m, n, 7 * p_value * share, 7) for share in (0.999, 1.001)
+        ]
         assert found == [False, True]
 
 
 def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
-    """The original's TET is unknown, and all of one algorithm's solutions collide, which have no TET."""
-    rows = [row(name, run, sd=sd - run / 20) for name, sd in (("nsga2", -1.0), ("rs", 1.5)) for run in range(12)]
-    answer = answer_questions([made_up(*rows, original={"safety_degree": 2.0, "tit": 0.5, "ave_dece": 6.0})])
+    """The original's TET is unknown, and all of one algorithm's solutions collide, which have no
+    TET.
+    """
+    rows = [
+        row(name, run, sd=sd - run / 20)
+        for name, sd in (("nsga2", -1.0), ("rs", 1.5))
+        for run in range(12)
+    ]
+    answer = answer_questions(
+        [made_up(*rows, original={"safety_degree": 2.0, "tit": 0.5, "ave_dece": 6.0})]
+    )
     for name, untested in (("rq1", 3), ("rq1-runs", 3), ("rq2", 2), ("rq2-runs", 2), ("a12", 2)):
         table = answer.to_dict()["tables"][name]["rows"]
         values = [one["significant"] for one in table]
@@ -137,11 +167,15 @@ def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
     assert re.search(r"│TET .* -│", answer.only("rq1").render("text"))
 
 
-def test_a_study_prints_tests_only_where_its_runs_can_be_significant(case: Case, study: Path, tmp_path: Path) -> None:
+def test_a_study_prints_tests_only_where_its_runs_can_be_significant(
+    case: Case, study: Path, tmp_path: Path
+) -> None:
     text = summarise(load(study.parent / "out")).render("text")
     assert "RQ2 over runs" in text
     assert "RQ1 over runs" not in text
-    (told,) = re.findall(r"all: mine: too few runs for (\d+) of \d+ tests of RQ1 \((\d+) are needed after", text)
+    (told,) = re.findall(
+        r"all: mine: too few runs for (\d+) of \d+ tests of RQ1 \((\d+) are needed after", text
+    )
     tests, needed = map(int, told)
     assert tests / 2 ** (needed - 1) < 0.01 <= tests / 2 ** (needed - 2)
     carried_out(load_study(str(study), search={"runs": 2}), tmp_path / "two")

@@ -1,5 +1,5 @@
-"""Quality indicators, tests and effect sizes against closed forms and their definitions; and answers rendered: the
-same numbers in every format, LaTeX that compiles, figures that can be read.
+"""Quality indicators, tests and effect sizes against closed forms and their definitions; and
+answers rendered: the same numbers in every format, LaTeX that compiles, figures that can be read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
-from safevar_sumo.questions.research_questions.fronts import compute_convergence, compute_indicators, reference_front
+from safevar_sumo.questions.research_questions.fronts import (
+    compute_convergence,
+    compute_indicators,
+    reference_front,
+)
 from safevar_sumo.questions.research_questions.statistics import (
     EXACT_TEST,
     compare_samples,
@@ -39,13 +43,17 @@ from tests.research_questions.cases import made_up, made_up_study, row, three_al
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:
-    case = made_up(row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6))
+    case = made_up(
+        row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6)
+    )
     assert sorted(reference_front(case).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
     result = compute_indicators(case)
     apart = math.hypot(0.5, 0.2)
     assert result.loc[("nsga2", 0), "igd"] == pytest.approx(apart / 2)
     assert result.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
-    assert result.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), "a whole width of f_safe away from one of two"
+    assert result.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), (
+        "a whole width of f_safe away from one of two"
+    )
     assert result.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
 
 
@@ -56,12 +64,21 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
         for run, end in enumerate(ends)
         for i in range(end)
     ]
-    case = made_up(*(row(name, run) for name in ("nsga2", "mine") for run in (0, 1)), evaluations=seen)
+    case = made_up(
+        *(row(name, run) for name in ("nsga2", "mine") for run in (0, 1)), evaluations=seen
+    )
     case = dataclasses.replace(case, titles={"mine": "My search"})
     ends = compute_convergence(case).groupby(["algorithm", "run"])["evaluations"].max()
-    assert ends.to_dict() == {("nsga2", 0): 100, ("nsga2", 1): 100, ("mine", 0): 33, ("mine", 1): 33}
+    assert ends.to_dict() == {
+        ("nsga2", 0): 100,
+        ("nsga2", 1): 100,
+        ("mine", 0): 33,
+        ("mine", 1): 33,
+    }
     figures = (draw_convergence(case), draw_pareto_fronts(case))
-    labels = ["".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures]
+    labels = [
+        "".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures
+    ]
     assert all("My search" in label and "mine" not in label for label in labels)
 
 
@@ -69,7 +86,9 @@ SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
 
 
 @given(x=SAMPLES, y=SAMPLES)
-def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(x: list[float], y: list[float]) -> None:
+def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(
+    x: list[float], y: list[float]
+) -> None:
     won = sum((a > b) + 0.5 * (a == b) for a in x for b in y)
     there = compare_samples(x, y)
     back = compare_samples(y, x)
@@ -86,7 +105,9 @@ def test_exact_p_of_separated_samples_is_two_orders_of_all() -> None:
 
 
 def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:
-    assert compare_samples([], [1.0, 2])[:5] == pytest.approx((math.nan, math.nan, None, 0, 2), nan_ok=True)
+    assert compare_samples([], [1.0, 2])[:5] == pytest.approx(
+        (math.nan, math.nan, None, 0, 2), nan_ok=True
+    )
     assert math.isnan(signed_rank_test([1.0, math.nan]).p_value)
     with pytest.raises(ValueError, match="nan"):
         compare_samples([1.0, math.nan], [1.0])
@@ -95,7 +116,10 @@ def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:
 def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
     assert signed_rank_test([0.0, 0.0])[:2] == (1.0, 0.5)
     tied = signed_rank_test([-1.0, -1.0, 1.0, 2.0])
-    assert tied.p_value == scipy.stats.wilcoxon([-1, -1, 1, 2], correction=True, method="approx").pvalue
+    assert (
+        tied.p_value
+        == scipy.stats.wilcoxon([-1, -1, 1, 2], correction=True, method="approx").pvalue
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,23 +162,30 @@ def test_the_interval_of_samples_apart_has_a_width() -> None:
     assert effect_interval(0.0, 10, 10, 0.05) == pytest.approx((0, 1 - low))
 
 
-@pytest.mark.parametrize(("size", "alpha", "rank"), [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)])
+@pytest.mark.parametrize(
+    ("size", "alpha", "rank"), [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)]
+)
 def test_the_interval_of_a_median_lies_between_the_order_statistics_of_tables_of_the_sign_test(
     size: int, alpha: float, rank: int
 ) -> None:
     values = np.random.default_rng(1).permutation(size) + 1
     assert median_interval(values, alpha) == (rank, size + 1 - rank)
-    assert np.isnan([median_interval(values[:7], 0.01), median_interval([], 0.01)]).all(), "too few values"
+    assert np.isnan([median_interval(values[:7], 0.01), median_interval([], 0.01)]).all(), (
+        "too few values"
+    )
 
 
 PLACEBO = [1, 1, 2, 2, 3, 4, 4, 5, 5, 8, 8, 8, 8, 11, 11, 12, 12, 15, 17, 22, 23]
 TREATED = [6, 6, 6, 7, 10, 13, 16, 22, 23, *(6, 9, 10, 11, 17, 19, 20, 25, 32, 32, 34, 35)]
-"""Weeks of remission of leukaemia (Freireich et al. 1963), the censored ones of the treated last."""
+"""Weeks of remission of leukaemia (Freireich et al. 1963), the censored ones of the treated last.
+"""
 RELAPSED = [True] * 9 + [False] * 12
 
 
 def test_survival_of_the_textbook_example() -> None:
-    """Medians 8 (95 % interval 4 to 11) and 23 (13 to none) weeks, a log-rank chi-squared of 16.79."""
+    """Medians 8 (95 % interval 4 to 11) and 23 (13 to none) weeks, a log-rank chi-squared of
+    16.79.
+    """
     all_relapsed = [True] * len(PLACEBO)
     assert survival_median(PLACEBO, all_relapsed, 0.05) == (8, (4, 11))
     median, (low, high) = survival_median(TREATED, RELAPSED, 0.05)
@@ -163,22 +194,32 @@ def test_survival_of_the_textbook_example() -> None:
     p_value = log_rank_test((PLACEBO, all_relapsed), (TREATED, RELAPSED))
     assert scipy.stats.chi2.isf(p_value, 1) == pytest.approx(16.79, abs=0.005)
     nobody = ([100, 100], [False, False])
-    assert np.isnan([survival_median(*nobody)[0], log_rank_test(nobody, nobody)]).all(), "no event, no median, no test"
+    assert np.isnan([survival_median(*nobody)[0], log_rank_test(nobody, nobody)]).all(), (
+        "no event, no median, no test"
+    )
 
 
 def rich_case(**changes: Any) -> Case:
-    """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has evaluations."""
+    """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has
+    evaluations.
+    """
     values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
     rows = [
         row(
-            algorithm, run, values=value, sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0), tet=1 + i / 10
+            algorithm,
+            run,
+            values=value,
+            sd=1 - 0.3 * i + 0.1 * run + (0.5 if algorithm == "rs" else 0),
+            tet=1 + i / 10,
         )
         for algorithm in ("nsga2", "rs")
         for run in (0, 1)
         for i, value in enumerate(values)
     ]
     return made_up(
-        *rows, study=made_up_study(**changes), evaluations=[{**one, "evaluation": i % 8} for i, one in enumerate(rows)]
+        *rows,
+        study=made_up_study(**changes),
+        evaluations=[{**one, "evaluation": i % 8} for i, one in enumerate(rows)],
     )
 
 
@@ -186,10 +227,21 @@ def special_case() -> Case:
     """Names and units with the characters that LaTeX reads as commands."""
     tables = {
         name: CharacteristicTable(unit=name, original=1, lower=0.5, upper=2)
-        for name in ("a&b", "50%_of $x$", "#1 {brace}", r"back\slash", "~tilde^2", "[option]", "*star|", "µ ° ² ä")
+        for name in (
+            "a&b",
+            "50%_of $x$",
+            "#1 {brace}",
+            r"back\slash",
+            "~tilde^2",
+            "[option]",
+            "*star|",
+            "µ ° ² ä",
+        )
     }
     case = made_up(row(), row("rs"), study=made_up_study(characteristics=tables))
-    solutions = case.solutions.assign(**{name: 1.5 if i < 4 else 1.0 for i, name in enumerate(tables)})
+    solutions = case.solutions.assign(
+        **{name: 1.5 if i < 4 else 1.0 for i, name in enumerate(tables)}
+    )
     return dataclasses.replace(case, name="_".join(tables), solutions=solutions)
 
 
@@ -217,7 +269,9 @@ DOCUMENT = r"""\documentclass{article}
 """
 
 
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI")
+@pytest.mark.skipif(
+    shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI"
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_latex_compiles(name: str, tmp_path: Path) -> None:
@@ -234,13 +288,15 @@ def test_latex_compiles(name: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout[-2000:]
 
 
-def test_the_table_for_a_paper_has_a_line_for_each_metric_and_a_mark_where_the_long_one_is_significant() -> None:
+def test_the_table_for_a_paper_marks_each_metric_that_is_significant() -> None:
     answer = answer_questions([three_algorithms()])
     long = answer.tables["rq2-runs"].set_index(["metric", "baseline"])
     short = answer.tables["a12"].set_index(["metric", "baseline"])
     assert long.index.tolist() == short.index.tolist()
     for key, text in short["a12"].items():
-        effect, is_significant, magnitude = long.loc[key, ["effect_size", "significant", "magnitude"]]
+        effect, is_significant, magnitude = long.loc[
+            key, ["effect_size", "significant", "magnitude"]
+        ]
         letter = "" if magnitude == "negligible" else f" {magnitude[0].upper()}"
         assert text == f"{effect:.2f}{'*' if is_significant else ''}{letter}"
     assert short["significant"].any()
@@ -254,28 +310,42 @@ def test_the_table_for_a_paper_has_a_line_for_each_metric_and_a_mark_where_the_l
 @pytest.mark.parametrize(
     ("name", "columns"),
     [
-        ("rq1", "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original enough_runs"),
+        (
+            "rq1",
+            (
+                "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"
+                " enough_runs"
+            ),
+        ),
         (
             "rq2",
-            "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm enough_runs evaluations "
-            "baseline_evaluations",
+            (
+                "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm"
+                " enough_runs evaluations baseline_evaluations"
+            ),
         ),
         (
             "rq1-runs",
-            "setting algorithm metric p_value p_holm effect_size effect_size_low effect_size_high magnitude runs "
-            "method mean original enough_runs",
+            (
+                "setting algorithm metric p_value p_holm effect_size effect_size_low"
+                " effect_size_high magnitude runs method mean original enough_runs"
+            ),
         ),
         (
             "rq2-runs",
-            "setting baseline metric p_value p_holm effect_size effect_size_low effect_size_high magnitude n1 n2 "
-            "method algorithm enough_runs",
+            (
+                "setting baseline metric p_value p_holm effect_size effect_size_low"
+                " effect_size_high magnitude n1 n2 method algorithm enough_runs"
+            ),
         ),
         ("medians", "setting algorithm metric runs median median_low median_high"),
         ("convergence", "case algorithm evaluations hypervolume low high"),
         (
             "rq2-common",
-            "setting baseline metric p_value p_holm effect_size effect_size_low effect_size_high magnitude n1 n2 "
-            "method algorithm enough_runs",
+            (
+                "setting baseline metric p_value p_holm effect_size effect_size_low"
+                " effect_size_high magnitude n1 n2 method algorithm enough_runs"
+            ),
         ),
         ("evaluations", "setting algorithm run requested simulated budget"),
         ("rq3.1", "setting run j count"),
@@ -286,26 +356,40 @@ def test_the_table_for_a_paper_has_a_line_for_each_metric_and_a_mark_where_the_l
         ("combinations", "setting rank characteristics percent"),
         (
             "weather",
-            "setting other characteristic percent percent_other difference rank rank_other increase increase_other "
-            "decrease decrease_other",
+            (
+                "setting other characteristic percent percent_other difference rank rank_other"
+                " increase increase_other decrease decrease_other"
+            ),
         ),
     ],
 )
 def test_tables_have_the_promised_columns(name: str, columns: str) -> None:
     table = answer_about("two").to_dict()["tables"][name]
-    assert set(table["columns"]) == {*columns.split(), *(["significant"] if "p_value" in columns else [])}
+    assert set(table["columns"]) == {
+        *columns.split(),
+        *(["significant"] if "p_value" in columns else []),
+    }
     for cells in table["rows"]:
         assert set(cells) == set(table["columns"])
-        counts = [cells.get(name) for name in ("n1", "n2", "n", "rank", "solutions", "collisions", "count")]
+        counts = [
+            cells.get(name)
+            for name in ("n1", "n2", "n", "rank", "solutions", "collisions", "count")
+        ]
         assert all(isinstance(count, int) for count in counts if count is not None)
 
 
 @pytest.mark.slow
-def test_the_tests_of_each_question_are_a_family_and_the_needed_runs_count_after_the_correction() -> None:
-    """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8 tests, and that of RQ2,
-    2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be without the correction.
+def test_the_tests_of_each_question_are_corrected_as_a_family() -> None:
+    """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8
+    tests, and that of RQ2, 2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be
+    without the correction.
     """
-    for runs, enough in ((6, (False, False)), (7, (False, True)), (10, (False, True)), (11, (True, True))):
+    for runs, enough in (
+        (6, (False, False)),
+        (7, (False, True)),
+        (10, (False, True)),
+        (11, (True, True)),
+    ):
         metrics = {"tet": (2.5, 2.0), "tit": (2.5, 2.0), "ave_dece": (9.0, 8.0)}
         case = made_up(
             *(
@@ -324,23 +408,35 @@ def test_the_tests_of_each_question_are_a_family_and_the_needed_runs_count_after
             assert len(table) == tests
             if runs <= 8:  # from then on, U's p-value of tied runs is approximate
                 assert table["p_holm"].min() == pytest.approx(min(tests * smallest, 1))
-            assert (table["enough_runs"].all(), table["significant"].any()) == (is_enough, is_enough)
+            assert (table["enough_runs"].all(), table["significant"].any()) == (
+                is_enough,
+                is_enough,
+            )
             text = " ".join(remarks["remark"])
-            assert f"p is corrected by Holm's method for the {tests} tests of {name[:3].upper()}, a family." in text
+            assert (
+                f"p is corrected by Holm's method for the {tests} tests of {name[:3].upper()}, a"
+                " family." in text
+            )
             assert ("are needed after the correction" in text) is not is_enough
 
 
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
-    """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever the number of
-    solutions.
+    """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever
+    the number of solutions.
     """
     case = made_up(
-        *(row(name, run=i % 7, sd=sd - i / 100) for name, sd in (("nsga2", 0.5), ("rs", 1.5)) for i in range(30))
+        *(
+            row(name, run=i % 7, sd=sd - i / 100)
+            for name, sd in (("nsga2", 0.5), ("rs", 1.5))
+            for i in range(30)
+        )
     )
     answer = answer_questions([case])
     few = "too few runs of NSGA-II, RS for a test (8 are needed)"
     over_runs = answer.only("rq1-runs").tables["remarks"]["remark"]
-    assert "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)" in "".join(over_runs)
+    assert "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)" in "".join(
+        over_runs
+    )
     for name, stands_out in (("rq1", False), ("rq2", True)):
         table, remarks = answer.only(name).tables.values()
         assert (table["p_value"] < 0.001).any()

@@ -1,4 +1,6 @@
-"""RQ1 to RQ3 and the discussion on made-up solutions of three characteristics, whose values one can count by hand."""
+"""RQ1 to RQ3 and the discussion on made-up solutions of three characteristics, whose values one can
+count by hand.
+"""
 
 from __future__ import annotations
 
@@ -52,14 +54,19 @@ def only(frame: pd.DataFrame, **wanted: Any) -> JsonObject:
 def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
     frame = rq1(made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5))))
     assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
-    assert frame[["effect_size", "magnitude", "n1", "n2"]].drop_duplicates().values.tolist() == [[0, "large", 5, 5]]
+    assert frame[["effect_size", "magnitude", "n1", "n2"]].drop_duplicates().values.tolist() == [
+        [0, "large", 5, 5]
+    ]
     safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
     assert safer["effect_size"].tolist() == [1, 1, 1, 1]
 
 
 def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
     case = made_up(
-        {**row(sd=-3), "tet": 0.0}, row(sd=1, tet=1.4), {**row("rs", sd=-3), "tet": 9.0}, row("rs", sd=1, tet=1.3)
+        {**row(sd=-3), "tet": 0.0},
+        row(sd=1, tet=1.4),
+        {**row("rs", sd=-3), "tet": 9.0},
+        row("rs", sd=1, tet=1.3),
     )
     assert only(rq1(case), algorithm="nsga2", metric="tet")["mean"] == 1.4
     assert only(rq2(case), metric="tet")["effect_size"] == 1
@@ -67,13 +74,26 @@ def test_a_tet_that_stands_at_a_collision_is_not_counted() -> None:
 
 def test_rq2_is_high_where_nsga2_is_better() -> None:
     rows = [
-        *(row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1) for run in (0, 1, 2)),
+        *(
+            row(run=run, sd=0.5 - run / 10, tet=2, tit=1, ave_dece=3, f_diff=0.1)
+            for run in (0, 1, 2)
+        ),
         *(row("rs", run=run, sd=1.5 + run / 10, f_diff=0.6) for run in (0, 1, 2)),
     ]
     frame = rq2(made_up(*rows))
-    assert frame["metric"].tolist() == ["igd_plus", "hypervolume", "igd", "safety_degree", "tet", "tit", "ave_dece"]
+    assert frame["metric"].tolist() == [
+        "igd_plus",
+        "hypervolume",
+        "igd",
+        "safety_degree",
+        "tet",
+        "tit",
+        "ave_dece",
+    ]
     assert frame["effect_size"].tolist() == [1] * 7
-    exchanged = [{**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows]
+    exchanged = [
+        {**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows
+    ]
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
 
 
@@ -81,15 +101,30 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
 def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> None:
     case = three_algorithms()
     means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
-    for asked, first, others in (("", "nsga2", ["rs", "safe_fuzzer"]), ("safe_fuzzer", "safe_fuzzer", ["nsga2", "rs"])):
+    for asked, first, others in (
+        ("", "nsga2", ["rs", "safe_fuzzer"]),
+        ("safe_fuzzer", "safe_fuzzer", ["nsga2", "rs"]),
+    ):
         frame = rq2_runs(case, Choices(asked))
         assert (set(frame["algorithm"]), list(frame["baseline"].unique())) == ({first}, others)
         expected = compare_samples(means[first], means["rs"])
         chosen = only(frame, metric="safety_degree", baseline="rs")
-        assert (chosen["p_value"], chosen["effect_size"]) == (expected.p_value, 1 - expected.effect_size)
-    without = made_up(*(row(name, run, sd=sd) for name, sd in (("rs", 1.0), ("mine", 2.0)) for run in (0, 1)))
-    answer = answer_questions([dataclasses.replace(without, titles={"mine": "My search"})]).only("rq2")
-    assert only(answer.tables["rq2"], algorithm="rs", baseline="mine", metric="safety_degree")["effect_size"] == 1
+        assert (chosen["p_value"], chosen["effect_size"]) == (
+            expected.p_value,
+            1 - expected.effect_size,
+        )
+    without = made_up(
+        *(row(name, run, sd=sd) for name, sd in (("rs", 1.0), ("mine", 2.0)) for run in (0, 1))
+    )
+    answer = answer_questions([dataclasses.replace(without, titles={"mine": "My search"})]).only(
+        "rq2"
+    )
+    assert (
+        only(answer.tables["rq2"], algorithm="rs", baseline="mine", metric="safety_degree")[
+            "effect_size"
+        ]
+        == 1
+    )
     assert re.search(r"RS +│My search", answer.render("text"))
     asked = answer_questions([without], Choices("nsga2")).only("rq2")
     assert asked.tables["rq2"].empty
@@ -97,20 +132,31 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
 
 
 def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> None:
-    """Of 100 evaluations one algorithm repeats settings, the other stops early; in the last generation only repeats may
-    be missing.
+    """Of 100 evaluations one algorithm repeats settings, the other stops early; in the last
+    generation only repeats may be missing.
     """
     positions = {"nsga2": [*range(0, 90, 2), 95], "rs": range(40)}
     rows = [row(name, run) for name in positions for run in (0, 1)]
-    seen = [{**row(name, run), "evaluation": i} for name in positions for run in (0, 1) for i in positions[name]]
+    seen = [
+        {**row(name, run), "evaluation": i}
+        for name in positions
+        for run in (0, 1)
+        for i in positions[name]
+    ]
     case = made_up(*rows, evaluations=seen)
     counts = count_evaluations(case)
-    assert counts[["requested", "simulated"]].to_numpy().tolist() == [[100, 46]] * 2 + [[40, 40]] * 2
+    assert (
+        counts[["requested", "simulated"]].to_numpy().tolist() == [[100, 46]] * 2 + [[40, 40]] * 2
+    )
     answer = answer_questions([case])
     table = answer.tables["rq2"]
-    assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [[46, 40]]
+    assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [
+        [46, 40]
+    ]
     note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it ended early)."
-    assert f"made-up: settings that a run simulates, mean: {note}" in [*answer.tables["remarks"]["remark"]]
+    assert f"made-up: settings that a run simulates, mean: {note}" in [
+        *answer.tables["remarks"]["remark"]
+    ]
     assert "46" in answer.only("evaluations").render("text")
     imported = answer_questions([made_up(*rows, has_runs=False)])
     assert imported.tables["rq2"]["evaluations"].isna().all()
@@ -118,8 +164,8 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
 
 
 def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
-    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the 8 against 8 that
-    there are.
+    """Runs of 40 copies each: pooled, rank tests see 320 against 320 values; over runs they see the
+    8 against 8 that there are.
     """
     ours = [1.0, 1.1, 1.2, 1.3, 1.4, 1.6, 1.7, 2.2]
     theirs = [1.5, 1.8, 1.9, 2.3, 2.4, 2.5, 2.6, 2.7]
@@ -133,33 +179,52 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     )
     paper, runs = (only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case)))
     assert paper["p_value"] < 1e-30
-    assert (runs["n1"], runs["n2"], runs["effect_size"]) == (8, 8, 1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64)
-    assert runs["p_value"] == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue > ALPHA / 10
+    assert (runs["n1"], runs["n2"], runs["effect_size"]) == (
+        8,
+        8,
+        1 - (0 + 0 + 0 + 0 + 0 + 1 + 1 + 3) / 64,
+    )
+    assert (
+        runs["p_value"]
+        == scipy.stats.mannwhitneyu(ours, theirs, method="exact").pvalue
+        > ALPHA / 10
+    )
     original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
     assert original["p_value"] == 2 * 2 / 2**8, "all signed ranks but the smallest are negative"
     assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
 
 
 def test_runs_without_a_collision_have_needed_more_evaluations_than_they_requested() -> None:
-    """Two of three runs of one algorithm collide, in their third and tenth evaluation, and none of the other."""
+    """Two of three runs of one algorithm collide, in their third and tenth evaluation, and none of
+    the other.
+    """
     seen = [
-        {**row(name, run, sd=-1.0 if name == "nsga2" and i == (2, 9, None)[run] else 1.0), "evaluation": i}
+        {
+            **row(name, run, sd=-1.0 if name == "nsga2" and i == (2, 9, None)[run] else 1.0),
+            "evaluation": i,
+        }
         for name in ("nsga2", "rs")
         for run in range(3)
         for i in range(100)
     ]
-    case = made_up(*(row(name, run) for name in ("nsga2", "rs") for run in range(3)), evaluations=seen)
+    case = made_up(
+        *(row(name, run) for name in ("nsga2", "rs") for run in range(3)), evaluations=seen
+    )
     ours, theirs = first_collisions(case, Choices(alpha=0.05)).to_dict("records")
     assert (ours["runs"], ours["collided"], ours["median"]) == (3, 2, 10)
     assert (theirs["runs"], theirs["collided"], math.isnan(theirs["median"])) == (3, 0, True)
     assert math.isnan(ours["p_value"])
     # At the collisions 3 of 6 and 2 of 5 runs at risk are of the algorithm.
     chi_squared = (2 - (3 / 6 + 2 / 5)) ** 2 / (3 * 3 / 6**2 + 2 * 3 / 5**2)
-    assert theirs["p_value"] == theirs["p_holm"] == pytest.approx(scipy.stats.chi2.sf(chi_squared, 1))
+    assert (
+        theirs["p_value"] == theirs["p_holm"] == pytest.approx(scipy.stats.chi2.sf(chi_squared, 1))
+    )
 
 
 def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -> None:
-    """The first collision of each run is in such an encounter, the second, in its fifth evaluation, is not."""
+    """The first collision of each run is in such an encounter, the second, in its fifth evaluation,
+    is not.
+    """
     seen = [
         {**row(name, sd=-1.0 if i in (1, 4) else 1.0, f_diff=0.5), "evaluation": i}
         for name in ("nsga2", "rs")
@@ -174,7 +239,9 @@ def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -
     )
     for one, median in ((case, 2), (joint, 5)):
         assert first_collisions(one)["median"].tolist() == [median] * 2
-    none = dataclasses.replace(joint, evaluations=joint.evaluations.assign(original_safety_degree=0.1))
+    none = dataclasses.replace(
+        joint, evaluations=joint.evaluations.assign(original_safety_degree=0.1)
+    )
     assert first_collisions(none)["collided"].tolist() == [0, 0]
     assert (compute_convergence(none)["hypervolume"] == 0).all()
     assert (compute_convergence(joint)["hypervolume"] > 0).any()
@@ -200,13 +267,19 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
 @pytest.mark.slow
 def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
     case = three_algorithms()
-    counts = [(name, run, 9, 5, 7 if name == "nsga2" else run % 3) for name in case.algorithms for run in range(8)]
+    counts = [
+        (name, run, 9, 5, 7 if name == "nsga2" else run % 3)
+        for name in case.algorithms
+        for run in range(8)
+    ]
     frame = pd.DataFrame(counts, columns=["algorithm", "run", "failures", "examined", "causes"])
     choices = Choices(causes={case.name: frame})
     found = only(rq2_runs(case, choices), metric="causes", baseline="rs")
     assert (found["effect_size"], found["n1"], found["significant"]) == (1, 8, True)
     assert "causes" not in [*rq2_runs(case)["metric"]]
-    assert answer_questions([case], choices).tables["causes"]["causes"].tolist() == [row[-1] for row in counts]
+    assert answer_questions([case], choices).tables["causes"]["causes"].tolist() == [
+        row[-1] for row in counts
+    ]
     assert "causes" not in answer_questions([case]).tables
 
 
@@ -221,7 +294,12 @@ def test_critical_solutions_are_strictly_below_the_original() -> None:
 
 
 def test_rq31_counts_runs_without_any() -> None:
-    case = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), finished=[("nsga2", 0), ("nsga2", 1)])
+    case = made_up(
+        row(values=HEAVY),
+        row(values=GRIPLESS),
+        row(values=BOTH),
+        finished=[("nsga2", 0), ("nsga2", 1)],
+    )
     assert rq31(case)[["run", "j", "count"]].to_numpy().tolist() == [
         [0, "1", 2],
         [0, "2", 1],
@@ -233,8 +311,12 @@ def test_rq31_counts_runs_without_any() -> None:
 
 
 def test_rq32_shares_and_ranks() -> None:
-    frame = rq32(made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY)))
-    percents = {(one["characteristic"], one["j"]): one["percent"] for one in frame.to_dict("records")}
+    frame = rq32(
+        made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY))
+    )
+    percents = {
+        (one["characteristic"], one["j"]): one["percent"] for one in frame.to_dict("records")
+    }
     assert [percents["mass", j] for j in ("1", "2", "3", "any")] == pytest.approx(
         [200 / 3, 100, np.nan, 75], nan_ok=True
     )
@@ -243,7 +325,14 @@ def test_rq32_shares_and_ranks() -> None:
 
 
 def test_rq33_tells_increases_from_decreases() -> None:
-    frame = rq33(made_up(row(values=HEAVY), row(values=(1300, 2, 0.1)), row(values=(900, 2, 0.1)), row(values=BOTH)))
+    frame = rq33(
+        made_up(
+            row(values=HEAVY),
+            row(values=(1300, 2, 0.1)),
+            row(values=(900, 2, 0.1)),
+            row(values=BOTH),
+        )
+    )
     cells = {
         (one["characteristic"], one["direction"], one["j"]): (one["pc"], one["delta"], one["n"])
         for one in frame.to_dict("records")
@@ -256,7 +345,9 @@ def test_rq33_tells_increases_from_decreases() -> None:
 
 
 def test_the_footer_of_rq33() -> None:
-    """A TET that stands at a collision is not counted, and nothing is a share of an original value of zero."""
+    """A TET that stands at a collision is not counted, and nothing is a share of an original value
+    of zero.
+    """
     rows = [
         row(values=HEAVY, sd=1.5, tet=1.5, tit=0.6, ave_dece=5),
         row(values=HEAVY, sd=0.5, tet=2, tit=1, ave_dece=4),
@@ -275,7 +366,9 @@ def test_the_footer_of_rq33() -> None:
         assert (result["value"], result["n"]) == (pytest.approx(value), n)
         assert result["percent"] == pytest.approx(percent, nan_ok=True)
     assert only(frame, quantity="avgSD_cS", j="2")["n"] == 0
-    zero = only(rq33_safety(made_up(*rows, original={**ORIGINAL, "tet": 0.0})), quantity="TET", j="any")
+    zero = only(
+        rq33_safety(made_up(*rows, original={**ORIGINAL, "tet": 0.0})), quantity="TET", j="any"
+    )
     assert (zero["value"], zero["percent"]) == pytest.approx((1.75, np.nan), nan_ok=True)
 
 
@@ -288,8 +381,12 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
     wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
     changes = {"metrics": MetricsTable(ttc_threshold=9), "step_length": 0.05}
-    other = made_up(row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", **changes))
-    assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [("made-up", "wet")]
+    other = made_up(
+        row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", **changes)
+    )
+    assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [
+        ("made-up", "wet")
+    ]
     result = only(compare_weathers(clear, wet), characteristic="mass")
     assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
     assert (result["increase"], result["increase_other"], result["decrease"]) == pytest.approx(
@@ -297,7 +394,11 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
     )
     assert (result["rank"], result["rank_other"]) == (1, 1)
     with pytest.raises(
-        InputError, match=r"differ in the weather alone; these two also differ in metrics\.ttc_threshold, step_length"
+        InputError,
+        match=(
+            r"differ in the weather alone; these two also differ in metrics\.ttc_threshold,"
+            r" step_length"
+        ),
     ):
         find_weather_pairs([clear, other])
     remarks = answer_questions([clear, other]).only("weather").tables["remarks"]["remark"]
@@ -306,7 +407,9 @@ def test_weather_compares_cases_that_differ_in_it_alone() -> None:
         find_weather_pairs([clear, clear])
 
 
-@pytest.mark.parametrize(("clearer", "other"), [("clear", "hard_rain"), ("fog", "wet"), ("clear", "night")])
+@pytest.mark.parametrize(
+    ("clearer", "other"), [("clear", "hard_rain"), ("fog", "wet"), ("clear", "night")]
+)
 def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
     (pair,) = find_weather_pairs(
         [made_up(row(), study=made_up_study(name=name, weather=name)) for name in (other, clearer)]

@@ -25,7 +25,9 @@ ROWS = 3
 RESULT = [1, 5]
 BUDGET = 99
 HEAD = journal_head("study", "nsga2-00", ("a", "b"))
-in_one_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
+in_one_folder = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100
+)
 
 
 def batch(number: int) -> Evaluations:
@@ -67,7 +69,10 @@ def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int
 
 
 def same(one: Evaluations, other: Evaluations) -> bool:
-    rest = (np.array_equal(getattr(one, name), getattr(other, name)) for name in ("settings", "f_diff", "f_num_diff"))
+    rest = (
+        np.array_equal(getattr(one, name), getattr(other, name))
+        for name in ("settings", "f_diff", "f_num_diff")
+    )
     return all(rest) and not [*differences(one.results, other.results)]
 
 
@@ -101,7 +106,10 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
     frame = pd.concat([pd.DataFrame(line) for line in lines if "evaluation" in line])
     expected = Evaluations.concatenate([batch(number) for number in range(BATCHES)])
     assert frame["evaluation"].tolist() == list(range(ROWS * BATCHES))
-    for name, column in (("b", expected.settings[:, 1]), ("collision_speed", expected.collision_speed)):
+    for name, column in (
+        ("b", expected.settings[:, 1]),
+        ("collision_speed", expected.collision_speed),
+    ):
         assert np.array_equal(frame[name].to_numpy(dtype=float), column, equal_nan=True)
     assert lines[0]["tet"][2] is None, "undefined"
 
@@ -109,7 +117,9 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
 @pytest.mark.slow
 @in_one_folder
 @given(st.data())
-def test_a_truncated_journal_loads_its_whole_lines_and_continues(tmp_path: Path, data: st.DataObject) -> None:
+def test_a_truncated_journal_loads_its_whole_lines_and_continues(
+    tmp_path: Path, data: st.DataObject
+) -> None:
     path = tmp_path / "a.jsonl"
     ends = write(path)
     left = data.draw(st.integers(0, ends[-1] - 1))
@@ -143,14 +153,19 @@ def test_a_damaged_line_and_all_after_it_are_lost(line: int, tmp_path: Path) -> 
 def edited(line: bytes, **columns: object) -> bytes:
     """The line with other columns and its checksum as it was; None leaves a column out."""
     table = {**json.loads(line), **columns}
-    return json.dumps({name: column for name, column in table.items() if column is not None}).encode() + b"\n"
+    return (
+        json.dumps({name: column for name, column in table.items() if column is not None}).encode()
+        + b"\n"
+    )
 
 
 ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
     "an outcome that does not exist": lambda line: line.replace(b"stopped", b"exploded"),
     "another outcome": lambda line: line.replace(b'"collision"', b'"stopped"'),
     "a digit": lambda line: line.replace(b"11.1", b"11.2"),
-    "a digit at the end of a number": lambda line: line.replace(b"3.6666666666666665", b"3.6666666666666664"),
+    "a digit at the end of a number": lambda line: line.replace(
+        b"3.6666666666666665", b"3.6666666666666664"
+    ),
     "an undefined value": lambda line: line.replace(b'"tet":[10.', b'"tet":[null,10.'),
     "a value out of its domain": lambda line: line.replace(b'"a":[10.0', b'"a":[1e99'),
     "a missing column": lambda line: edited(line, tet=None),
@@ -197,7 +212,9 @@ def test_other_solutions_and_lines_in_another_order_are_not_believed(tmp_path: P
     assert holds_the_first(0, read_journal(path, HEAD))
 
 
-def test_a_checksum_is_that_of_all_lines_up_to_there_without_their_checksums(tmp_path: Path) -> None:
+def test_a_checksum_is_that_of_all_lines_up_to_there_without_their_checksums(
+    tmp_path: Path,
+) -> None:
     write(tmp_path / "a.jsonl")
     head, *lines = (tmp_path / "a.jsonl").read_bytes().splitlines()
     for line in lines:
@@ -215,7 +232,9 @@ def without_checksums(path: Path) -> None:
     path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
 
 
-def test_a_journal_of_the_format_without_checksums_is_read_and_goes_on_in_it(tmp_path: Path) -> None:
+def test_a_journal_of_the_format_without_checksums_is_read_and_goes_on_in_it(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.jsonl"
     write(path)
     whole = path.read_bytes()
@@ -313,7 +332,9 @@ def test_a_journal_of_another_study_or_run_is_refused(
     tmp_path: Path, opened: Callable[..., object], study: str, run: str
 ) -> None:
     write(tmp_path / "a.jsonl")
-    with pytest.raises(InputError, match="belongs to another study, version or run, or is no journal"):
+    with pytest.raises(
+        InputError, match="belongs to another study, version or run, or is no journal"
+    ):
         opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
 
 

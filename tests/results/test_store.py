@@ -40,7 +40,9 @@ NAMES = ("a", "b")
 
 def evaluations(*safety: float) -> Evaluations:
     values = np.array(safety)
-    exposure = {name: np.where(values <= 0, np.nan, time) for name, time in (("tet", 0.2), ("tit", 0.1))}
+    exposure = {
+        name: np.where(values <= 0, np.nan, time) for name, time in (("tet", 0.2), ("tit", 0.1))
+    }
     return made_up_evaluations(
         values,
         settings=np.arange(2.0 * len(values)).reshape(-1, 2),
@@ -116,7 +118,9 @@ def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Stu
         ResultsDirectory(tmp_path, load_study("native"))
 
 
-def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_not_continued(tmp_path: Path) -> None:
+def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_not_continued(
+    tmp_path: Path,
+) -> None:
     def joint(meaning: str = "", upper: float = 20.0, margin: float = 0.3) -> Study:
         distance = {"unit": "m", "original": 12, "lower": 8, "upper": upper, "meaning": meaning}
         return load_study("smoke", scenario={"search": {"distance": distance}, "margin": margin})
@@ -139,7 +143,9 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         with_search(study, algorithms=["rs"]),
     ):
         directory = ResultsDirectory(tmp_path, other)
-        assert identity_digest(directory.manifest) == identity_digest(ResultsDirectory(tmp_path, study).manifest)
+        assert identity_digest(directory.manifest) == identity_digest(
+            ResultsDirectory(tmp_path, study).manifest
+        )
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"study": 3', "\x00"])
@@ -149,13 +155,21 @@ def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, tex
         ResultsDirectory(tmp_path, study)
 
 
-def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys(study: Study) -> None:
+def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys(
+    study: Study,
+) -> None:
     tables = tables_of(study)
-    stored = {"study": tables, "files": {"x.py": "0"}, "results": 1, "versions": {"numpy": "1", "libsumo": "1"}}
+    stored = {
+        "study": tables,
+        "files": {"x.py": "0"},
+        "results": 1,
+        "versions": {"numpy": "1", "libsumo": "1"},
+    }
 
     def changed(**layers: object) -> list[tuple[str, bool]]:
         return [
-            (text, changes_simulations) for _, text, changes_simulations in differences(stored, {**stored, **layers})
+            (text, changes_simulations)
+            for _, text, changes_simulations in differences(stored, {**stored, **layers})
         ]
 
     assert changed(study={**tables, "new": False}, versions={"numpy": "2", "libsumo": "1"}) == [
@@ -163,7 +177,9 @@ def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_ke
         ("version of numpy was '1' and is '2' now", False),
     ]
     assert not changed(study={**tables, "title": "new"})
-    assert changed(study={**tables, "weather": "fog"}, files={}, results=2, versions={"libsumo": "2"}) == [
+    assert changed(
+        study={**tables, "weather": "fog"}, files={}, results=2, versions={"libsumo": "2"}
+    ) == [
         (f"weather was {tables['weather']!r} and is 'fog' now", True),
         ("x.py no longer exists", True),
         ("the version of the package's results was 1 and is 2 now", True),
@@ -192,7 +208,17 @@ def test_rows_count_within_their_run() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "nsga2", "nsga2:0", "nsga2:0:", ":0:0", "nsga2:-1:0", "nsga2:0:0:0", "nsga2:0:x", "nsga2:0:" + "9" * 30],
+    [
+        "",
+        "nsga2",
+        "nsga2:0",
+        "nsga2:0:",
+        ":0:0",
+        "nsga2:-1:0",
+        "nsga2:0:0:0",
+        "nsga2:0:x",
+        "nsga2:0:" + "9" * 30,
+    ],
 )
 def test_a_text_that_is_no_handle_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
@@ -217,7 +243,9 @@ def test_chosen_by_what_they_are_among_the_unsafe() -> None:
 
 def test_without_a_collision_half_the_distance_is_unsafe() -> None:
     safe = FRAME[FRAME["outcome"] == "stopped"]
-    wide, narrow = (Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0))
+    wide, narrow = (
+        Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0)
+    )
     assert str(choose_handle(safe, wide, "smallest")) == "rs:0:0"
     with pytest.raises(InputError, match="no unsafe solution"):
         choose_handle(safe, narrow, "smallest")
@@ -240,7 +268,10 @@ def test_a_criterion_in_words_is_rounded_but_its_text_is_exact() -> None:
         "SD is below 0.847",
     )
     assert half == Unsafe(0.847103)
-    assert [Unsafe.parse(text).description for text in ("collision", "below=0.847103", "below=-2", "points=3.5")] == [
+    assert [
+        Unsafe.parse(text).description
+        for text in ("collision", "below=0.847103", "below=-2", "points=3.5")
+    ] == [
         "collision",
         "safety degree below 0.847 m",
         "safety degree below -2 m/s",
@@ -280,8 +311,12 @@ def test_altered_journals_are_simulated_again_and_those_without_checksums_are_re
     run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
     assert journal.read_bytes() == whole
     assert (copied / "solutions.csv").read_bytes() == (slippery / "solutions.csv").read_bytes()
-    journal.write_bytes(re.sub(rb',"crc32":\d+}\n', b"}\n", whole.replace(b'"format":6', b'"format":5')))
-    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout, "the manifest says that there are checksums"
+    journal.write_bytes(
+        re.sub(rb',"crc32":\d+}\n', b"}\n", whole.replace(b'"format":6', b'"format":5'))
+    )
+    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout, (
+        "the manifest says that there are checksums"
+    )
     manifest = read_manifest(copied)
     assert manifest.pop("journals") == 6
     (copied / "manifest.json").write_text(json.dumps(manifest))
@@ -305,12 +340,16 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
         ("study", study, "--out", str(copied), "--quiet"),
         ("report", str(copied)),
     ):
-        refused(*command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew"))
+        refused(
+            *command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew")
+        )
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
     return {
-        str(path): (path.read_bytes(), path.stat().st_mtime_ns) for path in sorted(place.rglob("*")) if path.is_file()
+        str(path): (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in sorted(place.rglob("*"))
+        if path.is_file()
     }
 
 
@@ -337,9 +376,16 @@ def test_a_study_under_way(copied: Path) -> None:
     rs = copied / "runs/rs-00.jsonl"
     rs.unlink()
     (copied / "solutions.csv").unlink()  # written after the last run
-    nsga2.write_bytes(nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3])  # torn, as while somebody writes
+    nsga2.write_bytes(
+        nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3]
+    )  # torn, as while somebody writes
     begun, waiting = status_of(copied).values()
-    assert (begun["finished"], waiting["finished"], waiting["simulated"], waiting["best"]) == (0, 0, 0, None)
+    assert (begun["finished"], waiting["finished"], waiting["simulated"], waiting["best"]) == (
+        0,
+        0,
+        0,
+        None,
+    )
     assert 0 < begun["simulated"] < 56
     nsga2.write_bytes(nsga2.read_bytes().partition(b"\n")[0] + b"\n")
     assert status_of(copied)["nsga2"]["simulated"] == 0

@@ -50,11 +50,13 @@ class Pedals(Ads):
 def driven(
     scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA
 ) -> SimulationRuns:
-    """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the vehicle keeps its
-    speed.
+    """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the
+    vehicle keeps its speed.
     """
     system = replace(system, scenario=scenario, matrix=(), ads=ads or Hold())
-    return simulate(system, system.characteristics.original[np.newaxis] if settings is None else settings)
+    return simulate(
+        system, system.characteristics.original[np.newaxis] if settings is None else settings
+    )
 
 
 def at_contact(run: SimulationRuns, values: FloatArray, vehicle: int = 0) -> float:

@@ -1,4 +1,6 @@
-"""Many encounters at once: a vehicle without drag or lag, and a point mass that obeys a driver's rule."""
+"""Many encounters at once: a vehicle without drag or lag, and a point mass that obeys a driver's
+rule.
+"""
 
 from __future__ import annotations
 
@@ -48,14 +50,18 @@ class Ideal(Vehicle):
         return seen, state
 
     def advance(self, prepared: Any, state: Any, command: Any) -> Rolling:
-        speed = np.maximum(state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0], 0.0)
+        speed = np.maximum(
+            state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0], 0.0
+        )
         return Rolling(speed, command.throttle, command.brake, state.gear)
 
 
 def ideal(system: System) -> System:
     """A system with the vehicle without drag or lag."""
     vehicle = Ideal()
-    return replace(system, vehicle=vehicle, nominal=calibration_drive(vehicle, system.characteristics))
+    return replace(
+        system, vehicle=vehicle, nominal=calibration_drive(vehicle, system.characteristics)
+    )
 
 
 def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> SimulationRuns:
@@ -68,8 +74,8 @@ def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> Si
 
 
 class Mass(NamedTuple):
-    """How N point masses meet another car: whether the front hits it, at which closing speed [m/s], and the least gap
-    in the path [m].
+    """How N point masses meet another car: whether the front hits it, at which closing speed [m/s],
+    and the least gap in the path [m].
     """
 
     hits: Any
@@ -86,11 +92,13 @@ def point_mass(
     reaction: float = 0.75,
     released: float = 0.0,
 ) -> Mass:
-    """A driver's rule, integrated in fine steps. He keeps his speed until he sees a danger, releases the accelerator
-    for the reaction time, and then never speeds up again: his deceleration rises at 12.65 m/s^3 to that of the rule.
+    """A driver's rule, integrated in fine steps. He keeps his speed until he sees a danger,
+    releases the accelerator for the reaction time, and then never speeds up again: his deceleration
+    rises at 12.65 m/s^3 to that of the rule.
 
-    `rule` says from time, both speeds, gap and own acceleration whether there is a danger, and how hard he brakes;
-    `other` is the other car's speed, `beside` how long it stays beside the path [s].
+    `rule` says from time, both speeds, gap and own acceleration whether there is a danger, and how
+    hard he brakes; `other` is the other car's speed, `beside` how long it stays beside the path
+    [s].
     """
     step = 0.005
     braking = acceleration = impact = 0.0 * v
@@ -116,8 +124,8 @@ def point_mass(
 
 
 def agreement(runs: SimulationRuns, expected: Mass, path: float) -> tuple[Any, Any]:
-    """Where outcomes are equal; and by how much gaps [m], or the closing speeds of two collisions [m/s], differ, of
-    cars whose middles are less than `path` [m] aside when they are in the path.
+    """Where outcomes are equal; and by how much gaps [m], or the closing speeds of two collisions
+    [m/s], differ, of cars whose middles are less than `path` [m] aside when they are in the path.
     """
     hits = runs.outcome == "collision"
     closing = runs.collision_speed - runs.contact.speed

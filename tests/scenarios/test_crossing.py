@@ -1,5 +1,5 @@
-"""The shipped scenarios in an artificial world, crossing pedestrians above all: position over time, point of impact,
-occlusion by parked cars, gaps, ends of encounters, and agreement with SUMO.
+"""The shipped scenarios in an artificial world, crossing pedestrians above all: position over time,
+point of impact, occlusion by parked cars, gaps, ends of encounters, and agreement with SUMO.
 """
 
 from __future__ import annotations
@@ -31,7 +31,13 @@ from tests.scenarios.holding import at_contact, driven
 
 @pytest.mark.parametrize(
     ("test", "location", "speed"),
-    [("CPFA", 50.0, 10.0), ("CPFA", 0.0, 60.0), ("CPNA", 25.0, 30.0), ("CPNA", 100.0, 10.0), ("CPNCO", 10.0, 60.0)],
+    [
+        ("CPFA", 50.0, 10.0),
+        ("CPFA", 0.0, 60.0),
+        ("CPNA", 25.0, 30.0),
+        ("CPNA", 100.0, 10.0),
+        ("CPNCO", 10.0, 60.0),
+    ],
 )
 def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_impact(
     test: str, location: float, speed: float
@@ -45,13 +51,22 @@ def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_i
 
 
 @settings(max_examples=40)
-@given(speed=st.floats(1, 5), run_up=st.just(0.0) | st.floats(0.1, 3), rest=st.floats(0.01, 8), time=st.floats(20, 60))
-def test_a_target_arrives_in_time_with_any_speed_profile(speed: float, run_up: float, rest: float, time: float) -> None:
+@given(
+    speed=st.floats(1, 5),
+    run_up=st.just(0.0) | st.floats(0.1, 3),
+    rest=st.floats(0.01, 8),
+    time=st.floats(20, 60),
+)
+def test_a_target_arrives_in_time_with_any_speed_profile(
+    speed: float, run_up: float, rest: float, time: float
+) -> None:
     profile = SpeedProfile.with_arrival(run_up + rest, time, speed, run_up)
     assert profile.travelled(time) == pytest.approx(run_up + rest)
     assert profile.travelled(profile.begin) == 0
     if run_up:
-        assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(run_up, abs=1e-9)
+        assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(
+            run_up, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize(
@@ -94,9 +109,13 @@ def moved(folder: Path, network: str, forth: tuple[float, float]) -> str:
 
 @pytest.mark.parametrize("forth", TURNS.values(), ids=TURNS)
 @pytest.mark.parametrize("study", ["rain", "native"])
-def test_a_turned_road_changes_nothing(study: str, forth: tuple[float, float], tmp_path: Path) -> None:
+def test_a_turned_road_changes_nothing(
+    study: str, forth: tuple[float, float], tmp_path: Path
+) -> None:
     ours = load_study(study)
-    mine = load_study(study, scenario={"parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}})
+    mine = load_study(
+        study, scenario={"parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}}
+    )
     system = assemble(ours)
     settings = np.vstack([system.characteristics.original, system.characteristics.lower])
     here = simulate(system, settings)
@@ -112,7 +131,9 @@ STEP, LENGTH, LANE, PATH, WIDTH = 0.05, 5.0, 14.0, 40.0, 0.5
 
 
 class ArtificialWorld:
-    """One vehicle and one pedestrian at positions that the test sets; the constants define lengths and widths."""
+    """One vehicle and one pedestrian at positions that the test sets; the constants define lengths
+    and widths.
+    """
 
     def __init__(self, front: float, lateral: float) -> None:
         self.front = front
@@ -161,7 +182,8 @@ def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
 
 
 @pytest.mark.parametrize(
-    ("front", "over"), [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)]
+    ("front", "over"),
+    [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)],
 )
 def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
     scenario = PedestrianCrossing()
@@ -172,7 +194,13 @@ def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, o
 
 @pytest.mark.parametrize(
     ("before", "now", "over"),
-    [(1.70, 1.79, True), (1.60, 1.74, False), (1.90, 1.81, False), (-1.90, -1.80, False), (-1.70, -1.79, True)],
+    [
+        (1.70, 1.79, True),
+        (1.60, 1.74, False),
+        (1.90, 1.81, False),
+        (-1.90, -1.80, False),
+        (-1.70, -1.79, True),
+    ],
 )
 def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
     before: float, now: float, over: bool
@@ -185,8 +213,8 @@ def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
 
 
 def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
-    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next would lead beyond
-    0.7 m.
+    """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next
+    would lead beyond 0.7 m.
     """
     scenario = PedestrianCrossing()
     world = ArtificialWorld(0.0, 0.0)
@@ -201,14 +229,17 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
     assert turns == [7], "0.63 m; 0.72 m would be beyond"
 
 
-def trace(gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]) -> Trace:
+def trace(
+    gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]
+) -> Trace:
     columns = (np.array(values)[:, np.newaxis] for values in (speed, gap, lateral, lateral_speed))
     v, gaps, across, across_speed = columns
     return made_up_runs(STEP, v, gaps, lateral=across, lateral_speed=across_speed).trace
 
 
 def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
-    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos + v_ped sin = 0.8 * 6 +
+    """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos +
+    v_ped sin = 0.8 * 6 +
     0.6 * 1.5.
     """
     encounter = PedestrianCrossing().encounter(trace([4.0 - LENGTH / 2], [6.0], [-3.0], [1.5]))
@@ -222,8 +253,13 @@ PARKED = 12.0
 
 def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() -> None:
     run = trace([3.0, -0.1], [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
-    encounter = LeadVehicleStopped().encounter(dataclasses.replace(run, obstacle_length=np.array(PARKED)))
-    assert encounter.separation[:, 0].tolist() == [3.0 + (LENGTH + PARKED) / 2, -0.1 + (LENGTH + PARKED) / 2]
+    encounter = LeadVehicleStopped().encounter(
+        dataclasses.replace(run, obstacle_length=np.array(PARKED))
+    )
+    assert encounter.separation[:, 0].tolist() == [
+        3.0 + (LENGTH + PARKED) / 2,
+        -0.1 + (LENGTH + PARKED) / 2,
+    ]
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
     assert encounter.in_conflict[:, 0].tolist() == [True, False]

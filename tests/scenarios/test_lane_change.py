@@ -1,4 +1,6 @@
-"""Cut-in, cut-out and following of UN R157: who moves how, and its driver by a second implementation of the rule."""
+"""Cut-in, cut-out and following of UN R157: who moves how, and its driver by a second
+implementation of the rule.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ HARDEST = 0.774 * 9.81
 
 
 def rule(v: Any, gap: Any, u: Any, beside: Any, perceived: Any) -> Mass:
-    """The regulation's driver: perceived at a time, a danger at a TTC below 2 s; he releases the accelerator, and
-    brakes with up to 0.774 g.
+    """The regulation's driver: perceived at a time, a danger at a TTC below 2 s; he releases the
+    accelerator, and brakes with up to 0.774 g.
     """
 
     def near(time: float, v: Any, u: Any, gap: Any, _: Any) -> Any:
@@ -49,7 +51,9 @@ def draw(low: float, high: float) -> Any:
 
 
 def assert_near(same: Any, late: Any) -> None:
-    """99 % are equal, and 98 % of their gaps or closing speeds are within 0.5 m or 0.5 m/s of the rule's."""
+    """99 % are equal, and 98 % of their gaps or closing speeds are within 0.5 m or 0.5 m/s of the
+    rule's.
+    """
     assert same.mean() >= 0.99
     assert np.mean(np.abs(late) < 0.5) >= 0.98
 
@@ -90,9 +94,18 @@ def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
 
 
 def test_a_cut_in_moves_as_it_says() -> None:
-    """Gap, place and speed when it begins, when it is in the lane and when it has stopped, from either side."""
+    """Gap, place and speed when it begins, when it is in the lane and when it has stopped, from
+    either side.
+    """
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        one = CutIn(speed=90.0, target_speed=72.0, gap=30.0, lateral_speed=1.75, target_deceleration=5.0, side=side)
+        one = CutIn(
+            speed=90.0,
+            target_speed=72.0,
+            gap=30.0,
+            lateral_speed=1.75,
+            target_deceleration=5.0,
+            side=side,
+        )
         (car,) = one.tracks(np.array([[0.0], [1.0], [2.0], [3.0], [5.0], [7.0], [9.0]]))
         rear = car.x[:, 0] - CAR.length / 2
         assert rear[1] - 25.0 == pytest.approx(30.0)
@@ -102,35 +115,55 @@ def test_a_cut_in_moves_as_it_says() -> None:
 
 
 def test_a_cut_out_hides_the_standing_car_until_the_leader_is_aside() -> None:
-    """The line of sight leads along the lane, so the leader hides it until he is half his width off his way."""
+    """The line of sight leads along the lane, so the leader hides it until he is half his width off
+    his way.
+    """
     one = CutOut(speed=72.0, headway=1.0, gap=60.0, lateral_speed=1.0, **BODY)
     run = driven(one, Hold(), system=WEAR)
     gap = run.trace.gap[:, 0]
     assert gap[20] == pytest.approx(20.0)
     shown = int(np.argmax(np.diff(gap) > 10)) + 1
     assert run.trace.time[shown] == pytest.approx(1.0 + CAR.width / 2, abs=2 * STEP)
-    assert gap[shown] == pytest.approx(20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0))
+    assert gap[shown] == pytest.approx(
+        20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0)
+    )
     impact = 1.0 + (20.0 + CAR.length + 60.0) / 20.0
     assert at_contact(run, run.trace.time) == pytest.approx(impact)
 
 
 def test_whose_collision_it_is() -> None:
-    """At 80 against 60 km/h and 1 m/s the car is in the path after 1.63 s, when a gap of 9.03 m is closed: from then on
-    the vehicle drives into its rear; before, the car drives its flank into the vehicle's side, and that is listed only.
+    """At 80 against 60 km/h and 1 m/s the car is in the path after 1.63 s, when a gap of 9.03 m is
+    closed: from then on the vehicle drives into its rear; before, the car drives its flank into the
+    vehicle's side, and that is listed only.
     """
     border = (20.0 / 3.6) * (3.5 - PATH)
-    for gap, side, outcome in ((border - 0.3, "left", "passed"), (border + 0.3, "front", "collision")):
+    for gap, side, outcome in (
+        (border - 0.3, "left", "passed"),
+        (border + 0.3, "front", "collision"),
+    ):
         run = driven(CutIn(speed=80.0, target_speed=60.0, gap=gap, **BODY), Hold(), system=WEAR)
         assert (run.contact.side[0], run.outcome[0]) == (side, outcome)
-    mirrored = driven(CutIn(speed=80.0, target_speed=60.0, gap=border - 0.3, side="right", **BODY), Hold(), system=WEAR)
+    mirrored = driven(
+        CutIn(speed=80.0, target_speed=60.0, gap=border - 0.3, side="right", **BODY),
+        Hold(),
+        system=WEAR,
+    )
     assert mirrored.contact.side[0] == "right"
 
 
 REFUSED = {
-    "closed": ("cut_in", {"speed": 130.0, "target_speed": 30.0, "gap": 10.0}, r"gap = 10 m is closed before"),
+    "closed": (
+        "cut_in",
+        {"speed": 130.0, "target_speed": 30.0, "gap": 10.0},
+        r"gap = 10 m is closed before",
+    ),
     "fast": ("cut_in", {"target_speed": 140.0}, "target_speed = 140"),
     "fast leader": ("car_to_car", {"test": "CCRb", "speed": 140.0}, "target_speed = 140 km/h"),
-    "through": ("cut_out", {"speed": 100.0, "gap": 20.0}, r"0\.72 m sideways when he drives through"),
+    "through": (
+        "cut_out",
+        {"speed": 100.0, "gap": 20.0},
+        r"0\.72 m sideways when he drives through",
+    ),
 }
 
 
@@ -146,14 +179,18 @@ def test_what_cannot_be_is_refused_in_two_lines(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_new_car_avoids_all_encounters_of_the_study_and_the_regulations_driver_in_it_all_but_two() -> None:
+def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_two() -> None:
     """He waits for a TTC of 2 s, which is too late before a standing car at 60 km/h."""
     too_fast = {"cut_out, speed 60, wet", "cut_out, speed 80, wet"}
-    for ads, failures in (({"model": "aeb"}, set()), ({"model": "competent_driver", "parameters": ANY}, too_fast)):
+    for ads, failures in (
+        ({"model": "aeb"}, set()),
+        ({"model": "competent_driver", "parameters": ANY}, too_fast),
+    ):
         system = assemble(load_study("alks", ads=ads))
         results = simulate_all_points(system, system.characteristics.original[np.newaxis])
         degrees = {
-            point.name: result.evaluations.f_safe[0] for point, result in zip(system.points, results, strict=True)
+            point.name: result.evaluations.f_safe[0]
+            for point, result in zip(system.points, results, strict=True)
         }
         assert len(degrees) == 15
         assert {name for name, degree in degrees.items() if degree < 0} == failures
@@ -166,7 +203,13 @@ def step(traci, vehicle_id):
     if leader and leader[1] < 30:
         traci.vehicle.slowDown(vehicle_id, 8, 1.0)
 """
-FOLLOWING = {"test": "CCRb", "speed": 80.0, "headway": 2.0, "target_deceleration": 7.0, "final_speed": 0.0}
+FOLLOWING = {
+    "test": "CCRb",
+    "speed": 80.0,
+    "headway": 2.0,
+    "target_deceleration": 7.0,
+    "final_speed": 0.0,
+}
 ENCOUNTERS = (
     ("cut_in", {"gap": 25.0}),
     ("cut_in", {"gap": 8.0, "side": "right"}),
@@ -181,7 +224,9 @@ ENCOUNTERS = (
 def test_whoever_drives_the_actors_are_where_sumo_has_them(
     model: str, parameters: dict[str, Any], ads: str, in_tmp: Path
 ) -> None:
-    """The test's speed is held until the driving system acts, be it an AEB, one that drives itself or a script."""
+    """The test's speed is held until the driving system acts, be it an AEB, one that drives itself
+    or a script.
+    """
     (in_tmp / "script.py").write_text(SCRIPT)
     scenario = {"model": model, "parameters": BODY | parameters}
     driver = {"model": ads, "parameters": {}, "kind": "traci" if ":" in ads else ""}
@@ -196,7 +241,9 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
 
 
 def test_a_leader_brakes_down_to_a_stop() -> None:
-    """R157's following: the leader's way to a stop is v^2 / (2 b), and the run lasts until he stands."""
+    """R157's following: the leader's way to a stop is v^2 / (2 b), and the run lasts until he
+    stands.
+    """
     one = CarToCar(test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0)
     run = driven(one, Hold(), system=WEAR)
     impact = at_contact(run, run.trace.time)

@@ -1,4 +1,6 @@
-"""A user's own scenario: its parameters are searched where they are declared, and what cannot be is refused."""
+"""A user's own scenario: its parameters are searched where they are declared, and what cannot be is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ class Mine(Struct, frozen=True, kw_only=True):
     '''A scooter comes out of a row past a parked van.'''
 
     speed: float = 40.0
-    scooter: Annotated[float, Meta(ge=5, le=30, description="speed of the scooter", extra={"unit": "km/h"})] = 15.0
+    scooter: Annotated[
+        float, Meta(ge=5, le=30, description="speed of the scooter", extra={"unit": "km/h"})
+    ] = 15.0
     gap: Annotated[float, searched(20.0, 60.0, "m", "gap to the scooter when it moves out")] = 30.0
     duration: float = 9.0
 
@@ -42,7 +46,8 @@ class Mine(Struct, frozen=True, kw_only=True):
         v = self.scooter / 3.6 + 0.0 * times
         moves = (times > 1.0) & (times < 3.0)
         y = -2.5 + np.clip(times - 1.0, 0.0, 2.0)
-        scooter = Track.of("scooter", "scooter", self.gap + travelled(v, times), y, v, 1.0 * moves, size=(1.8, 0.6))
+        x = self.gap + travelled(v, times)
+        scooter = Track.of("scooter", "scooter", x, y, v, 1.0 * moves, size=(1.8, 0.6))
         return [scooter, Track.of("van", "van", self.gap + 20.0, -3.2, size=(5.5, 2.0))]
 """
 SEARCH = {
@@ -57,18 +62,30 @@ def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     return load_study("wear", matrix=None, scenario=scenario, **tables)
 
 
-def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_in_a_matrix(in_tmp: Path) -> None:
+def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_in_a_matrix(
+    in_tmp: Path,
+) -> None:
     """A `msgspec.Struct` that does not forbid unknown fields takes no notice of them."""
     (in_tmp / "own.py").write_text(MINE)
     scenario = {"model": "own:Mine", "parameters": {"pase": 3}}
-    with pytest.raises(InputError, match=r"scenario\.parameters\.pase: .*own:Mine' has no such parameter"):
+    with pytest.raises(
+        InputError, match=r"scenario\.parameters\.pase: .*own:Mine' has no such parameter"
+    ):
         assemble(load_study("wear", matrix=None, scenario=scenario))
     with pytest.raises(InputError, match=r"test 'CPFA': .*own:Mine' has no such parameter"):
-        assemble(load_study("wear", scenario={"model": "own:Mine"}, matrix=tables_of(load_study("wear"))["matrix"]))
+        assemble(
+            load_study(
+                "wear",
+                scenario={"model": "own:Mine"},
+                matrix=tables_of(load_study("wear"))["matrix"],
+            )
+        )
 
 
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
-    """Each encounter is that of a study with these parameters, and the original vehicle meets the same."""
+    """Each encounter is that of a study with these parameters, and the original vehicle meets the
+    same.
+    """
     system = assemble(mine(in_tmp, SEARCH))
     settings = drawn(system, 6, 4)
     found = evaluate(system, settings)
@@ -77,10 +94,17 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
     assert names == ("scooter", "gap")
     for row, setting in enumerate(settings):
         parameters = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
-        alone = assemble(load_study("wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}))
+        alone = assemble(
+            load_study(
+                "wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}
+            )
+        )
         both = evaluate(alone, np.stack([setting[of_vehicle], alone.characteristics.original]))
         assert both.outcome[0] == found.outcome[row]
-        assert both.f_safe.tolist() == [found.f_safe[row], found.metrics["original_safety_degree"][row]]
+        assert both.f_safe.tolist() == [
+            found.f_safe[row],
+            found.metrics["original_safety_degree"][row],
+        ]
     assert not verify_in_sumo(system, settings)
 
 
@@ -117,7 +141,9 @@ gap = { unit = "m", original = 50, lower = 35, upper = 55 }
 def test_questions_answer_about_encounters_with_a_users_class(
     typed: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They draw encounters, too: the parameters of the class stand beside the vehicle's characteristics."""
+    """They draw encounters, too: the parameters of the class stand beside the vehicle's
+    characteristics.
+    """
     monkeypatch.setattr(scans, "SCAN_VALUES", 5)
     monkeypatch.setattr(evaluator, "ENCOUNTERS", 4)
     monkeypatch.setattr(evaluator, "CANDIDATES", 64)
@@ -151,7 +177,8 @@ class Mine(Struct, frozen=True, kw_only=True):
 
 def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path) -> None:
     methods = "".join(
-        f"\n    def {name}(self, *arguments):\n        return LeadVehicleStopped().{name}(*arguments)\n"
+        f"\n    def {name}(self, *arguments):\n        return"
+        f" LeadVehicleStopped().{name}(*arguments)\n"
         for name in ("begin", "observe", "encounter")
     )
     (in_tmp / "own.py").write_text(TRAFFIC + methods)
@@ -162,7 +189,11 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     found = evaluate(system, settings)
     for row, setting in enumerate(settings):
         parameters = {"distance": float(setting[-1])}
-        alone = assemble(load_study("native", scenario={"model": "lead_vehicle_stopped", "parameters": parameters}))
+        alone = assemble(
+            load_study(
+                "native", scenario={"model": "lead_vehicle_stopped", "parameters": parameters}
+            )
+        )
         assert evaluate(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
 
 
@@ -170,7 +201,11 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     ("name", "changes", "message"),
     [
         ("speed", {}, r"Mine has no such parameter to search"),
-        ("scooter", {"upper": 40}, r"scenario\.search\.scooter: .*\nexpected: a part of \[5, 30\] km/h"),
+        (
+            "scooter",
+            {"upper": 40},
+            r"scenario\.search\.scooter: .*\nexpected: a part of \[5, 30\] km/h",
+        ),
         ("gap", {"unit": "km"}, r"scenario\.search\.gap\.unit = 'km'\nexpected: 'm'"),
     ],
 )
@@ -208,8 +243,14 @@ class Mine:
         return """
 CAR = "Track.of('car', 'car', {}, 0.0)"
 MISTAKES = {
-    "jump": (CAR.format("60 + np.where(times > 1, 30.0, 0.0)"), "at 1.05 s actor 'car' jumps, at 600 m/s"),
-    "no number": (CAR.format("np.where(times > 1, np.nan, 50.0)"), "at 1.05 s actor 'car' has x = nan"),
+    "jump": (
+        CAR.format("60 + np.where(times > 1, 30.0, 0.0)"),
+        "at 1.05 s actor 'car' jumps, at 600 m/s",
+    ),
+    "no number": (
+        CAR.format("np.where(times > 1, np.nan, 50.0)"),
+        "at 1.05 s actor 'car' has x = nan",
+    ),
     "short": (CAR.format("60.0 + times[:20]"), "actor 'car': x ends at 0.95 s"),
     "flat": (CAR.format("60.0 + times[:, 0]"), r"x has the shape \(61,\)"),
     "one name": (f"{CAR.format(60.0)}, {CAR.format(80.0)}", "at 0 s 2 actors are called 'car'"),
@@ -218,7 +259,10 @@ MISTAKES = {
         "at 0 s actor 'car' is 1.71 m inside actor 'b'",
     ),
     "vehicle": (CAR.format(0.0), "at 0 s actor 'car' is 1.92 m inside the vehicle under test"),
-    "direction": ("Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 1.0, 0.0)", "has a direction of length 1.41421"),
+    "direction": (
+        "Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 1.0, 0.0)",
+        "has a direction of length 1.41421",
+    ),
     "fast": ("Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 0.0, 300.0)", "has a speed of 300 m/s"),
     "size": ("Track.of('bus', 'bus', 60.0, 0.0)", "a body of the kind 'bus' has no size"),
     "nobody": ("", r"returned \[\] from tracks"),

@@ -1,4 +1,6 @@
-"""Cells of Euro NCAP's tests: time, place and speed of the impact without braking; shipped points are avoided."""
+"""Cells of Euro NCAP's tests: time, place and speed of the impact without braking; shipped points
+are avoided.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,8 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A crossing test of the protocol: side, target speed [km/h], lateral start and run-up [m], headings and speed
-    changes of layers.
+    """A crossing test of the protocol: side, target speed [km/h], lateral start and run-up [m],
+    headings and speed changes of layers.
     """
 
     side: int
@@ -75,12 +77,18 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
             distance = (row.start + (location / 100 - 0.5) * width) * share
             arrival = max(6.0, math.ceil((distance + row.run_up) / target_speed_ms * 2) / 2)
         forward = -row.side * math.sin(math.radians(layer.get("heading", 0.0))) * target_speed_ms
-        yield Cell(Crossing(test=test, speed=speed, impact_location=location, **layer), arrival, speed * KMH - forward)
+        yield Cell(
+            Crossing(test=test, speed=speed, impact_location=location, **layer),
+            arrival,
+            speed * KMH - forward,
+        )
 
 
 def junction(test: str, speed: float, target_speed: float) -> Iterator[Cell]:
     for increase in (0, 5, -5):
-        yield Cell(Crossing(test=test, speed=speed, target_speed=target_speed + increase), 6.0, speed * KMH)
+        yield Cell(
+            Crossing(test=test, speed=speed, target_speed=target_speed + increase), 6.0, speed * KMH
+        )
 
 
 def behind(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
@@ -88,21 +96,33 @@ def behind(test: str, speed: float, location: float, target_speed: float) -> Ite
     turns = (0.0, -10.0, 20.0) if target_speed == 0 else (0.0,)
     closing = (speed - target_speed) * KMH
     for turn in turns:
-        scenario = CarToCar(test=test, speed=speed, target_speed=target_speed, impact_location=location, heading=turn)
+        scenario = CarToCar(
+            test=test,
+            speed=speed,
+            target_speed=target_speed,
+            impact_location=location,
+            heading=turn,
+        )
         yield Cell(scenario, 5 * speed * KMH / closing, closing)
 
 
 def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
-    """Headway of 1 s; from 3 s on, the target brakes at b = 4 m/s^2 down to 2 km/h: gap = closing^2 / (2 b), then a
-    steady speed.
+    """Headway of 1 s; from 3 s on, the target brakes at b = 4 m/s^2 down to 2 km/h: gap = closing^2
+    / (2 b), then a steady speed.
     """
     for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
         gap = headway * speed * KMH
         speed_loss = (speed - 2) * KMH
         closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
-        braking_time = closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
+        braking_time = (
+            closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
+        )
         scenario = CarToCar(
-            test=test, speed=speed, impact_location=location, headway=headway, target_deceleration=deceleration
+            test=test,
+            speed=speed,
+            impact_location=location,
+            headway=headway,
+            target_deceleration=deceleration,
         )
         yield Cell(scenario, 3 + braking_time, closing)
 
@@ -132,7 +152,9 @@ def edge_cells() -> Iterator[Cell]:
 
 
 def middle_beside(scenario: Any) -> float:
-    """How far the middle of a rotated body ahead is beside the middle of its rear, which is hit [m]."""
+    """How far the middle of a rotated body ahead is beside the middle of its rear, which is hit
+    [m].
+    """
     if not isinstance(scenario, CarToCar):
         return 0.0
     body = BODIES["motorcyclist" if scenario.test.startswith("CM") else "car"]
@@ -150,7 +172,9 @@ def check(cells: list[Cell]) -> None:
         late = at_contact(run, run.trace.time) - cell.arrival
         assert abs(late) * scenario.speed * KMH < 0.05, (late, scenario)
         lateral = at_contact(run, run.trace.lateral[:, 0])
-        expected = (scenario.impact_location / 100 - 0.5) * scenario.vut_width + middle_beside(scenario)
+        expected = (scenario.impact_location / 100 - 0.5) * scenario.vut_width + middle_beside(
+            scenario
+        )
         assert abs(lateral - expected) < 0.02 * scenario.vut_width, scenario
         middle = 100 * (expected / scenario.vut_width + 0.5)
         assert run.contact.place == pytest.approx(min(max(middle, 0), 100), abs=2), scenario
@@ -177,8 +201,8 @@ def test_cells_at_the_edges_and_their_layers_agree_with_the_closed_forms() -> No
     ids=lambda scenario: scenario.test,
 )
 def test_targets_are_hit_on_a_lane_as_in_sumo_to_the_last_bit(scenario: Any) -> None:
-    """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and the corners, and
-    passed targets.
+    """Vehicles that never brake, or brake at any time up to the impact: impacts at the front and
+    the corners, and passed targets.
     """
     assert set(hit_at_any_time(scenario)) > {Outcome.COLLISION}
 
@@ -193,7 +217,9 @@ def hit_at_any_time(scenario: Any) -> list[str]:
     return assert_same(system, np.repeat(original_of(system), n, axis=0))
 
 
-def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In SUMO, persons move first. In a test, contacts of the side would not count."""
     monkeypatch.setattr(drive, "Contacts", lambda n, _: Contacts(n, np.zeros(n, dtype=bool)))
     scenario = Crossing(test="CPFA", speed=30, impact_location=-30)
@@ -201,8 +227,8 @@ def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(monkeypatch:
 
 
 def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
-    """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the vehicle, 1 m before the
-    impact.
+    """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the
+    vehicle, 1 m before the impact.
     """
     for heading in (0.0, -10.0, 20.0):
         scenario = Crossing(test="CBNAO", heading=heading)
@@ -214,13 +240,22 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         corner = 40 * KMH * before + reach - 1.0
         y = 10 * KMH * before * math.cos(turned)
         hidden = (corner > 0) & (y * corner / x > scenario.vut_width / 2 + 1.0)
-        gaps = []
-        driven(scenario, Pedals(lambda seen: (gaps.append(seen.gap[0]) or seen.throttle, seen.brake)))  # noqa: B023
+        gaps: list[float] = []
+
+        def coast(seen, gaps=gaps):
+            gaps.append(seen.gap[0])
+            return seen.throttle, seen.brake
+
+        driven(scenario, Pedals(coast))
         assert np.isinf(gaps).tolist() == hidden[: len(gaps)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0
 
 
-BRAKE = {"euro_ncap_pedestrian": "maxBrakeTorque", "euro_ncap_car_to_car": "maxBrakeTorque", "wear": "brakeTorque"}
+BRAKE = {
+    "euro_ncap_pedestrian": "maxBrakeTorque",
+    "euro_ncap_car_to_car": "maxBrakeTorque",
+    "wear": "brakeTorque",
+}
 
 
 def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
@@ -231,10 +266,15 @@ def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("study", BRAKE)
-def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(study: str) -> None:
+def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(
+    study: str,
+) -> None:
     system = assemble(load_study(study))
     collided = np.stack(
-        [one.evaluations.collided for one in simulate_all_points(system, original_and_half_its_brakes(study, system))]
+        [
+            one.evaluations.collided
+            for one in simulate_all_points(system, original_and_half_its_brakes(study, system))
+        ]
     )
     assert not collided[:, 0].any()
     assert collided[:, 1].any()

@@ -19,29 +19,48 @@ def stops(weather: Any, *speeds: float, **tables: Any) -> System:
     """The worn car's stops from `speeds` [km/h]."""
     tests = [{"name": "stop", "over": {"speed": [*speeds]}}]
     return assemble(
-        load_study({"extends": "stop", "name": "some", "weather": weather, "matrix": {"tests": tests}, **tables})
+        load_study(
+            {
+                "extends": "stop",
+                "name": "some",
+                "weather": weather,
+                "matrix": {"tests": tests},
+                **tables,
+            }
+        )
     )
 
 
 def distances(system: System, **changes: float) -> FloatArray:
     """Stopping distances of the original vehicle with some changes, from every speed [m]."""
-    values = dict(zip(system.characteristics.names, system.characteristics.original, strict=True)) | changes
+    values = (
+        dict(zip(system.characteristics.names, system.characteristics.original, strict=True))
+        | changes
+    )
     results = simulate_all_points(system, np.array([[*values.values()]]))
     return np.array([result.evaluations.metrics["stopping_distance"][0] for result in results])
 
 
 @pytest.mark.parametrize(("brake_response", "friction"), [(0.1, 0.3), (0.05, 0.75), (0.3, 0.5)])
-def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(brake_response: float, friction: float) -> None:
+def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(
+    brake_response: float, friction: float
+) -> None:
     """From the first brake force on: a delay of the brake, here of whole steps, changes nothing."""
     speeds = np.array([10.0, 30.0, 50.0, 80.0, 81.7, 120.0, 250.0])
-    system = stops({"name": "polished", "road_friction": friction, "visibility": 1.0}, *speeds.tolist())
+    system = stops(
+        {"name": "polished", "road_friction": friction, "visibility": 1.0}, *speeds.tolist()
+    )
     mu = system.vehicle.tyre_friction * friction  # type: ignore[attr-defined]
     expected = (speeds / KMH_PER_MS) ** 2 / (2 * mu * GRAVITY)
     assert distances(system, brakeResponse=brake_response) == pytest.approx(expected, abs=0.01)
 
 
 def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> None:
-    study = {"extends": "sun", "name": "some", "scenario": {"model": "stop", "parameters": {"speed": 30}}}
+    study = {
+        "extends": "sun",
+        "name": "some",
+        "scenario": {"model": "stop", "parameters": {"speed": 30}},
+    }
     stop = sv.simulate(study)
     other = sv.simulate({**study, "ads": {"model": "aeb"}})
     assert stop.metrics == pytest.approx(other.metrics, nan_ok=True)

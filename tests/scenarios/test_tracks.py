@@ -1,4 +1,6 @@
-"""Scenarios of tracks: who is seen, hit, passed and measured among several bodies, by formulas and by hand."""
+"""Scenarios of tracks: who is seen, hit, passed and measured among several bodies, by formulas and
+by hand.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def standing(x: float, y: float = 0.0, name: str = "car") -> Any:
     return lambda times: Track.of(name, "car", x, y)
 
 
-def moving(name: str, x: float, y: float, vx: float, vy: float, kind: str = "car", size: Any = None) -> Any:
+def moving(
+    name: str, x: float, y: float, vx: float, vy: float, kind: str = "car", size: Any = None
+) -> Any:
     return lambda times: Track.of(name, kind, x + vx * times, y + vy * times, vx, vy, size)
 
 
@@ -52,8 +56,8 @@ def held(*cast: Any, **parameters: Any) -> SimulationRuns:
 
 
 def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
-    """An oncoming car in the next lane, a trailer across it behind, an overtaking car, two pedestrians: the second is
-    in the way at 60 m.
+    """An oncoming car in the next lane, a trailer across it behind, an overtaking car, two
+    pedestrians: the second is in the way at 60 m.
     """
     cast = [
         moving("oncoming", 150.0, 3.5, -15.0, 0.0),
@@ -102,18 +106,27 @@ def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
 
 
 def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
-    """From 80 km/h, 2 m/s^2: a vehicle as fast as its leader is not safe while the leader still brakes."""
+    """From 80 km/h, 2 m/s^2: a vehicle as fast as its leader is not safe while the leader still
+    brakes.
+    """
     speed = 80 / 3.6
     wear = load_study("wear", matrix=None)
-    scenario = {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0}}
+    scenario = {
+        "model": "car_to_car",
+        "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0},
+    }
     system = assemble(load_study(wear, scenario=scenario))
     assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2
     run = simulate(system, system.characteristics.original[np.newaxis])
     end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
     assert run.outcome[0] == Outcome.PASSED
-    assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], "it ends when it is slower for good"
+    assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], (
+        "it ends when it is slower for good"
+    )
     gap = run.trace.gap[run.trace.active]
-    assert gap.min() == pytest.approx(1.63, abs=0.005), "4.95 m at 12 m/s, where the leader still brakes"
+    assert gap.min() == pytest.approx(1.63, abs=0.005), (
+        "4.95 m at 12 m/s, where the leader still brakes"
+    )
     assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(4.95, abs=0.02)
 
 
@@ -121,23 +134,40 @@ angles = st.floats(-math.pi, math.pi)
 
 
 @settings(max_examples=60, deadline=None)
-@given(x=st.floats(-8, 8), y=st.floats(-5, 5), angle=angles, length=st.floats(0.3, 8), width=st.floats(0.3, 3))
+@given(
+    x=st.floats(-8, 8),
+    y=st.floats(-5, 5),
+    angle=angles,
+    length=st.floats(0.3, 8),
+    width=st.floats(0.3, 3),
+)
 def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
     x: float, y: float, angle: float, length: float, width: float
 ) -> None:
-    """Points of a grid on one rectangle against the other: a second implementation, coarse as its grid."""
+    """Points of a grid on one rectangle against the other: a second implementation, coarse as its
+    grid.
+    """
     along = np.array([math.cos(angle), math.sin(angle)])
     body = Track("b", "car", length, width, x, y, along[0], along[1], 0.0)
     distance = float(distance_between(body, np.zeros(1), LENGTH, WIDTH)[0])
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, 81), np.linspace(-0.5, 0.5, 81))
     points = np.stack(
-        [x + u * length * along[0] - v * width * along[1], y + u * length * along[1] + v * width * along[0]]
+        [
+            x + u * length * along[0] - v * width * along[1],
+            y + u * length * along[1] + v * width * along[0],
+        ]
     )
-    outside = np.maximum(np.abs(points) - np.array([LENGTH, WIDTH])[:, np.newaxis, np.newaxis] / 2, 0.0)
+    outside = np.maximum(
+        np.abs(points) - np.array([LENGTH, WIDTH])[:, np.newaxis, np.newaxis] / 2, 0.0
+    )
     by_grid = float(np.sqrt((outside**2).sum(axis=0)).min())
     assert distance == pytest.approx(by_grid, abs=0.06)
-    own = Body(np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([LENGTH]), np.array([WIDTH]), np.zeros(1))
-    other = Body(np.array([[x, y]]), along[np.newaxis], np.array([length]), np.array([width]), np.zeros(1))
+    own = Body(
+        np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([LENGTH]), np.array([WIDTH]), np.zeros(1)
+    )
+    other = Body(
+        np.array([[x, y]]), along[np.newaxis], np.array([length]), np.array([width]), np.zeros(1)
+    )
     depth = float(find_overlaps(own, other)[0])
     assert (depth > 1e-9) == (distance == 0) or abs(depth) < 1e-6
 

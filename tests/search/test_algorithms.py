@@ -35,7 +35,9 @@ REQUIRED = {
 Evaluate = Callable[[CharacteristicSet, FloatArray], Evaluations]
 
 
-def evaluated(characteristics: CharacteristicSet, settings: FloatArray, safety: FloatArray) -> Evaluations:
+def evaluated(
+    characteristics: CharacteristicSet, settings: FloatArray, safety: FloatArray
+) -> Evaluations:
     """Vehicles that stop, whatever their safety degree."""
     return made_up_evaluations(
         safety,
@@ -90,7 +92,9 @@ def begun(
         population=POPULATION,
         scoring=scoring,
     )
-    return steps_of(algorithm.search(problem, np.random.default_rng(seed)), partial(evaluate, characteristics))
+    return steps_of(
+        algorithm.search(problem, np.random.default_rng(seed)), partial(evaluate, characteristics)
+    )
 
 
 def built(name: str, **arguments: Any) -> Algorithm:
@@ -99,13 +103,17 @@ def built(name: str, **arguments: Any) -> Algorithm:
     return msgspec.convert(REQUIRED.get(name, {}) | arguments, kind)  # type: ignore[no-any-return]
 
 
-def searched(name: str, seed: int, evaluations: int, **changes: Any) -> tuple[Evaluations, list[FloatArray]]:
+def searched(
+    name: str, seed: int, evaluations: int, **changes: Any
+) -> tuple[Evaluations, list[FloatArray]]:
     """Run an algorithm to its end; returns its result and all populations that it requested."""
     *asked, result = begun(ALGORITHMS[name](), seed, evaluations, **changes)
     return result, asked
 
 
-@pytest.mark.parametrize("name", [*ALGORITHMS, "pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"])
+@pytest.mark.parametrize(
+    "name", [*ALGORITHMS, "pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"]
+)
 @pytest.mark.parametrize("evaluations", [1, 7, POPULATION, 3 * POPULATION + 1, 500])
 def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> None:
     *asked, result = begun(built(name), 1, evaluations)
@@ -116,7 +124,9 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if "AGEMOEA" in name else ())  # compiled by numba at their first call
+        pytest.param(
+            name, marks=pytest.mark.slow if "AGEMOEA" in name else ()
+        )  # compiled by numba at their first call
         for name in (*ALGORITHMS, *PYMOO_ALGORITHMS)
     ],
 )
@@ -161,7 +171,9 @@ def test_a_generation_is_fifty_and_changes_between_one_and_all() -> None:
 
 
 def test_safe_fuzzer_ends_after_five_generations_without_improvement() -> None:
-    single = CharacteristicSet((Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),))
+    single = CharacteristicSet(
+        (Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),)
+    )
 
     def constant(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
         return evaluated(characteristics, np.full_like(settings, 6.0), np.ones(len(settings)))
@@ -180,11 +192,15 @@ def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result
     assert np.array_equal(solutions.settings, np.concatenate(asked)[best])
     lowest = np.minimum.accumulate([score.min() for score in scores])
     last_improvement = np.flatnonzero(np.diff(lowest) < 0)[-1] + 1
-    assert len(asked) == max(last_improvement + 1, 500 // 50) + 5 < 5000 // 50, "the best score is five generations old"
+    assert len(asked) == max(last_improvement + 1, 500 // 50) + 5 < 5000 // 50, (
+        "the best score is five generations old"
+    )
 
 
 TWO = CharacteristicSet(
-    tuple(Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0) for name in "ab")
+    tuple(
+        Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0) for name in "ab"
+    )
 )
 
 
@@ -198,7 +214,9 @@ def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
 
 
 @given(st.lists(st.tuples(*[st.integers(-2, 2)] * 3), max_size=40), st.integers(1, 40))
-def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]], number: int) -> None:
+def test_survivors_are_those_of_deap(
+    objectives: list[tuple[float, float, float]], number: int
+) -> None:
     """Identical survivors in identical order, with ties of all kinds."""
     ours = individuals(*objectives)
     deaps = individuals(*objectives)
@@ -207,15 +225,27 @@ def test_survivors_are_those_of_deap(objectives: list[tuple[float, float, float]
     for front in fronts:
         tools.emo.assignCrowdingDist(front)
         expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
-    places = [next(i for i, one in enumerate(ours) if one is survivor) for survivor in select_survivors(ours, number)]
-    assert places == [next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]]
+    places = [
+        next(i for i, one in enumerate(ours) if one is survivor)
+        for survivor in select_survivors(ours, number)
+    ]
+    assert places == [
+        next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]
+    ]
 
 
 def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
-    worst_feasible, best, slightly, badly = individuals((9, 9, 9), (0, 1, 0), (-9, 0, 0), (-99, 0, 0))
+    worst_feasible, best, slightly, badly = individuals(
+        (9, 9, 9), (0, 1, 0), (-9, 0, 0), (-99, 0, 0)
+    )
     slightly.violation = 0.1
     badly.violation = 5.0
-    assert select_survivors([badly, slightly, worst_feasible, best], 4) == [best, worst_feasible, slightly, badly]
+    assert select_survivors([badly, slightly, worst_feasible, best], 4) == [
+        best,
+        worst_feasible,
+        slightly,
+        badly,
+    ]
     assert select_survivors([badly, slightly], 1) == [slightly]
     assert 0 < slightly.standing[0] < badly.standing[0], "no solution of a run"
 
@@ -246,7 +276,8 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
 
 
 @pytest.mark.parametrize(
-    ("settings", "most"), [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)]
+    ("settings", "most"),
+    [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)],
 )
 def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
     ranges = _Ranges(problem())

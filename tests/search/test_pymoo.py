@@ -32,25 +32,40 @@ def test_arguments_reach_the_algorithm() -> None:
     """Das and Dennis's directions: C(p + 2, 2) for p partitions and three objectives."""
     sizes = {
         number: len(next(begun(built("pymoo:NSGA3", **arguments), 1, 300)))
-        for number, arguments in ((91, {}), (15, {"ref_dirs": 4}), (2, {"ref_dirs": [[1.0, 0, 0], [0, 0, 1.0]]}))
+        for number, arguments in (
+            (91, {}),
+            (15, {"ref_dirs": 4}),
+            (2, {"ref_dirs": [[1.0, 0, 0], [0, 0, 1.0]]}),
+        )
     }
     assert sizes == {91: 91, 15: 15, 2: 2}
-    assert [len(asked) for asked in begun(built("pymoo:GA"), 1, 60)][:3] == [POPULATION] * 3, "the study's population"
+    assert [len(asked) for asked in begun(built("pymoo:GA"), 1, 60)][:3] == [POPULATION] * 3, (
+        "the study's population"
+    )
     assert [len(asked) for asked in begun(built("pymoo:GA", pop_size=9), 1, 60)][:3] == [9] * 3
 
 
 @pytest.mark.parametrize(
-    "name", ["pymoo:CMAES", "pymoo:DE", "pymoo:GA", "pymoo:NSGA2", pytest.param("pymoo:MOEAD", marks=pytest.mark.slow)]
+    "name",
+    [
+        "pymoo:CMAES",
+        "pymoo:DE",
+        "pymoo:GA",
+        "pymoo:NSGA2",
+        pytest.param("pymoo:MOEAD", marks=pytest.mark.slow),
+    ],
 )
 def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
-    """The original vehicle is safe in the upper half of the first domain: there the sphere, which an algorithm for one
-    objective minimises alone, is 1/4 or more.
+    """The original vehicle is safe in the upper half of the first domain: there the sphere, which
+    an algorithm for one objective minimises alone, is 1/4 or more.
     """
 
     def formula(sun: CharacteristicSet, settings: FloatArray) -> Evaluations:
         evaluations = sphere(sun, settings)
         share = (settings[:, 0] - sun.lower[0]) / (sun.upper[0] - sun.lower[0])
-        return dataclasses.replace(evaluations, metrics={**evaluations.metrics, ORIGINAL_DEGREE: share})
+        return dataclasses.replace(
+            evaluations, metrics={**evaluations.metrics, ORIGINAL_DEGREE: share}
+        )
 
     scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.5)
     *_, result = begun(built(name), 1, 3000, formula, scoring)
@@ -74,7 +89,9 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
         def __init__(self) -> None:
             super().__init__(standard.variables, 3, n_ieq_constr=1, xl=1.0, xu=2.0)
 
-        def _evaluate(self, x: FloatArray, out: dict[str, FloatArray], *_: object, **__: object) -> None:
+        def _evaluate(
+            self, x: FloatArray, out: dict[str, FloatArray], *_: object, **__: object
+        ) -> None:
             out["F"], out["G"] = standard.objectives(x - 1), np.zeros((len(x), 1))
 
     ours = result_of(built(f"pymoo:{name}").search(problem, np.random.default_rng(3)), problem)
@@ -85,7 +102,9 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
     assert np.array_equal(ours.settings, theirs.X)
 
 
-STOPS: JsonObject = {"safe_fuzzer": {"generation": 5, "warm_up": 0, "generations_without_improvement": 1}}
+STOPS: JsonObject = {
+    "safe_fuzzer": {"generation": 5, "warm_up": 0, "generations_without_improvement": 1}
+}
 """Options with which SafeFuzzer ends early."""
 
 
@@ -99,14 +118,24 @@ def with_pymoo(algorithms: list[str], **search: Any) -> Study:
         ("NSGA3", {}, "'NSGA3'\nexpected: 'pymoo:NSGA3'"),
         ("pymoo:NSAG3", {}, "'pymoo:NSAG3'; did you mean 'pymoo:NSGA3'?"),
         ("pymoo:NSGA3", {"pymoo:NSAG3": {}}, "did you mean 'pymoo:NSGA3'?"),
-        ("pymoo:NSGA3", {"pymoo:NSGA3": {"ref_dir": 3}}, "search.'pymoo:NSGA3'.ref_dir: there is no such key; did you"),
+        (
+            "pymoo:NSGA3",
+            {"pymoo:NSGA3": {"ref_dir": 3}},
+            "search.'pymoo:NSGA3'.ref_dir: there is no such key; did you",
+        ),
         ("pymoo:NSGA3", {"pymoo:NSGA3": {"ref_dirs": 0}}, "a whole number >= 1"),
         ("pymoo:GA", {"pymoo:GA": {"seed": 1}}, "there is no such key"),
-        ("pymoo:DE", {"pymoo:DE": {"CR": "high"}}, "search.'pymoo:DE'.CR = 'high'\nexpected: a number"),
+        (
+            "pymoo:DE",
+            {"pymoo:DE": {"CR": "high"}},
+            "search.'pymoo:DE'.CR = 'high'\nexpected: a number",
+        ),
         ("pymoo:RNSGA2", {}, "ref_points is missing"),
     ],
 )
-def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: JsonObject, error: str) -> None:
+def test_a_mistake_in_a_study_names_key_and_nearest_name(
+    algorithm: str, table: JsonObject, error: str
+) -> None:
     study = with_pymoo([algorithm], parameters=table)
     with pytest.raises(InputError) as refused:
         algorithm_of(next(iter(study.search.labels)), study)
@@ -123,7 +152,9 @@ def test_a_mistake_in_a_study_names_key_and_nearest_name(algorithm: str, table: 
         ("pymoo:DE", {"variant": "DE/best"}, "DE/<selection>/<n_diffs>/<crossover>"),
     ],
 )
-def test_what_pymoo_refuses_is_an_error_of_the_user(name: str, arguments: dict[str, Any], error: str) -> None:
+def test_what_pymoo_refuses_is_an_error_of_the_user(
+    name: str, arguments: dict[str, Any], error: str
+) -> None:
     with pytest.raises(InputError, match=error):
         next(begun(built(name, **arguments), 1, 130))
 
@@ -137,15 +168,31 @@ def test_what_pymoo_refuses_is_an_error_of_the_user(name: str, arguments: dict[s
             "search.'pymoo:ES'.rule = -1.0: pymoo fails: ValueError: negative dimensions",
         ),
         ("CMOPSO", {"elite_size": 0}, "search.'pymoo:CMOPSO'.elite_size = 0: pymoo fails"),
-        ("MOPSO_CD", {"w": 0.5, "max_velocity_rate": -1.0}, "search.'pymoo:MOPSO_CD'.max_velocity_rate = -1.0: pymoo"),
-        ("GDE3", {"de_repair": "nope", "CR": 0.3}, "search.'pymoo:GDE3'.de_repair = 'nope': pymoo fails"),
-        ("NRBO", {"max_iteration": 0}, "search.'pymoo:NRBO'.max_iteration = 0: pymoo fails: ZeroDivisionError"),
+        (
+            "MOPSO_CD",
+            {"w": 0.5, "max_velocity_rate": -1.0},
+            "search.'pymoo:MOPSO_CD'.max_velocity_rate = -1.0: pymoo",
+        ),
+        (
+            "GDE3",
+            {"de_repair": "nope", "CR": 0.3},
+            "search.'pymoo:GDE3'.de_repair = 'nope': pymoo fails",
+        ),
+        (
+            "NRBO",
+            {"max_iteration": 0},
+            "search.'pymoo:NRBO'.max_iteration = 0: pymoo fails: ZeroDivisionError",
+        ),
         (
             "ISRES",
             {"alpha": 0.0, "phi": 0.0},
             "search.'pymoo:ISRES'.alpha = 0.0 and search.'pymoo:ISRES'.phi = 0.0: pymoo",
         ),
-        ("GA", {"pop_size": 500}, "search.'pymoo:GA'.pop_size = 500\nexpected: at most the 100 evaluations"),
+        (
+            "GA",
+            {"pop_size": 500},
+            "search.'pymoo:GA'.pop_size = 500\nexpected: at most the 100 evaluations",
+        ),
     ],
 )
 def test_an_option_with_which_pymoo_fails_is_named_before_anything_is_simulated(
@@ -158,7 +205,9 @@ def test_an_option_with_which_pymoo_fails_is_named_before_anything_is_simulated(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_population_with_which_pymoo_draws_for_ever_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_population_with_which_pymoo_draws_for_ever_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pymoo, "TRIAL_TIME", 0.2)
     failure = "pymoo fails: it does not end within 0.2 s"
     for name in ("GDE3", "NSDE"):
@@ -171,18 +220,29 @@ def test_a_population_with_which_pymoo_draws_for_ever_is_named(tmp_path: Path, m
     assert not (tmp_path / "out").exists()
 
 
-def test_an_algorithm_that_simulates_little_of_its_budget_is_named_unless_it_says_that_it_stops_by_itself(
+def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
     in_tmp: Path,
 ) -> None:
     options = {"pymoo:PSO": {"max_velocity_rate": 0.0}, "pymoo:CMAES": {"sigma": -1.0}}
-    study = with_pymoo(["pymoo:PSO", "pymoo:CMAES", "safe_fuzzer", "rs"], evaluations=60, runs=1, parameters=options)
+    study = with_pymoo(
+        ["pymoo:PSO", "pymoo:CMAES", "safe_fuzzer", "rs"],
+        evaluations=60,
+        runs=1,
+        parameters=options,
+    )
     study = msgspec.structs.replace(
         study, search=msgspec.structs.replace(study.search, parameters={**options, **STOPS})
     )
-    with pytest.warns(UserWarning, match="less than 90% of a run's evaluations are simulated") as warned:
+    with pytest.warns(
+        UserWarning, match="less than 90% of a run's evaluations are simulated"
+    ) as warned:
         results = run(study, in_tmp / "out", jobs=1)
     counts = results.evaluations.groupby("algorithm").size()
-    assert max(counts[name] for name in ("pymoo_PSO", "pymoo_CMAES", "safe_fuzzer")) < 54 < counts["rs"]
+    assert (
+        max(counts[name] for name in ("pymoo_PSO", "pymoo_CMAES", "safe_fuzzer"))
+        < 54
+        < counts["rs"]
+    )
     remark = str(warned[-1].message)
     assert f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal settings are simulated once)" in remark
     assert f"CMAES (pymoo) {counts['pymoo_CMAES']} of 60 (it ended early)" in remark
@@ -199,7 +259,9 @@ def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.Monk
 MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
 
 
-def test_an_interrupted_study_ends_as_if_it_had_never_been_and_batches_change_nothing(tmp_path: Path) -> None:
+def test_an_interrupted_study_ends_as_if_it_had_never_been_and_batches_change_nothing(
+    tmp_path: Path,
+) -> None:
     study = with_pymoo(MIXED, evaluations=60, parameters={"pymoo:NSGA3": {"ref_dirs": 3}})
     carried_out(study, tmp_path / "whole")
     with pytest.raises(SafevarError, match="broken down"):

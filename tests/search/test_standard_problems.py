@@ -28,7 +28,9 @@ EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 def zdt3(x: FloatArray) -> FloatArray:
     first = x[:, 0]
     g = 1 + 9 * x[:, 1:].mean(axis=1)
-    return np.stack([first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1)
+    return np.stack(
+        [first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1
+    )
 
 
 def dtlz2(x: FloatArray) -> FloatArray:
@@ -45,14 +47,19 @@ def dtlz2(x: FloatArray) -> FloatArray:
 
 
 class StandardProblem(NamedTuple):
-    """The number of variables in [0, 1], the objectives, and the reference point of the hypervolume."""
+    """The number of variables in [0, 1], the objectives, and the reference point of the
+    hypervolume.
+    """
 
     variables: int
     objectives: Callable[[FloatArray], FloatArray]
     reference: tuple[float, ...]
 
 
-PROBLEMS = {"zdt3": StandardProblem(30, zdt3, (11.0, 11.0)), "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0))}
+PROBLEMS = {
+    "zdt3": StandardProblem(30, zdt3, (11.0, 11.0)),
+    "dtlz2": StandardProblem(12, dtlz2, (2.0, 2.0, 2.0)),
+}
 """A front in parts, and a concave one of three objectives."""
 
 
@@ -102,7 +109,9 @@ def standard_problem(
 
 
 def result_of(search: Search, problem: Problem) -> Evaluations:
-    *_, result = steps_of(search, lambda asked: evaluated(problem.characteristics, asked, np.zeros(len(asked))))
+    *_, result = steps_of(
+        search, lambda asked: evaluated(problem.characteristics, asked, np.zeros(len(asked)))
+    )
     return result  # type: ignore[no-any-return]
 
 

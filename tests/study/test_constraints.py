@@ -1,5 +1,5 @@
-"""Constraints among characteristics: what every command reports satisfies them, and what cannot be satisfied is
-refused.
+"""Constraints among characteristics: what every command reports satisfies them, and what cannot be
+satisfied is refused.
 """
 
 from __future__ import annotations
@@ -56,7 +56,11 @@ def is_feasible(values: Mapping[str, float]) -> bool:
 def settings_in(answer: Any) -> Iterator[dict[str, float]]:
     """Every mapping of an answer whose keys are characteristics."""
     if isinstance(answer, dict):
-        if answer and set(answer) <= set(SUN.names) and all(isinstance(value, float) for value in answer.values()):
+        if (
+            answer
+            and set(answer) <= set(SUN.names)
+            and all(isinstance(value, float) for value in answer.values())
+        ):
             yield answer
         for value in answer.values():
             yield from settings_in(value)
@@ -81,7 +85,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
     below = ("--unsafe", "below=2.5", "--fits", "0")
     explained = json_of("explain", "out", *below, "--top", "2", "--limit", "500")
-    tolerance = json_of("tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque")
+    tolerance = json_of(
+        "tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque"
+    )
     boundaries = [cause["boundary"] for cause in explained["tables"]["causes"]["rows"]]
     intervals = tolerance["tables"]["intervals"]["rows"]
     alone = [
@@ -101,7 +107,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         "risk bound.toml --samples 200",
     ):
         said = run(*question.split(), "--unsafe", "below=2.5").stdout
-        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, question
+        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, (
+            question
+        )
 
 
 def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> None:
@@ -109,7 +117,9 @@ def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_fea
     lower = region.characteristics.lower
     upper = region.characteristics.upper
     rng = np.random.default_rng(1)
-    drawn = region.draw_feasible(lambda some: rng.uniform(lower, upper, (some, len(lower))), 200, filtered=True)
+    drawn = region.draw_feasible(
+        lambda some: rng.uniform(lower, upper, (some, len(lower))), 200, filtered=True
+    )
     assert len(np.unique(drawn, axis=0)) == 200
     assert region.feasible(region.characteristics.filter(drawn)).all()
 
@@ -120,4 +130,7 @@ def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(bound: 
     assert sv.simulate("bound.toml", {"mass": 2040}, beyond=True).outcome
     with pytest.raises(InputError, match="violates a constraint"):
         sv.evaluate("bound.toml", pd.DataFrame({"mass": [2404, 2040]}), jobs=1)
-    assert "or any with --beyond" in run("simulate", "bound.toml", "--set", "mass=2040", expect=2).stderr
+    assert (
+        "or any with --beyond"
+        in run("simulate", "bound.toml", "--set", "mass=2040", expect=2).stderr
+    )

@@ -1,5 +1,7 @@
 # ruff: noqa: E501 (lines of XML)
-"""Studies whose scenario is a file of OpenSCENARIO: what the file says takes the place of model, network and matrix."""
+"""Studies whose scenario is a file of OpenSCENARIO: what the file says takes the place of model,
+network and matrix.
+"""
 
 from __future__ import annotations
 
@@ -47,14 +49,21 @@ def study_of(file: str, **scenario: Any) -> Study:
 
 def runs_of(study: Study) -> list[SimulationRuns]:
     system = assemble(study)
-    return [result.runs for result in simulate_all_points(system, system.characteristics.original[np.newaxis])]
+    return [
+        result.runs
+        for result in simulate_all_points(system, system.characteristics.original[np.newaxis])
+    ]
 
 
 def test_a_concrete_file_is_one_scenario_and_drops_what_is_inherited() -> None:
     study = study_of(str(FILES / "cut_in.xosc"), values={"ego_kmh": 60})
     assert study.matrix is None
     assert study.scenario.parameters == {"file": str(FILES / "cut_in.xosc"), "ego_kmh": 60}
-    assert {Path(path).name for path in data_files(study)} == {"cut_in.xosc", "bodies.xosc", "three_lanes.xodr"}
+    assert {Path(path).name for path in data_files(study)} == {
+        "cut_in.xosc",
+        "bodies.xosc",
+        "three_lanes.xodr",
+    }
     assert tables_of(load_study(tables_of(study))) == tables_of(study)
     (point,) = assemble(study).points
     assert point.scenario.test_speed == pytest.approx(60 / 3.6)
@@ -66,18 +75,25 @@ def test_a_path_counts_from_the_study(tmp_path: Path) -> None:
     path.write_text('extends = "wear"\n[scenario]\nfile = "scenario.xosc"\n')
     study = load_study(path)
     assert study.scenario.parameters["file"] == "scenario.xosc"
-    assert {Path(file) for file in data_files(study).values()} == {tmp_path / "scenario.xosc", tmp_path / "road.xodr"}
+    assert {Path(file) for file in data_files(study).values()} == {
+        tmp_path / "scenario.xosc",
+        tmp_path / "road.xodr",
+    }
     assert assemble(study).points[0].scenario.duration == pytest.approx(14)
 
 
 def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
-    """A logical file and the concrete one; and, if a parameter chooses the catalog, all catalogs."""
+    """A logical file and the concrete one; and, if a parameter chooses the catalog, all
+    catalogs.
+    """
     names = {"cut_in_logical.xosc", "cut_in.xosc", "bodies.xosc", "three_lanes.xodr"}
     study = study_of(LOGICAL, values={"ego_kmh": 80, "body": "lorry"}, search={"gap_m": {}})
     assert {Path(path).name for path in data_files(study).values()} == names
     assert tables_of(load_study(tables_of(study))) == tables_of(study)
     copytree(FILES, tmp_path / "files")
-    (tmp_path / "files/catalogs/other.xosc").write_text("<OpenSCENARIO><Catalog name='other'/></OpenSCENARIO>")
+    (tmp_path / "files/catalogs/other.xosc").write_text(
+        "<OpenSCENARIO><Catalog name='other'/></OpenSCENARIO>"
+    )
     concrete = tmp_path / "files/cut_in.xosc"
     text = concrete.read_text()
     concrete.write_text(
@@ -88,19 +104,27 @@ def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
         )
     )
     study = study_of(
-        str(tmp_path / "files/cut_in_logical.xosc"), values={"ego_kmh": 80, "body": "lorry"}, search={"gap_m": {}}
+        str(tmp_path / "files/cut_in_logical.xosc"),
+        values={"ego_kmh": 80, "body": "lorry"},
+        search={"gap_m": {}},
     )
     assert {Path(path).name for path in data_files(study).values()} == {*names, "other.xosc"}
     (tmp_path / "base.toml").write_text(
         'extends = "wear"\n[scenario]\nfile = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, body = "lorry" }\n'
     )
-    (tmp_path / "next.toml").write_text('extends = "base.toml"\n[scenario]\nfile = "files/crossing_pedestrian.xosc"\n')
+    (tmp_path / "next.toml").write_text(
+        'extends = "base.toml"\n[scenario]\nfile = "files/crossing_pedestrian.xosc"\n'
+    )
     assert "files/cut_in_logical.xosc" in data_files(load_study(tmp_path / "base.toml"))
     assert not any("cut_in" in path for path in data_files(load_study(tmp_path / "next.toml")))
 
 
 def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None:
-    study = study_of(LOGICAL, values={"ego_kmh": 80}, search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}})
+    study = study_of(
+        LOGICAL,
+        values={"ego_kmh": 80},
+        search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}},
+    )
     gap = study.scenario.search["gap_m"]
     slower = study.scenario.search["slower_kmh"]
     assert (gap.lower, gap.upper, gap.original) == (5, 45, 20)
@@ -136,7 +160,9 @@ def test_encounters_of_a_search_are_those_of_single_files() -> None:
     times = (np.arange(200) * 0.05)[:, np.newaxis]
     (together,) = searched.tracks(times)
     for k in range(3):
-        (alone,) = encounter(point, {"gap_m": gaps[k], "slower_kmh": slower[k]}).scenario.tracks(times)  # type: ignore[attr-defined]
+        (alone,) = encounter(point, {"gap_m": gaps[k], "slower_kmh": slower[k]}).scenario.tracks(
+            times
+        )  # type: ignore[attr-defined]
         assert np.array_equal(alone.x[:, 0], together.x[:, k])
         assert np.array_equal(alone.y[:, 0], together.y[:, k])
 
@@ -152,7 +178,9 @@ def test_sumo_repeats_a_run() -> None:
     assert point.scenario.vut_length == 4.2  # type: ignore[attr-defined]
 
 
-def test_a_run_in_which_the_system_acts_while_others_depend_on_ego_is_invalid(tmp_path: Path) -> None:
+def test_a_run_in_which_the_system_acts_while_others_depend_on_ego_is_invalid(
+    tmp_path: Path,
+) -> None:
     """A slower car ahead changes the lane when Ego is 1 m behind; no system waits for that."""
     close = '<RelativeDistanceCondition entityRef="Car" relativeDistanceType="longitudinal" freespace="true" rule="lessThan" value="1"/>'
     change = event(lane_change(-2, "linear", "time", 1), watching("Ego", close))
@@ -200,8 +228,14 @@ def test_who_is_deleted_is_not_hit(tmp_path: Path) -> None:
         ({"search": {"gap_m": {"lower": 25}}}, "the file's value 20 is not in its range"),
         ({"search": {"body": {}}}, "body = 'hatchback' is no number"),
         ({"search": {"gap_m": 3}}, "scenario.search.gap_m = 3"),
-        ({"file": str(FILES / "cut_in.xosc"), "search": {"gap_m": {}}}, "gap_m has no range in the file"),
-        ({"values": {"ego_kmh": 20, "slower_kmh": 15}}, "the file's constraints exclude every combination"),
+        (
+            {"file": str(FILES / "cut_in.xosc"), "search": {"gap_m": {}}},
+            "gap_m has no range in the file",
+        ),
+        (
+            {"values": {"ego_kmh": 20, "slower_kmh": 15}},
+            "the file's constraints exclude every combination",
+        ),
     ],
 )
 def test_refusals(scenario: dict[str, Any], problem: str) -> None:
@@ -230,8 +264,12 @@ VALUES = 'file = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, sideways_
     ],
     ids=["concrete", "matrix", "search"],
 )
-def test_questions_take_results_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tables: str) -> None:
-    """Compared with itself nothing differs; a pack of it has all files, and every claim is the same."""
+def test_questions_take_results_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tables: str
+) -> None:
+    """Compared with itself nothing differs; a pack of it has all files, and every claim is the
+    same.
+    """
     monkeypatch.chdir(tmp_path)
     copytree(FILES, "files")
     Path("scene.toml").write_text(f'extends = "wear"\n[scenario]\n{tables}')

@@ -1,5 +1,5 @@
-"""Study files are read strictly, limits too: every error names file, key, value and the expected values; and the
-shipped JSON schema, as an editor uses it.
+"""Study files are read strictly, limits too: every error names file, key, value and the expected
+values; and the shipped JSON schema, as an editor uses it.
 """
 
 from __future__ import annotations
@@ -22,22 +22,38 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.results.manifest import evaluation_keys
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study import Limit, Origin, Study, limits_of, load_study, study_names, tables_of, write_study
+from safevar_sumo.study import (
+    Limit,
+    Origin,
+    Study,
+    limits_of,
+    load_study,
+    study_names,
+    tables_of,
+    write_study,
+)
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import ROOT
 
 SUN = load_study("sun").vehicle.characteristics
 ALL_FIXED = "".join(
-    f"[[constraints]]\nsum = {{ {name} = 1 }}\nat_least = {row.original}\nat_most = {row.original}\n"
+    f"[[constraints]]\nsum = {{ {name} = 1 }}\nat_least = {row.original}\nat_most ="
+    f" {row.original}\n"
     for name, row in SUN.items()
 )
 MISTAKES = [
     ("[[constraints]]\nat_least = 2", "constraints[0]: sum is missing"),
     ("[metrics]\nttc_threshold = '1.5'", "metrics.ttc_threshold = '1.5'"),
-    ("[vehicle.characteristics.max_rpm]\noriginal = nan", "vehicle.characteristics.max_rpm.original = nan"),
+    (
+        "[vehicle.characteristics.max_rpm]\noriginal = nan",
+        "vehicle.characteristics.max_rpm.original = nan",
+    ),
     ("[ads", "cannot be read as TOML"),
-    (f"files = {3000 * '['}{3000 * ']'}", "cannot be read as TOML: maximum recursion depth exceeded"),
+    (
+        f"files = {3000 * '['}{3000 * ']'}",
+        "cannot be read as TOML: maximum recursion depth exceeded",
+    ),
     ('name = "../sun"', "name = '../sun'\nexpected: letters, digits, _, . and -"),
     ('title = "x"', "name is missing"),
     (
@@ -47,15 +63,24 @@ MISTAKES = [
     ('[spread]\n"ads.parameters.brake_gap" = ["a"]', "spread.'ads.parameters.brake_gap'[0] = 'a'"),
     ("[repair.brake_gap]\nlow = 1", "repair.parameters.brake_gap.low: there is no such key"),
     ("seed = 3", "seed: there is no such key; did you mean 'search.seed'?"),
-    ("[search]\nevaluatons = 5", "search.evaluatons: there is no such key; did you mean 'evaluations'?"),
+    (
+        "[search]\nevaluatons = 5",
+        "search.evaluatons: there is no such key; did you mean 'evaluations'?",
+    ),
     ("evaluatons = 5", "evaluatons: there is no such key; did you mean 'search.evaluations'?"),
-    ('[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1', "weather.road_friction = 0\nexpected: a number > 0"),
+    (
+        '[weather]\nname = "x"\nroad_friction = 0\nvisibility = 1',
+        "weather.road_friction = 0\nexpected: a number > 0",
+    ),
     ("zzz = 1", "zzz: there is no such key\nexpected: one of ads, constraints"),
     ("[vehicle]\ncharacteristics = 3", "vehicle.characteristics = 3\nexpected: a table"),
     ('[ads]\nkind = "fmuu"', "ads.kind = 'fmuu'; did you mean 'fmu'?\nexpected: one of fmu, traci"),
     (
         '[variation.mass]\ndistribution = "norml"',
-        "variation.mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed, lognormal",
+        (
+            "variation.mass.distribution = 'norml'; did you mean 'normal'?\nexpected: one of fixed,"
+            " lognormal"
+        ),
     ),
     (
         'extends = "native"\n[limits]\ndecel = { atleast = 6 }',
@@ -71,7 +96,10 @@ MISTAKES = [
         "[vehicle.characteristics.max_rpm]\nlower = 7000\nupper = 4200",
         "vehicle.characteristics.max_rpm: lower = 7000.0 and upper = 4200.0",
     ),
-    ("[vehicle.characteristics.max_rpm]\nlower = 5900", "vehicle.characteristics.max_rpm: original = 5800.0"),
+    (
+        "[vehicle.characteristics.max_rpm]\nlower = 5900",
+        "vehicle.characteristics.max_rpm: original = 5800.0",
+    ),
     (
         "[vehicle.characteristics.dampRateFullT]\noriginal = 0\nlower = -1",
         "vehicle.characteristics.dampRateFullT: original = 0",
@@ -84,37 +112,67 @@ MISTAKES = [
     ),
     (
         "[vehicle.characteristics.brakes]\noriginal = 9",
-        "brakes: unit is missing\nexpected: unit, original, lower, upper for what is new here; else ",
+        (
+            "brakes: unit is missing\nexpected: unit, original, lower, upper for what is new here;"
+            " else "
+        ),
     ),
     ("[vehicle.characteristics.mass]\nupper = 1e300", "1e+300]\nexpected: numbers up to 1e+12"),
     (
         '[metrics]\nalso = ["max_jerk", "max_jerk"]',
         "metrics: also = ['max_jerk', 'max_jerk']\nexpected: each metric once",
     ),
-    ('[rating.claims]\nCCRs = ["glare"]', "rating.claims: the study is not rated\nexpected: matrix.protocol"),
+    (
+        '[rating.claims]\nCCRs = ["glare"]',
+        "rating.claims: the study is not rated\nexpected: matrix.protocol",
+    ),
     (
         '[vehicle]\nmodel = "tesla"',
         "vehicle.model = 'tesla' has no characteristics: vehicle.characteristics is missing",
     ),
     ('[vehicle]\nmodel = "carl"', "vehicle.characteristics is missing; did you mean 'carla'?"),
-    ("colour = 1", "colour: there is no such key\nexpected: one of ads, constraints, correlations, limits, matrix"),
+    (
+        "colour = 1",
+        (
+            "colour: there is no such key\nexpected: one of ads, constraints, correlations, limits,"
+            " matrix"
+        ),
+    ),
     ("colour = 1", "name, published"),
     ('extends = "mine.toml"', "extends = 'mine.toml' leads back to "),
     ('[scenario]\nkind = "fmu"', "scenario.kind = 'fmu'\nexpected: no kind"),
-    ('[spread]\n"ads.parameters.brake_gapp" = [1]', "spread.'ads.parameters.brake_gapp' is no parameter of the study"),
-    ("[model_error]\nsafety_degre = 1", "model_error.safety_degre is no metric; did you mean 'safety_degree'?"),
+    (
+        '[spread]\n"ads.parameters.brake_gapp" = [1]',
+        "spread.'ads.parameters.brake_gapp' is no parameter of the study",
+    ),
+    (
+        "[model_error]\nsafety_degre = 1",
+        "model_error.safety_degre is no metric; did you mean 'safety_degree'?",
+    ),
     ("[repeatability]\nfoo = 1", "repeatability.foo is no metric\nexpected: one of ave_dece"),
     ('weather = "fogg"', "did you mean 'fog'?"),
     ('[ads]\nmodel = "world_on_rail"', "did you mean 'world_on_rails'?"),
     ("[ads.parameters]\nnothing = 3", "mine.toml: ads.parameters.nothing: there is no such key"),
-    ('[scenario.parameters]\nnetwork = "nope"', "mine.toml: scenario.parameters.network: there is no network 'nope'"),
-    ('[metrics]\nalso = ["tet"]', "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness"),
+    (
+        '[scenario.parameters]\nnetwork = "nope"',
+        "mine.toml: scenario.parameters.network: there is no network 'nope'",
+    ),
+    (
+        '[metrics]\nalso = ["tet"]',
+        "metrics.also = ['tet']: every study has 'tet'\nexpected: one of brake_harshness",
+    ),
     (
         'extends = "native"\n[limits]\ndecl = { at_least = 6 }',
         "limits.decl: there is no such characteristic; did you mean 'decel'?",
     ),
-    ("extends = \"native\"\n[limits]\ndecel = { source = 'x' }", "limits.decel: neither at_least nor at_most"),
-    ('extends = "native"\n[limits]\ndecel = { at_least = 3 }', "limits.decel.at_least = 3 is outside its domain"),
+    (
+        "extends = \"native\"\n[limits]\ndecel = { source = 'x' }",
+        "limits.decel: neither at_least nor at_most",
+    ),
+    (
+        'extends = "native"\n[limits]\ndecel = { at_least = 3 }',
+        "limits.decel.at_least = 3 is outside its domain",
+    ),
     (
         'extends = "native"\n[limits]\ndecel = { at_least = 9.4 }',
         "limits.decel.at_least = 9.4: the original, 9 m/s^2, does not keep it",
@@ -129,16 +187,24 @@ MISTAKES = [
     ),
     (
         "[[constraints]]\nsum = { mass = 1, maxBrakeTorque = -1 }\nunit = 'kg'\nat_most = 900",
-        "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected: at most 900 kg",
+        (
+            "mass - maxBrakeTorque = 904 kg (mass = 2404 kg, maxBrakeTorque = 1500 N m)\nexpected:"
+            " at most 900 kg"
+        ),
     ),
     (
-        "[[constraints]]\nsum = { mass = 1 }\nat_least = 2404\n"
-        "[[constraints]]\nsum = { mass = 2, tireFric = 1 }\nunit = 'kg'\nat_most = 4800",
+        (
+            "[[constraints]]\nsum = { mass = 1 }\nat_least = 2404\n"
+            "[[constraints]]\nsum = { mass = 2, tireFric = 1 }\nunit = 'kg'\nat_most = 4800"
+        ),
         "the original vehicle: violates a constraint: 2 mass + tireFric = 4811.5 kg",
     ),
     (ALL_FIXED, "fewer than 2 in 1,000 random settings satisfy them"),
     (
-        "[[constraints]]\nsum = { mass = 1, maxBrakeTorque = -1 }\nunit = 'kg'\nat_least = 904\nat_most = 904",
+        (
+            "[[constraints]]\nsum = { mass = 1, maxBrakeTorque = -1 }\nunit = 'kg'\nat_least ="
+            " 904\nat_most = 904"
+        ),
         "fewer than 2 in 1,000 random settings satisfy them: mass - maxBrakeTorque",
     ),
     (
@@ -154,35 +220,75 @@ MISTAKES = [
         "constraints[0]: unit = None for the sum of mass [kg], radius [cm]",
     ),
     ("[[constraints]]\nsum = { mass = 1 }", "neither at_least nor at_most"),
-    ("[[constraints]]\nsum = { mass = 1 }\nat_least = 2\nat_most = 1", "at_least = 2 and at_most = 1"),
+    (
+        "[[constraints]]\nsum = { mass = 1 }\nat_least = 2\nat_most = 1",
+        "at_least = 2 and at_most = 1",
+    ),
     ("[variation.wings]\ndistribution = 'fixed'", "variation.wings"),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRx = ["Type"]', "CCRx"),
-    ("[variation.mass]\ndistribution = 'normal'\ndeviation = 1\nmean = 9999", "variation.mass.mean = 9999"),
-    ("[variation.mass]\ndistribution = 'uniform'\nlower = 2600\nupper = 2100", "lower = 2600 and upper = 2100"),
-    ("[variation.mass]\ndistribution = 'triangular'\nlower = 2100\nmode = 2050", "variation.mass.mode = 2050"),
-    ('[[correlations]]\nbetween = ["mass", "wings"]\nvalue = 0.5', "'wings'"),
-    ('[[correlations]]\nbetween = ["mass", "mass"]\nvalue = 0.5', "two characteristics, each pair once"),
     (
-        '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 0.5\n'
-        '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 0.5',
+        "[variation.mass]\ndistribution = 'normal'\ndeviation = 1\nmean = 9999",
+        "variation.mass.mean = 9999",
+    ),
+    (
+        "[variation.mass]\ndistribution = 'uniform'\nlower = 2600\nupper = 2100",
+        "lower = 2600 and upper = 2100",
+    ),
+    (
+        "[variation.mass]\ndistribution = 'triangular'\nlower = 2100\nmode = 2050",
+        "variation.mass.mode = 2050",
+    ),
+    ('[[correlations]]\nbetween = ["mass", "wings"]\nvalue = 0.5', "'wings'"),
+    (
+        '[[correlations]]\nbetween = ["mass", "mass"]\nvalue = 0.5',
         "two characteristics, each pair once",
     ),
     (
-        "[[correlations]]\nbetween = ['mass', 'radius']\nvalue = -0.9\n"
-        "[[correlations]]\nbetween = ['mass', 'tireFric']\nvalue = -0.9\n"
-        "[[correlations]]\nbetween = ['radius', 'tireFric']\nvalue = -0.9",
+        (
+            '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 0.5\n'
+            '[[correlations]]\nbetween = ["mass", "radius"]\nvalue = 0.5'
+        ),
+        "two characteristics, each pair once",
+    ),
+    (
+        (
+            "[[correlations]]\nbetween = ['mass', 'radius']\nvalue = -0.9\n"
+            "[[correlations]]\nbetween = ['mass', 'tireFric']\nvalue = -0.9\n"
+            "[[correlations]]\nbetween = ['radius', 'tireFric']\nvalue = -0.9"
+        ),
         "contradict each other",
     ),
     ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Typo"]', "Typo"),
-    ('extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Trajectory/Heading"]', "is simulated"),
-    ('[matrix]\naggregate = "worst"', "matrix: 0 tests and protocol = ''\nexpected: tests, or a protocol"),
+    (
+        'extends = "euro_ncap_rating"\n[rating.claims]\nCCRs = ["Trajectory/Heading"]',
+        "is simulated",
+    ),
+    (
+        '[matrix]\naggregate = "worst"',
+        "matrix: 0 tests and protocol = ''\nexpected: tests, or a protocol",
+    ),
     ("[search.nsga2]\ntournament_size = 1", "search.nsga2.tournament_size = 1"),
     ("[search.nsga2]\ntournament_sizes = 7", "did you mean 'tournament_size'?"),
     ("[search.nsga]\ntournament_size = 7", "did you mean 'nsga2'?"),
-    ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\n[[matrix.tests]]\nname = "x"', "2 points are 'x"),
-    ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { spede = [1] }', "spede"),
-    ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { speed = [-1] }', "speed"),
-    ('extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nweathers = ["sunny"]', "sunny"),
+    (
+        (
+            'extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\n[[matrix.tests]]\nname'
+            ' = "x"'
+        ),
+        "2 points are 'x",
+    ),
+    (
+        'extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { spede = [1] }',
+        "spede",
+    ),
+    (
+        'extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nover = { speed = [-1] }',
+        "speed",
+    ),
+    (
+        'extends = "euro_ncap_pedestrian"\n[[matrix.tests]]\nname = "x"\nweathers = ["sunny"]',
+        "sunny",
+    ),
 ]
 """A text in a study that extends `smoke`, or a whole one, and what the error says."""
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
@@ -194,7 +300,9 @@ def is_accepted(text: str) -> bool:
 
 
 @pytest.mark.parametrize(("text", "told"), MISTAKES, ids=lambda text: text[:40])
-def test_the_first_mistake_is_told_with_file_key_and_value(text: str, told: str, in_tmp: Path) -> None:
+def test_the_first_mistake_is_told_with_file_key_and_value(
+    text: str, told: str, in_tmp: Path
+) -> None:
     whole = text if text.startswith(("extends", "title")) else f'extends = "smoke"\n{text}\n'
     Path("mine.toml").write_text(whole)
     with pytest.raises(InputError) as caught:
@@ -226,7 +334,9 @@ def with_remarks(study: str, **changes: Any) -> tuple[Study, list[str]]:
         ('[ads]\nmodel = "world_on_rails"', True),
     ],
 )
-def test_another_system_inherits_neither_title_nor_published_values(text: str, inherits: bool, tmp_path: Path) -> None:
+def test_another_system_inherits_neither_title_nor_published_values(
+    text: str, inherits: bool, tmp_path: Path
+) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
     study, remarks = with_remarks(str(tmp_path / "mine.toml"))
     sun = load_study("sun")
@@ -237,25 +347,36 @@ def test_another_system_inherits_neither_title_nor_published_values(text: str, i
     assert all(": has a different " in remark for remark in remarks)
 
 
-def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(in_tmp: Path) -> None:
+def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(
+    in_tmp: Path,
+) -> None:
     Path("mine.toml").write_text('extends = "sun"\n[ads]\nmodel = "krauss"\n')
     Path("metric.toml").write_text('extends = "mine.toml"\nname = "own"\n')
     Path("rash.toml").write_text('extends = "metric.toml"\n')
     Path("headed.toml").write_text('extends = "metric.toml"\ntitle = "A heading"\n')
     Path("heir.toml").write_text('extends = "headed.toml"\n')
-    titles = [load_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")]
+    titles = [
+        load_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")
+    ]
     assert titles == ["mine", "own", "rash", "A heading", "A heading"]
 
 
 def test_the_shipped_schema_is_that_of_the_code_and_refuses_mistakes_of_form() -> None:
     assert schema_text() == STUDY_SCHEMA.read_text(encoding="utf-8")
     VALIDATOR.check_schema(VALIDATOR.schema)
-    for text in ("evaluatons = 5", '[search]\nruns = "x"', "[search]\nruns = 0", "[repair.brake_gap]\nlow = 1"):
+    for text in (
+        "evaluatons = 5",
+        '[search]\nruns = "x"',
+        "[search]\nruns = 0",
+        "[repair.brake_gap]\nlow = 1",
+    ):
         assert not is_accepted(text), text
 
 
 @pytest.mark.parametrize("name", study_names())
-def test_a_shipped_study_names_the_schema_which_accepts_it_and_all_that_it_extends(name: str, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_a_shipped_study_names_the_schema_which_accepts_it_and_all_that_it_extends(
+    name: str, tmp_path
+) -> None:  # type: ignore[no-untyped-def]
     text = (STUDIES / f"{name}.toml").read_text()
     assert text.startswith(f"#:schema ./{STUDY_SCHEMA.name}\n")
     assert is_accepted(text)
@@ -291,11 +412,17 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
         ("", "''"),
         ("decl >= 6", "decl: there is no such characteristic; did you mean 'decel'?"),
         ("decel >= 6, decel >= 7", "decel >= is given twice\nexpected: each limit once"),
-        ("decel >= 4", "decel.at_least = 4 is outside its domain\nexpected: a number in [4.5, 9] m/s^2"),
+        (
+            "decel >= 4",
+            "decel.at_least = 4 is outside its domain\nexpected: a number in [4.5, 9] m/s^2",
+        ),
         ("actuatorLag <= 1e999", "actuatorLag.at_most = inf is outside its domain"),
         (
             "actuatorLag <= 0.15",
-            "actuatorLag.at_most = 0.15: the original, 0.2 s, does not keep it\nexpected: a number in [0.2, 0.6] s",
+            (
+                "actuatorLag.at_most = 0.15: the original, 0.2 s, does not keep it\nexpected: a"
+                " number in [0.2, 0.6] s"
+            ),
         ),
     ],
 )
@@ -307,7 +434,9 @@ def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
 
 @pytest.mark.parametrize("name", study_names())
 def test_a_study_that_another_process_received_has_the_same_tables(name: str) -> None:
-    study = load_study(name, variation={next(iter(load_study(name).domains)): {"distribution": "triangular"}})
+    study = load_study(
+        name, variation={next(iter(load_study(name).domains)): {"distribution": "triangular"}}
+    )
     assert json.loads(json.dumps(tables_of(study))) == tables_of(study)
     assert tables_of(pickle.loads(pickle.dumps(study))) == tables_of(study)
     assert load_study(tables_of(study)) == msgspec.structs.replace(study, origin=Origin())
@@ -322,17 +451,23 @@ def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> 
 
 def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
-    study = load_study({"extends": "wear", "name": "mine", "scenario": scenario, "matrix": {"tests": []}})
+    study = load_study(
+        {"extends": "wear", "name": "mine", "scenario": scenario, "matrix": {"tests": []}}
+    )
     assert study.matrix is None
     assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
     assert load_study(tables_of(study)).matrix is None
 
 
-@pytest.mark.parametrize("scenario", [{"model": "mine:Deer"}, {"model": "along"}, {"file": "scenario.xosc"}])
+@pytest.mark.parametrize(
+    "scenario", [{"model": "mine:Deer"}, {"model": "along"}, {"file": "scenario.xosc"}]
+)
 def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     scenario: dict[str, str], in_tmp: Path
 ) -> None:
-    shutil.copy(ROOT / "tests" / "openscenario" / "files" / "crossing_pedestrian.xosc", "scenario.xosc")
+    shutil.copy(
+        ROOT / "tests" / "openscenario" / "files" / "crossing_pedestrian.xosc", "scenario.xosc"
+    )
     ((key, value),) = scenario.items()
     Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
     study, remarks = with_remarks("mine.toml")
@@ -341,7 +476,9 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     own, remarks = with_remarks("wear", scenario=scenario, matrix={"tests": [{"name": "own"}]})
     assert own.matrix is not None
     assert ([test.name for test in own.matrix.tests], remarks) == (["own"], [])
-    same, remarks = with_remarks("wear", scenario={"model": "crossing", "parameters": {"speed": 30}})
+    same, remarks = with_remarks(
+        "wear", scenario={"model": "crossing", "parameters": {"speed": 30}}
+    )
     assert (same.matrix, remarks) == (load_study("wear").matrix, [])
 
 
@@ -355,6 +492,7 @@ def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -
 
 def test_an_unknown_study_is_refused_with_the_path_first() -> None:
     with pytest.raises(
-        InputError, match=r"'nativ'; did you mean 'native'\?\nexpected: the path of a study file \(TOML\), or"
+        InputError,
+        match=r"'nativ'; did you mean 'native'\?\nexpected: the path of a study file \(TOML\), or",
     ):
         load_study("nativ")

@@ -1,4 +1,6 @@
-"""A vehicle whose brakes are worn, and a driver who brakes fully at a gap: the border of collisions is a formula."""
+"""A vehicle whose brakes are worn, and a driver who brakes fully at a gap: the border of collisions
+is a formula.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from safevar_sumo.scenarios import PedestrianCrossing
 from safevar_sumo.vehicles import SumoType, Vehicle
 
 BRAKING, PULL, GAP = 10.0, 3.0, 20.0
-"""Deceleration of the new vehicle on a dry road and its acceleration [m/s^2]; gap at which the driver brakes [m]."""
+"""Deceleration of the new vehicle on a dry road and its acceleration [m/s^2]; gap at which the
+driver brakes [m].
+"""
 
 
 class Slope(PedestrianCrossing, frozen=True, kw_only=True):
@@ -58,12 +62,16 @@ class Block(Vehicle):
         zero = np.zeros_like(speed)
         return State(speed, zero, zero, zero)
 
-    def sense(self, prepared: Prepared, state: State, seen: Observation) -> tuple[Observation, State]:
+    def sense(
+        self, prepared: Prepared, state: State, seen: Observation
+    ) -> tuple[Observation, State]:
         return seen, state
 
     def advance(self, prepared: Prepared, state: State, command: Command) -> State:
         change = (PULL * command.throttle - prepared.braking * command.brake) * prepared.step
-        return State(np.maximum(state.speed + change, 0.0), command.throttle, command.brake, state.gear)
+        return State(
+            np.maximum(state.speed + change, 0.0), command.throttle, command.brake, state.gear
+        )
 
 
 class AtGap(Ads):

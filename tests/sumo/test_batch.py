@@ -29,20 +29,28 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
     together = evaluate(system, population)
     some = data.draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True))
     for rows in (some, [0]):
-        assert not [*differences(together.take(rows).results, evaluate(system, population[rows]).results)]
+        assert not [
+            *differences(together.take(rows).results, evaluate(system, population[rows]).results)
+        ]
 
 
-def test_the_original_vehicle_does_not_collide(any_system: System, request: pytest.FixtureRequest) -> None:
+def test_the_original_vehicle_does_not_collide(
+    any_system: System, request: pytest.FixtureRequest
+) -> None:
     original = evaluate(any_system, any_system.characteristics.original[np.newaxis])
     if request.node.callspec.id == "autoware_december":  # what docs/autoware.md is about
         assert original.outcome[0] == Outcome.COLLISION
         return
     assert original.outcome[0] in (Outcome.STOPPED, Outcome.PASSED)
-    assert original.f_safe[0] > 0 or any_system.points[0].scenario.brakes_fully  # where nobody is met
+    assert (
+        original.f_safe[0] > 0 or any_system.points[0].scenario.brakes_fully
+    )  # where nobody is met
     assert original.f_diff[0] == original.f_num_diff[0] == 0
 
 
-def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(any_system: System) -> None:
+def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(
+    any_system: System,
+) -> None:
     characteristics = any_system.characteristics
     n = len(characteristics)
     ends = np.repeat(characteristics.original[np.newaxis], 2 * n, axis=0)
@@ -54,14 +62,16 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(any_s
 
 
 def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
-    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has ended, collision
-    speed).
+    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has
+    ended, collision speed).
     """
     outcomes = _Outcomes(1)
     active = []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
-        verdicts = outcomes.judge(np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1)
+        verdicts = outcomes.judge(
+            np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1
+        )
         active.append(bool(verdicts[0]))
     assert not outcomes.is_open.any()
     return str(outcomes.classify()[0]), active, float(outcomes.collision_speed[0])
@@ -75,7 +85,10 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
         (((0, False, None), (0, False, None), (0, True, None)), Outcome.NEVER_MOVED),
         (((0, False, None), (2, False, None), (0, False, None)), Outcome.STOPPED),
         (((0, False, None), (2, False, None), (2, True, None), (2, False, None)), Outcome.PASSED),
-        (((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)), Outcome.COLLISION),
+        (
+            ((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)),
+            Outcome.COLLISION,
+        ),
         (((0, False, None), (0, False, 0.0), (0, False, None)), Outcome.COLLISION),
         (((0, False, None), (0, False, None), (3, False, None), (3, False, None)), Outcome.TIMEOUT),
         (((3, False, None), (0, False, None)), Outcome.STOPPED),
@@ -95,7 +108,10 @@ def test_the_sample_of_a_collision_is_the_last_active_sample() -> None:
 
 def test_the_sample_in_which_the_encounter_ends_is_active_only_at_a_collision() -> None:
     assert judged((3, False, None), (3, True, None), (3, False, None))[1] == [True, False, False]
-    assert judged((3, False, None), (3, True, 3.0), (3, False, None))[1:] == ([True, True, False], 3.0)
+    assert judged((3, False, None), (3, True, 3.0), (3, False, None))[1:] == (
+        [True, True, False],
+        3.0,
+    )
 
 
 def test_the_last_sample_counts() -> None:
@@ -107,21 +123,32 @@ TIMES = np.arange(12) * STEP
 
 
 def observed(delay: float) -> tuple[FloatArray, FloatArray]:
-    """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose scene changes
-    linearly.
+    """Observed own speeds and (gap, closing speed, lateral, lateral speed) of one vehicle whose
+    scene changes linearly.
     """
-    perception = Perception([Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay)], STEP, 1)
+    perception = Perception(
+        [Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay)], STEP, 1
+    )
     seen = []
     for time in TIMES:
         scene = Scene(
-            np.array([20 - 5 * time]), np.array([-3 + 2 * time]), np.array([2 + time]), np.zeros(1, dtype=bool)
+            np.array([20 - 5 * time]),
+            np.array([-3 + 2 * time]),
+            np.array([2 + time]),
+            np.zeros(1, dtype=bool),
         )
         seen.append(perception.observe(float(time), np.array([5 + time]), scene))
     assert all(one.visibility == 0.7 for one in seen)
     return (
         np.array([one.speed[0] for one in seen]),
         np.array(
-            [[values[0] for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)] for one in seen]
+            [
+                [
+                    values[0]
+                    for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)
+                ]
+                for one in seen
+            ]
         ),
     )
 
@@ -132,17 +159,23 @@ def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float
     then = np.maximum(TIMES - delay, 0.0)
     assert speed == pytest.approx(5 + TIMES)
     if delay in (0.05, 0.15):
-        assert np.array_equal(scene[4:], observed(0.0)[1][4 - round(delay / STEP) : -round(delay / STEP)]), (
-            "whole steps are exact"
-        )
-    assert scene == pytest.approx(np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1))
+        assert np.array_equal(
+            scene[4:], observed(0.0)[1][4 - round(delay / STEP) : -round(delay / STEP)]
+        ), "whole steps are exact"
+    assert scene == pytest.approx(
+        np.stack([20 - 5 * then, 5 + then, -3 + 2 * then, 2 + then], axis=1)
+    )
 
 
 def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
-    perception = Perception([Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03)], STEP, 1)
+    perception = Perception(
+        [Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03)], STEP, 1
+    )
     nothing = np.zeros(1)
     gaps = [
-        perception.observe(time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)).gap[0]
+        perception.observe(
+            time, nothing, Scene(np.array([gap]), nothing, nothing, nothing > 0)
+        ).gap[0]
         for time, gap in zip(TIMES.tolist(), [np.inf, np.inf, 5.0, 4.0], strict=False)
     ]
     assert gaps == pytest.approx([np.inf, np.inf, np.inf, 4.6])
@@ -162,11 +195,16 @@ def test_hesitation_delays_braking_but_not_the_release_of_the_brake() -> None:
     wanted = [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
     assert pressed(0.0, wanted) == wanted
     assert pressed(0.1, wanted) == [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.2, 0.0, 0.0]
-    assert pressed(0.12, wanted) == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0])
+    assert pressed(0.12, wanted) == pytest.approx(
+        [0.0, 0.0, 0.0, 0.0, 0.6, 1.0, 1.0, 0.2, 0.0, 0.0]
+    )
 
 
 def test_a_remark_says_that_a_weather_has_no_effect() -> None:
     sentence = "weather 'carla_hard_rain' has no effect"
     for driver, says in (({"model": "full_braking"}, True), ({}, False)):
-        assert any(sentence in remark for remark in assemble(load_study("rain", ads=driver)).remarks) is says
+        assert (
+            any(sentence in remark for remark in assemble(load_study("rain", ads=driver)).remarks)
+            is says
+        )
     assert not any("has no effect" in remark for remark in assemble(load_study("sun")).remarks)

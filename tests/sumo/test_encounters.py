@@ -1,5 +1,5 @@
-"""Studies that search vehicle and scenario together: scenes of their encounters, the row's own original, and what is
-refused.
+"""Studies that search vehicle and scenario together: scenes of their encounters, the row's own
+original, and what is refused.
 """
 
 from __future__ import annotations
@@ -35,7 +35,12 @@ MARGIN = 4.0
 
 
 def domain(lower: float, upper: float, unit: str, original: float | None = None) -> dict[str, Any]:
-    return {"lower": lower, "upper": upper, "unit": unit, "original": lower if original is None else original}
+    return {
+        "lower": lower,
+        "upper": upper,
+        "unit": unit,
+        "original": lower if original is None else original,
+    }
 
 
 SPEED, PLACE = domain(30, 60, "km/h"), domain(20, 80, "%", 50)
@@ -48,10 +53,18 @@ CASES = {
     "walker": (
         "sun",
         {"model": "pedestrian_crossing"},
-        {"distance": domain(8, 20, "m"), "walking_speed": domain(1, 2.4, "m/s"), "lateral_start": domain(4, 8, "m")},
+        {
+            "distance": domain(8, 20, "m"),
+            "walking_speed": domain(1, 2.4, "m/s"),
+            "lateral_start": domain(4, 8, "m"),
+        },
     ),
     "parked": ("lgsvl", {"model": "lead_vehicle_stopped"}, {"distance": domain(40, 70, "m")}),
-    "far": ("wear", {"model": "crossing", "parameters": {"test": "CPFA"}}, {"speed": SPEED, "impact_location": PLACE}),
+    "far": (
+        "wear",
+        {"model": "crossing", "parameters": {"test": "CPFA"}},
+        {"speed": SPEED, "impact_location": PLACE},
+    ),
     "child": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CPNCO"}},
@@ -82,14 +95,24 @@ CASES = {
     "brakes": (
         "wear",
         {"model": "car_to_car", "parameters": {"test": "CCRb"}},
-        {"speed": SPEED, "headway": domain(1, 2, "s"), "target_deceleration": domain(3, 6, "m/s^2")},
+        {
+            "speed": SPEED,
+            "headway": domain(1, 2, "s"),
+            "target_deceleration": domain(3, 6, "m/s^2"),
+        },
     ),
 }
 
 
 def searched_study(case: str) -> Study:
     base, scenario, search = CASES[case]
-    return load_study(base, matrix=None, scenario={**scenario, "search": {**search, **WEATHER}}, name=case, title=case)
+    return load_study(
+        base,
+        matrix=None,
+        scenario={**scenario, "search": {**search, **WEATHER}},
+        name=case,
+        title=case,
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -118,7 +141,10 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         assert alone.outcome[0] == evaluations.outcome[row]
         np.testing.assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(
-            evaluations.metrics["original_safety_degree"][row], alone.f_safe[1], rtol=0, atol=ROUNDING
+            evaluations.metrics["original_safety_degree"][row],
+            alone.f_safe[1],
+            rtol=0,
+            atol=ROUNDING,
         )
     assert not verify_in_sumo(system, settings)
 
@@ -131,8 +157,12 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
         alone = evaluate(system, settings[[row]])
         for name, values in together.results.items():
             np.testing.assert_array_equal(alone.results[name], values[[row]])
-    beside = simulate("sun_joint", dict(zip(system.characteristics.names, settings[0].tolist(), strict=True)))
-    assert beside.original.evaluation.f_safe == pytest.approx(together.metrics["original_safety_degree"][:1])
+    beside = simulate(
+        "sun_joint", dict(zip(system.characteristics.names, settings[0].tolist(), strict=True))
+    )
+    assert beside.original.evaluation.f_safe == pytest.approx(
+        together.metrics["original_safety_degree"][:1]
+    )
     in_sumo = evaluate(system, settings, Engine.LIBSUMO)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
@@ -148,7 +178,9 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     system = assemble(load_study(base, matrix=None, scenario={**scenario, "search": search}))
     corners = product(*((one.lower, one.upper) for one in widest.values()))
     settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
-    recorded, in_sumo = (evaluate(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    recorded, in_sumo = (
+        evaluate(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
+    )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
 
@@ -185,8 +217,9 @@ def planted(**changes: Any) -> Study:
 
 @pytest.mark.slow
 def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) -> None:
-    """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap - margin; a share b of its
-    brakes collides if s / b > gap. So the least wear that ever collides leaves b = 1 - margin / gap of the brakes.
+    """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap -
+    margin; a share b of its brakes collides if s / b > gap. So the least wear that ever collides
+    leaves b = 1 - margin / gap of the brakes.
     """
     search = {"algorithms": ["nsga2"], "population": 40, "evaluations": 1200, "runs": 1, "seed": 1}
     results = load_runs(searched(planted(step_length=0.01, search=search), tmp_path / "out"))
@@ -205,9 +238,13 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
-    """In half of the encounters here the original collides; all algorithms simulate them and report none."""
+    """In half of the encounters here the original collides; all algorithms simulate them and report
+    none.
+    """
     search = {"speed": domain(50, 90, "km/h"), "road_friction": domain(0.5, 1, "-", 1)}
-    study = planted(scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "search": search})
+    study = planted(
+        scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "search": search}
+    )
     results = load_runs(searched(study, tmp_path / "out"))
     for algorithm, rows in results.evaluations.groupby("algorithm"):
         assert (rows["original_safety_degree"] < MARGIN).mean() > 0.1, algorithm
@@ -217,10 +254,17 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
 
 
 @pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=pytest.mark.slow)])
-def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tmp_path: Path) -> None:
+def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
+    name: str, tmp_path: Path
+) -> None:
     """`searched` also verifies all solutions in SUMO."""
     study = load_study(
-        name, search={"runs": 1, "evaluations": 150, "algorithms": ["nsga2", "rs", "pymoo:NSGA3", "pymoo:DE"]}
+        name,
+        search={
+            "runs": 1,
+            "evaluations": 150,
+            "algorithms": ["nsga2", "rs", "pymoo:NSGA3", "pymoo:DE"],
+        },
     )
     solutions = load_runs(searched(study, tmp_path / "out")).solutions
     limit = assemble(study).measuring.scoring.safe_original
@@ -231,7 +275,9 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(name: str, tm
 
 @pytest.mark.slow
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
-    """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap of the brakes."""
+    """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap
+    of the brakes.
+    """
     study = planted(step_length=0.01)
     answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0)
     (limit,) = answer.tables["limits"].to_dict("records")
@@ -242,7 +288,9 @@ def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> 
 
 
 @pytest.mark.slow
-def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> None:
+def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> (
+    None
+):
     study = planted()
     answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=500, top=2)
     for cause in answer.tables["causes"].to_dict("records"):
@@ -262,12 +310,18 @@ TOO_WIDE = {**SPEED, "upper": 500}
 MISTAKES = {
     "unknown": ({"headway": domain(1, 2, "s")}, r"scenario\.search\.headway: .* no such parameter"),
     "nearest": ({"speeed": SPEED}, r"did you mean 'speed'"),
-    "reversed": ({"speed": {**SPEED, "lower": 60, "upper": 30}}, r"scenario\.search\.speed: lower = 60"),
+    "reversed": (
+        {"speed": {**SPEED, "lower": 60, "upper": 30}},
+        r"scenario\.search\.speed: lower = 60",
+    ),
     "empty": ({"speed": {**SPEED, "upper": 30}}, "lower < upper"),
     "unit": ({"speed": {**SPEED, "unit": "m/s"}}, r"scenario\.search\.speed\.unit = 'm/s'"),
     "wide": ({"speed": TOO_WIDE}, r"a part of \[10, 80\] km/h"),
     "pure": ({"road_friction": domain(0, 1, "-", 1)}, r"a part of \[0\.1, 1\.2\]$"),
-    "fixed": ({"impact_location": PLACE}, r"scenario\.parameters\.impact_location = 25\.0 fixes it"),
+    "fixed": (
+        {"impact_location": PLACE},
+        r"scenario\.parameters\.impact_location = 25\.0 fixes it",
+    ),
     "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
     "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
     "key": ({"speed": {**SPEED, "weight": 2}}, "there is no such key"),
@@ -280,19 +334,33 @@ def test_mistakes_of_a_search_are_refused(mistake: str) -> None:
     parameters = {"test": "CPFA", "impact_location": 25.0, "time_to_impact": 3.5}
     with pytest.raises(InputError, match=message) as caught:
         assemble(
-            load_study("wear", matrix=None, scenario={"model": "crossing", "parameters": parameters, "search": search})
+            load_study(
+                "wear",
+                matrix=None,
+                scenario={"model": "crossing", "parameters": parameters, "search": search},
+            )
         )
     assert str(caught.value).count("\n") <= 1
 
 
 def test_a_matrix_and_a_search_over_one_parameter_are_refused() -> None:
-    with pytest.raises(InputError, match=r"scenario\.search\.speed: test 'CPFA' of the matrix sets speed, too"):
+    with pytest.raises(
+        InputError, match=r"scenario\.search\.speed: test 'CPFA' of the matrix sets speed, too"
+    ):
         load_study("wear", scenario={"search": {"speed": SPEED}})
     with pytest.raises(InputError, match=r"ads: there is no such key|ads.search"):
         load_study("wear", ads={"search": {"speed": SPEED}})
-    with pytest.raises(InputError, match="weathers clear and night of the matrix set visibility, too"):
-        assemble(load_study("euro_ncap_pedestrian", scenario={"search": {"visibility": WEATHER["visibility"]}}))
+    with pytest.raises(
+        InputError, match="weathers clear and night of the matrix set visibility, too"
+    ):
+        assemble(
+            load_study(
+                "euro_ncap_pedestrian", scenario={"search": {"visibility": WEATHER["visibility"]}}
+            )
+        )
     with pytest.raises(InputError, match="Stop has no such parameter to search\nexpected: none"):
-        assemble(load_study("stop", scenario={"search": {"road_friction": WEATHER["road_friction"]}}))
+        assemble(
+            load_study("stop", scenario={"search": {"road_friction": WEATHER["road_friction"]}})
+        )
     with pytest.raises(InputError, match="the cells of euro_ncap_2026 are fixed"):
         load_study("euro_ncap_rating", scenario={"search": {"speed": SPEED}})

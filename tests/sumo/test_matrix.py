@@ -1,5 +1,5 @@
-"""Settings in a matrix: the worst point counts, independently of the batch, the order of points and the other
-points.
+"""Settings in a matrix: the worst point counts, independently of the batch, the order of points and
+the other points.
 """
 
 from __future__ import annotations
@@ -56,7 +56,9 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
         alone = evaluate(SYSTEM.at(one.point), population)
         assert not [*differences(alone.results, one.evaluations.results)], one.point.name
     whole = evaluate(SYSTEM, population)
-    assert whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
+    assert (
+        whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
+    )
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
@@ -103,8 +105,12 @@ def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_
     assert runs.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
 
 
-def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_brakes_before() -> None:
-    """The slope requires 2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4) = 304 N m; the engine has 0.5 * 500 N m."""
+def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_brakes_before() -> (
+    None
+):
+    """The slope requires 2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4) = 304 N m; the engine has 0.5
+    * 500 N m.
+    """
     steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
     runs = run(steep, system=WEAK)
     assert runs.outcome[0] == Outcome.INVALID_TEST
@@ -113,22 +119,38 @@ def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_b
     assert run(steep, Pedals(lambda seen: (0, 0.5)), system=WEAK).outcome[0] == Outcome.STOPPED
 
 
-@pytest.mark.parametrize(("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)])
-def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(error: float, invalid: bool) -> None:
+@pytest.mark.parametrize(
+    ("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)]
+)
+def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
+    error: float, invalid: bool
+) -> None:
     """Euro NCAP's tolerance applies until the ADS acts."""
     vehicle = SUN.vehicle
     original = SUN.characteristics.original
-    prepared = vehicle.prepare(dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05)
+    prepared = vehicle.prepare(
+        dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05
+    )
     state = vehicle.at_speed(prepared, np.array([50 / 3.6]))
     all_open = np.ones(1, dtype=bool)
     robot = DrivingRobot([Point(CarToCar(speed=50), SUN.weather)], vehicle, prepared, state, 0.05)
-    robot.drive(Command(state.throttle, state.brake), state._replace(speed=np.array([(50 + error) / 3.6])), all_open)
+    robot.drive(
+        Command(state.throttle, state.brake),
+        state._replace(speed=np.array([(50 + error) / 3.6])),
+        all_open,
+    )
     assert robot.invalid.tolist() == [invalid]
 
 
-def test_a_setting_with_an_invalid_test_is_neither_safe_nor_unsafe_unless_it_collides_at_another_point() -> None:
-    tests = [MatrixTest(name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]})]
-    steep = assemble(msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests)))
+def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewhere() -> None:
+    tests = [
+        MatrixTest(
+            name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]}
+        )
+    ]
+    steep = assemble(
+        msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests))
+    )
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = original_of(SUN)
     assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == [
@@ -160,14 +182,27 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
     [
         # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
         ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
-        ((2.1, -1.2), (0.0, 1.0), 1.0, ("front", 0.01, 0.0)),  # across since 0.1 s, along since 0.01 s
-        ((1.0, -1.25), (0.0, 1.0), 1.0, ("right", 0.05, None)),  # along since 0.12 s, across by 0.05 m at 1 m/s
+        (
+            (2.1, -1.2),
+            (0.0, 1.0),
+            1.0,
+            ("front", 0.01, 0.0),
+        ),  # across since 0.1 s, along since 0.01 s
+        (
+            (1.0, -1.25),
+            (0.0, 1.0),
+            1.0,
+            ("right", 0.05, None),
+        ),  # along since 0.12 s, across by 0.05 m at 1 m/s
         ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
         ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
     ],
 )
 def test_bodies_touch_at_the_side_where_the_overlap_began_last(
-    middle: tuple[float, float], along: tuple[float, float], speed: float, contact: tuple[str, float, float | None]
+    middle: tuple[float, float],
+    along: tuple[float, float],
+    speed: float,
+    contact: tuple[str, float, float | None],
 ) -> None:
     own = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0)
     other = Body(np.array(middle), np.array(along), 0.6, 0.4, speed)

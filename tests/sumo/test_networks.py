@@ -1,4 +1,6 @@
-"""Networks: copies are equal and not connected; a user's network is simulated, or refused by name."""
+"""Networks: copies are equal and not connected; a user's network is simulated, or refused by
+name.
+"""
 
 from __future__ import annotations
 
@@ -28,27 +30,37 @@ BINARIES = Path(sumo.SUMO_HOME) / "bin"
 def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path) -> None:
     shutil.copytree(NETWORKS / folder, tmp_path / folder)
     subprocess.run(
-        [str(BINARIES / "netconvert"), "-c", "network.netccfg"], cwd=tmp_path / folder, check=True, capture_output=True
+        [str(BINARIES / "netconvert"), "-c", "network.netccfg"],
+        cwd=tmp_path / folder,
+        check=True,
+        capture_output=True,
     )
 
     def without_head(path: Path) -> list[str]:
         lines = path.read_text().splitlines()
         return lines[next(i for i, line in enumerate(lines) if line.startswith("<net ")) :]
 
-    assert without_head(tmp_path / folder / "network.net.xml") == without_head(NETWORKS / folder / "network.net.xml")
+    assert without_head(tmp_path / folder / "network.net.xml") == without_head(
+        NETWORKS / folder / "network.net.xml"
+    )
 
 
 def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
-    (mine / "network.edg.xml").write_text('<edges><edge id="road" from="west" to="nowhere"/></edges>')
+    (mine / "network.edg.xml").write_text(
+        '<edges><edge id="road" from="west" to="nowhere"/></edges>'
+    )
     with pytest.raises(
-        InputError, match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known"
+        InputError,
+        match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known",
     ):
         copied_network(open_network(str(mine)), 1)
 
 
-CAR = '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
+CAR = (
+    '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
+)
 
 
 @pytest.fixture
@@ -64,16 +76,22 @@ def with_traffic(mine: Path, more: str) -> str:
 
 
 GOOD = {
-    "a flow": '<flow id="f" type="car" from="oncoming" to="oncoming_on" begin="0" end="9" period="3"/>',
-    "a flow on a route": '<route id="r" edges="oncoming"/>'
-    '<flow id="f" type="car" route="r" begin="0" end="9" number="2"/>',
+    "a flow": (
+        '<flow id="f" type="car" from="oncoming" to="oncoming_on" begin="0" end="9" period="3"/>'
+    ),
+    "a flow on a route": (
+        '<route id="r" edges="oncoming"/>'
+        '<flow id="f" type="car" route="r" begin="0" end="9" number="2"/>'
+    ),
     "a trip": '<trip id="t" type="car" depart="0" from="oncoming" to="oncoming_on"/>',
     "a late vehicle": (
         '<vehicle id="t" type="car" depart="0:0:2"><route edges="oncoming"/><stop edge="oncoming" '
         'duration="1"/></vehicle>'
     ),
-    "a person's trip": '<person id="w" type="walker" depart="0">'
-    '<personTrip from="footpath" to="footpath_on"/></person>',
+    "a person's trip": (
+        '<person id="w" type="walker" depart="0">'
+        '<personTrip from="footpath" to="footpath_on"/></person>'
+    ),
     "a flow of persons": (
         '<personFlow id="w" type="walker" begin="0" end="4" period="2"><walk from="footpath" '
         'to="footpath_on"/></personFlow>'
@@ -83,7 +101,8 @@ GOOD = {
         'edges="footpath"/></person>'
     ),
     "parameters": (
-        '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note" value="approach"/></vehicle>'
+        '<vehicle id="v" type="car" depart="0"><route edges="oncoming"/><param key="note"'
+        ' value="approach"/></vehicle>'
     ),
 }
 
@@ -99,7 +118,8 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
             world.api.simulationStep()
             there = world.actor_poses()
             first, second = (
-                {name[2:]: place for name, place in there.items() if name.startswith(copy)} for copy in ("0.", "1.")
+                {name[2:]: place for name, place in there.items() if name.startswith(copy)}
+                for copy in ("0.", "1.")
             )
             assert first == second
             seen |= set(first)
@@ -113,19 +133,40 @@ def rewritten(file: Path, old: str, new: str) -> None:
 
 
 TRAFFIC = (
-    ('<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>', "has a 'vTypeDistribution', which"),
-    ('<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>', "'f.0' moves at random"),
-    ('<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>', "'f.0' moves at random"),
-    ('<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>', "'t' moves at random"),
-    ('<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>', "vType 'r' drives at random"),
     (
-        '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r" from="oncoming" depart="0"/>',
+        '<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>',
+        "has a 'vTypeDistribution', which",
+    ),
+    (
+        '<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>',
+        "'f.0' moves at random",
+    ),
+    (
+        '<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>',
+        "'f.0' moves at random",
+    ),
+    (
+        '<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>',
+        "'t' moves at random",
+    ),
+    (
+        '<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>',
+        "vType 'r' drives at random",
+    ),
+    (
+        (
+            '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r"'
+            ' from="oncoming" depart="0"/>'
+        ),
         "vType 'r' drives at random",
     ),
     ('<trip id="t" type="car" from="nowhere" depart="0"/>', "The edge 'nowhere' within the route"),
     ('<trip id="t" type="vut" from="oncoming" depart="0"/>', "'vut', a vType of its own"),
     (
-        '<person id="w" type="walker" depart="0"><ride from="approach" to="departure" lines="vut"/></person>',
+        (
+            '<person id="w" type="walker" depart="0"><ride from="approach" to="departure"'
+            ' lines="vut"/></person>'
+        ),
         "has a 'ride'",
     ),
 )
@@ -133,8 +174,18 @@ TRAFFIC = (
 BAD = [
     *(("traffic.rou.xml", "</routes>", f"{CAR}{more}</routes>", told) for more, told in TRAFFIC),
     ("traffic.rou.xml", '<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
-    ("traffic.rou.xml", 'id="vut" type="vut" depart="0"', 'id="vut" type="vut" depart="3"', "depart = '3'"),
-    ("traffic.rou.xml", 'id="vut" type="vut" depart', 'id="vut" type="pedestrian" depart', "type = 'pedestrian'"),
+    (
+        "traffic.rou.xml",
+        'id="vut" type="vut" depart="0"',
+        'id="vut" type="vut" depart="3"',
+        "depart = '3'",
+    ),
+    (
+        "traffic.rou.xml",
+        'id="vut" type="vut" depart',
+        'id="vut" type="pedestrian" depart',
+        "type = 'pedestrian'",
+    ),
     (
         "traffic.rou.xml",
         '<route edges="approach departure"/>',
@@ -189,7 +240,8 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     rewritten(mine / "network.netccfg", "</input>", '<type-files value="network.typ.xml"/></input>')
     rewritten(
         mine / "network.edg.xml",
-        'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70" disallow="pedestrian"',
+        'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70"'
+        ' disallow="pedestrian"',
         'id="departure" from="crossing" to="east" type="slow"',
     )
     check_network(str(mine))
@@ -220,8 +272,8 @@ def load_original(study: str) -> np.ndarray:
 
 
 def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
-    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no id of the
-    original.
+    """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no
+    id of the original.
     """
     netgenerate = str(BINARIES / "netgenerate")
     subprocess.run(
@@ -248,7 +300,11 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
         shutil.copy(NETWORKS / "along" / name, tmp_path / name)
     root = roads(tmp_path / "town.net.xml", 2)
     plain = ElementTree.parse(built_network(open_network(str(tmp_path / "town.net.xml")))).getroot()
-    originals = {one.attrib["id"] for one in plain.iter() if one.tag in ("edge", "lane", "junction", "tlLogic")}
+    originals = {
+        one.attrib["id"]
+        for one in plain.iter()
+        if one.tag in ("edge", "lane", "junction", "tlLogic")
+    }
     numbers = ("index", "fromLane", "toLane", "linkIndex", "linkIndex2", "name", "type")
     kept = {
         value
@@ -267,7 +323,9 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
 
 def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(mine: Path) -> None:
     (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
-    rewritten(mine / "scenario.sumocfg", "</input>", '<additional-files value="more.add.xml"/></input>')
+    rewritten(
+        mine / "scenario.sumocfg", "</input>", '<additional-files value="more.add.xml"/></input>'
+    )
     check_network(str(mine))
     before = open_network(str(mine)).digests
     (mine / "more.add.xml").write_text('<additional><vType id="more" length="7"/></additional>')

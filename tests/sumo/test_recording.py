@@ -1,5 +1,5 @@
-"""Vehicles in recorded scenes, compared with SUMO; and with nobody in sight, where the original vehicle must drive to
-the encounter, or no command gives a verdict on its driving system.
+"""Vehicles in recorded scenes, compared with SUMO; and with nobody in sight, where the original
+vehicle must drive to the encounter, or no command gives a verdict on its driving system.
 """
 
 from __future__ import annotations
@@ -42,17 +42,23 @@ class Claims(PedestrianCrossing, frozen=True, kw_only=True):
 
 
 def assert_same(system: System, settings: FloatArray) -> list[str]:
-    """Assert that recorded scenes and SUMO give the same bits, or what is computed of a scene the same to `ROUNDING`;
-    returns all outcomes.
+    """Assert that recorded scenes and SUMO give the same bits, or what is computed of a scene the
+    same to `ROUNDING`; returns all outcomes.
     """
     outcomes = []
     tolerance = ROUNDING if len(system.characteristics.scenario) else 0.0
-    results = (simulate_all_points(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO))
+    results = (
+        simulate_all_points(system, settings, engine)
+        for engine in (Engine.RECORDED, Engine.LIBSUMO)
+    )
     for recorded, copies in zip(*results, strict=True):
-        assert not [*differences(recorded.evaluations.results, copies.evaluations.results, tolerance)]
+        assert not [
+            *differences(recorded.evaluations.results, copies.evaluations.results, tolerance)
+        ]
         pairs = [*zip(recorded.runs.contact, copies.runs.contact, strict=True)]
         pairs += [
-            (getattr(recorded.runs, name), getattr(copies.runs, name)) for name in ("relative_speed", "warning_ttc")
+            (getattr(recorded.runs, name), getattr(copies.runs, name))
+            for name in ("relative_speed", "warning_ttc")
         ]
         for ours, theirs in pairs:
             if np.asarray(ours).dtype.kind == "f":
@@ -69,8 +75,8 @@ def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: S
 
 
 def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
-    """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions before and after a
-    step in SUMO.
+    """The mean of both speeds gave positions 1.4e-14 m off for 2 of 7,168 settings: their positions
+    before and after a step in SUMO.
     """
     before = np.array([0.0, 0.49783446695015615])
     after = np.array([0.4348049848410796, 1.0073508794958133])
@@ -134,15 +140,17 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
     Path("claims.py").write_text(CLAIM)
     scenario = {"model": "claims:Claims", "parameters": {"network": "reacting"}}
     system = assemble(load_study("native", scenario=scenario))
-    with pytest.raises(InputError, match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = "):
+    with pytest.raises(
+        InputError, match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = "
+    ):
         verify_in_sumo(system, drawn(system, 60, 5))
 
 
 FIRST = "On a first drive, with nobody in sight, the original vehicle "
 NO_VERDICT = ". So its drives with somebody in sight do not show how it reacts to them: no verdict."
 STANDS = (
-    f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m, with at most 0 of the throttle and 0 of the brake)"
-    f"{NO_VERDICT}"
+    f"{FIRST}never reaches the encounter (it gets 0.0 of 11.9 m, with at most 0 of the throttle and"
+    f" 0 of the brake){NO_VERDICT}"
 )
 BRAKES = f"{FIRST}brakes without an obstacle"
 
@@ -161,7 +169,10 @@ def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, obj
             STANDS.replace("0.0 of", "0.5 of").replace("0 of the thr", "0.02 of the thr"),
         ),
         (lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5), BRAKES + NO_VERDICT),
-        (lambda seen: (seen.speed < 5, seen.speed > 5), ""),  # a cruise control with the pedals' full strokes
+        (
+            lambda seen: (seen.speed < 5, seen.speed > 5),
+            "",
+        ),  # a cruise control with the pedals' full strokes
         # Stands on its brake, but only because of the pedestrian.
         (lambda seen: (0.9, np.isfinite(seen.gap)), ""),
     ],
@@ -172,7 +183,7 @@ def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
     assert reason("smoke", pedals) == expected
 
 
-def test_a_robot_drives_who_does_nothing_to_the_target_but_braking_for_nobody_is_told_with_its_points() -> None:
+def test_a_driving_system_that_brakes_for_nobody_is_named_with_its_points() -> None:
     test = at_point(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear")
     assert reason(test, lambda seen: (0, 0)) == ""
     assert reason(test, lambda seen: (0, 1)) == BRAKES + NO_VERDICT
@@ -191,7 +202,13 @@ def test_the_reason_counts_the_points_and_names_one() -> None:
     ("step", "expected"),
     [
         ("traci.vehicle.setSpeed(vehicle_id, 0)", "it gets 0.0 of 60.3 m"),
-        ("traci.vehicle.setSpeed(vehicle_id, 0 if traci.vehicle.getLeader(vehicle_id, 100) else 12)", ""),
+        (
+            (
+                "traci.vehicle.setSpeed(vehicle_id, 0 if traci.vehicle.getLeader(vehicle_id, 100)"
+                " else 12)"
+            ),
+            "",
+        ),
     ],
 )
 def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) -> None:
@@ -208,10 +225,12 @@ def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) 
 def still(in_tmp: Path) -> str:
     """A study file whose driving system does nothing."""
     Path("still.py").write_text(
-        "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self, seen):\n"
-        "        return 0.0, 0.0\n"
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self,"
+        " seen):\n        return 0.0, 0.0\n"
     )
-    Path("still.toml").write_text('extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n')
+    Path("still.toml").write_text(
+        'extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n'
+    )
     return "still.toml"
 
 
@@ -230,7 +249,9 @@ def test_an_answer_begins_with_the_reason(still: str) -> None:
 def test_every_command_begins_with_the_reason(still: str) -> None:
     for command in (("explain", still), ("simulate", still, "--set", "mass=2400..2600")):
         begins_with_the_reason(*command)
-    assert run("study", still, "--runs", "1", "--evaluations", "20", "--out", "results").stdout.startswith(STANDS)
+    assert run(
+        "study", still, "--runs", "1", "--evaluations", "20", "--out", "results"
+    ).stdout.startswith(STANDS)
     run("report", "results", "--ask", "rules --samples 32 --unsafe collision", "--out", "page.html")
     page = re.sub("</?span>", "", Path("page.html").read_text())  # a sentence has a line of its own
     assert f'<div class="first">\n<p>{STANDS}' in page

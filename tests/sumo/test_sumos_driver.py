@@ -83,24 +83,37 @@ def follows(traci, v):
 """
 NAMES = re.findall(r"def (\w+)\(traci, v\)", CONTROLLERS)
 NET = NETWORKS / "lead_vehicle_stopped"
-NO_DELAY = {name: {"original": 1e-9, "lower": 1e-9} for name in ("actuatorLag", "reactionTime", "brakeDelay")}
-"""Characteristics of a vehicle without delays; with the grip of `NO_DELAYS` it brakes as hard as anybody asks."""
+NO_DELAY = {
+    name: {"original": 1e-9, "lower": 1e-9}
+    for name in ("actuatorLag", "reactionTime", "brakeDelay")
+}
+"""Characteristics of a vehicle without delays; with the grip of `NO_DELAYS` it brakes as hard as
+anybody asks.
+"""
 NO_DELAYS = {"characteristics": NO_DELAY, "parameters": {"tyre_friction": 3.0}}
 
 
 def bare_sumo(traffic: Path, step: Callable[[Any, str], None], n: int = 161) -> np.ndarray:
     """Speed and gap at n samples, where SUMO alone drives."""
     rows = []
-    with open_world(CopiedNetwork(NET / "network.net.xml", traffic, NET / "scenario.sumocfg"), 0) as world:
+    with open_world(
+        CopiedNetwork(NET / "network.net.xml", traffic, NET / "scenario.sumocfg"), 0
+    ) as world:
         for _ in range(n):
             world.api.simulationStep()
-            rows.append((world.api.vehicle.getSpeed("vut"), 80.3 - world.api.vehicle.getPosition("vut")[0]))
+            rows.append(
+                (world.api.vehicle.getSpeed("vut"), 80.3 - world.api.vehicle.getPosition("vut")[0])
+            )
             step(world.api, "vut")
     return np.array(rows)
 
 
-def refuse_difference(runs: System, traffic: Path, step: Callable[[Any, str], None], speed_error: float = 1e-6) -> None:
-    """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its end."""
+def refuse_difference(
+    runs: System, traffic: Path, step: Callable[[Any, str], None], speed_error: float = 1e-6
+) -> None:
+    """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its
+    end.
+    """
     trace = simulate(runs, changed(runs)).trace
     n = np.count_nonzero(trace.active)
     bare = bare_sumo(traffic, step)
@@ -135,8 +148,12 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
     old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
     new = f'speedDev="0" mass="900" tau="0.3" {attributes}'
     traffic.write_text(traffic.read_text().replace(old, new))
-    runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario={"parameters": {"network": str(network)}})
-    unused = f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
+    runs = system(
+        "idle", CONTROLLERS, vehicle=NO_DELAYS, scenario={"parameters": {"network": str(network)}}
+    )
+    unused = (
+        f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
+    )
     assert any(remark.startswith(unused) for remark in runs.remarks)
     traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
     refuse_difference(runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6)
@@ -163,11 +180,17 @@ def native(**characteristics: object) -> tuple[System, SimulationRuns]:
     return runs, simulate(runs, changed(runs))
 
 
-def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_does(tmp_path: Path) -> None:
+def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_does(
+    tmp_path: Path,
+) -> None:
     """Without delays; `braking_share` 0.6 of 9 m/s^2 is SUMO's decel of 5.4 m/s^2."""
     bare_hardest = []
     for tau in (0.5, 1.0, 1.5, 2.0):
-        text = (NET / "traffic.rou.xml").read_text().replace('vut" vClass', f'vut" tau="{tau}" decel="5.4" vClass')
+        text = (
+            (NET / "traffic.rou.xml")
+            .read_text()
+            .replace('vut" vClass', f'vut" tau="{tau}" decel="5.4" vClass')
+        )
         (tmp_path / "traffic.rou.xml").write_text(text)
         bare = bare_sumo(tmp_path / "traffic.rou.xml", lambda *_: None)
         bare_hardest.append(-np.diff(bare[:, 0]).min() / 0.1)
@@ -183,14 +206,19 @@ def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> No
     assert np.all(np.diff([one.max() for one in by_tau]) < -0.5)
     assert np.all(np.diff([one.mean() for one in by_tau]) < -0.3)
     lags = np.concatenate(
-        [changed(runs, actuatorLag=lag, sensorRange=20, reactionTime=0.5) for lag in (0.1, 0.2, 0.4, 0.6)]
+        [
+            changed(runs, actuatorLag=lag, sensorRange=20, reactionTime=0.5)
+            for lag in (0.1, 0.2, 0.4, 0.6)
+        ]
     )
     assert np.all(np.diff(simulate(runs, lags).collision_speed) > 0.3)
 
 
 def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
     def remarks(model: str, **parameters: float) -> list[str]:
-        return assemble(load_study("native", ads={"model": model, "parameters": parameters})).remarks
+        return assemble(
+            load_study("native", ads={"model": model, "parameters": parameters})
+        ).remarks
 
     runs = assemble(load_study("native", ads={"model": "idm"}))
     fast, slow = (simulate(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
@@ -202,7 +230,14 @@ def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
     ]
 
 
-@pytest.mark.parametrize("of_older_studies", [{"tau": {"original": 0.2, "lower": 0.1, "upper": 0.6}}])
-def test_a_tau_that_is_a_lag_is_refused_and_the_new_key_is_named(of_older_studies: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"tau.original = 0.2: tau is the headway(.|\n)*characteristics.actuatorLag"):
+@pytest.mark.parametrize(
+    "of_older_studies", [{"tau": {"original": 0.2, "lower": 0.1, "upper": 0.6}}]
+)
+def test_a_tau_that_is_a_lag_is_refused_and_the_new_key_is_named(
+    of_older_studies: dict[str, Any],
+) -> None:
+    with pytest.raises(
+        InputError,
+        match=r"tau.original = 0.2: tau is the headway(.|\n)*characteristics.actuatorLag",
+    ):
         assemble(load_study("native", vehicle={"characteristics": of_older_studies}))

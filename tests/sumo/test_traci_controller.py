@@ -1,4 +1,6 @@
-"""A script for TraCI drives the vehicle under test: it reads SUMO, and the vehicle model carries out its commands."""
+"""A script for TraCI drives the vehicle under test: it reads SUMO, and the vehicle model carries
+out its commands.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,16 @@ def step(traci, vehicle_id):
     speed = traci.vehicle.getSpeed(vehicle_id)
     leader = traci.vehicle.getLeader(vehicle_id, 100)
     decel = traci.vehicle.getDecel(vehicle_id)
-    if leader and leader[0] == "parked_ahead" and leader[1] < 3 + speed * 0.5 + speed ** 2 / (2 * 0.6 * decel):
+    needed = 3 + speed * 0.5 + speed ** 2 / (2 * 0.6 * decel)
+    if leader and leader[0] == "parked_ahead" and leader[1] < needed:
         traci.vehicle.slowDown(vehicle_id, 0, max(speed / (0.6 * decel), 0.1))
     else:
         traci.vehicle.setSpeed(vehicle_id, 12)
 
 
 def idle(traci, vehicle_id):
-    assert traci.vehicle.getIDList() and set(traci.vehicle.getIDList()) == {"parked_ahead", "parked_beside", vehicle_id}
+    everybody = {"parked_ahead", "parked_beside", vehicle_id}
+    assert traci.vehicle.getIDList() and set(traci.vehicle.getIDList()) == everybody
     assert traci.simulation.getTime() < 17
 
 
@@ -62,7 +66,8 @@ get_speed, looked = traci.vehicle.getSpeed, []
 def cruise(vehicle_id):
     looked.append(traci.simulation.getTime())
     assert len(looked) == round(traci.simulation.getTime() / 0.1), "one call a step: nobody else's"
-    assert get_speed(vehicle_id) == ls.vehicle.getSpeed(vehID=vehicle_id) == vehicle.getSpeed(vehicle_id)
+    speed_of_libsumo = ls.vehicle.getSpeed(vehID=vehicle_id)
+    assert get_speed(vehicle_id) == speed_of_libsumo == vehicle.getSpeed(vehicle_id)
     try:
         traci.person.getPosition("nobody")
     except TraCIException as error:
@@ -79,7 +84,9 @@ def step(traci, vehicle_id):
 def system(name: str, script: str = SCRIPT, **tables: object) -> System:
     Path("my_controller.py").write_text(script)
     study = load_study("native", **tables)
-    return assemble(msgspec.structs.replace(study, ads=ModelTable(model=f"my_controller:{name}", kind="traci")))
+    return assemble(
+        msgspec.structs.replace(study, ads=ModelTable(model=f"my_controller:{name}", kind="traci"))
+    )
 
 
 def changed(of: System, **values: float) -> np.ndarray:
@@ -106,17 +113,24 @@ def step(traci, vehicle_id):
     traci.vehicle.setSpeed(vehicle_id, 12)
     leader = traci.vehicle.getLeader(vehicle_id, dist=200)
     x = traci.vehicle.getPosition("parked_ahead")[0]
-    row = (leader[1] if leader else -1, x, traci.vehicle.getIDCount(), "parked_ahead" in traci.vehicle.getIDList())
+    is_parked = "parked_ahead" in traci.vehicle.getIDList()
+    row = (leader[1] if leader else -1, x, traci.vehicle.getIDCount(), is_parked)
     with Path("looks.csv").open("a") as file:
         print(*map(float, row), sep=",", file=file)
 """
 
 
 def test_a_controller_reads_other_actors_through_the_sensors() -> None:
-    """The gap to the leader is the trace's gap one reaction time and one recognition delay ago, linear between two
-    steps.
+    """The gap to the leader is the trace's gap one reaction time and one recognition delay ago,
+    linear between two steps.
     """
-    weather = {"name": "haze", "road_friction": 1.0, "visibility": 0.5, "recognition_delay": 0.1, "light": "day"}
+    weather = {
+        "name": "haze",
+        "road_friction": 1.0,
+        "visibility": 0.5,
+        "recognition_delay": 0.1,
+        "light": "day",
+    }
     runs = system("step", LOOKS, weather=weather)
     trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
     leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[: len(trace.time)].T
@@ -138,12 +152,14 @@ import traci.constants as tc
 
 class Reads:
     def start(self, traci, vehicle_id):
-        traci.vehicle.subscribe(vehicle_id, [tc.VAR_LANE_ID, tc.VAR_LEADER], parameters={tc.VAR_LEADER: ("d", 200.0)})
+        variables = [tc.VAR_LANE_ID, tc.VAR_LEADER]
+        traci.vehicle.subscribe(vehicle_id, variables, parameters={tc.VAR_LEADER: ("d", 200.0)})
 
     def step(self, traci, vehicle_id):
         found = traci.vehicle.getAllSubscriptionResults()
         assert found == {vehicle_id: traci.vehicle.getSubscriptionResults(vehicle_id)}, found
-        assert found[vehicle_id][tc.VAR_LANE_ID] == "road_0" and found[vehicle_id][tc.VAR_LEADER][0] == "parked_ahead"
+        assert found[vehicle_id][tc.VAR_LANE_ID] == "road_0"
+        assert found[vehicle_id][tc.VAR_LEADER][0] == "parked_ahead"
         assert traci.simulation.convertRoad(10.0, 0.0) == ("road", 10.0, 1)
         assert traci.vehicle.getIDCount() == 3
         assert traci.edge.getIDCount() == 1 and traci.vehicle.getRoute(vehicle_id) == ("road",)
@@ -157,14 +173,20 @@ def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
 
 
 REFUSED = [
-    ("traci.simulationStep()", "traci.simulationStep: is not for a controller of 'vut': safevar_sumo itself starts"),
+    (
+        "traci.simulationStep()",
+        "traci.simulationStep: is not for a controller of 'vut': safevar_sumo itself starts",
+    ),
     (
         "traci.vehicle.setSpeed('parked_ahead', 3)",
         "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test",
     ),
     ("traci.vehicle.setSpeed(v, speed=float('nan'))", "traci.vehicle.setSpeed: speed = nan"),
     ("traci.vehicle.setSpeedMode(v, 1.5)", "traci.vehicle.setSpeedMode: mode = 1.5"),
-    ("traci.vehicle.getNeighbors(v, 1)", "traci.vehicle.getNeighbors: is not for a controller of 'vut'"),
+    (
+        "traci.vehicle.getNeighbors(v, 1)",
+        "traci.vehicle.getNeighbors: is not for a controller of 'vut'",
+    ),
     (
         "traci.vehicle.getRoute('parked_ahead')",
         "traci.vehicle.getRoute: returns a value of 'parked_ahead' that no sensor",
@@ -174,14 +196,22 @@ REFUSED = [
         "traci.vehicle.moveTo: is not for a controller of 'vut': it would bypass",
     ),
     ("traci.vehicle.setType(v, 'parked')", "traci.vehicle.setType: makes it another vehicle"),
-    ("traci.vehicle.setLaneChangeMode(v, 1621)", "traci.vehicle.setLaneChangeMode: mode = 1621: the vehicle keeps its"),
-    ("traci.vehicle.setImperfection(v, 0.5)", "traci.vehicle.setImperfection: imperfection = 0.5 makes results random"),
+    (
+        "traci.vehicle.setLaneChangeMode(v, 1621)",
+        "traci.vehicle.setLaneChangeMode: mode = 1621: the vehicle keeps its",
+    ),
+    (
+        "traci.vehicle.setImperfection(v, 0.5)",
+        "traci.vehicle.setImperfection: imperfection = 0.5 makes results random",
+    ),
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "problem"), REFUSED)
-def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(line: str, problem: str) -> None:
+def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
+    line: str, problem: str
+) -> None:
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
     runs = system("step", script)
     with pytest.raises(InputError) as caught:
@@ -214,20 +244,36 @@ def main(traci, v):
     [
         (
             "my_script:step",
-            "raised in step: traci.simulationStep: is not for a controller of 'vut': safevar_sumo itself starts",
+            (
+                "raised in step: traci.simulationStep: is not for a controller of 'vut':"
+                " safevar_sumo itself starts"
+            ),
         ),
-        ("my_script:main", "raised in main: traci.start: is not for a controller of 'vut': safevar_sumo itself starts"),
+        (
+            "my_script:main",
+            (
+                "raised in main: traci.start: is not for a controller of 'vut': safevar_sumo itself"
+                " starts"
+            ),
+        ),
         ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
         (
             "my_loop:run",
-            "user code raised in main: traci.start: is called while no vehicle is driven: safevar_sumo itself",
+            (
+                "user code raised in main: traci.start: is called while no vehicle is driven:"
+                " safevar_sumo itself"
+            ),
         ),
     ],
 )
-def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(model: str, problem: str) -> None:
+def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(
+    model: str, problem: str
+) -> None:
     Path("my_script.py").write_text(OWN_LOOP)
     Path("my_loop.py").write_text(f"{OWN_LOOP}\n\nmain(traci, 'vut')\n")
-    Path("mine.toml").write_text(f'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "{model}"\n')
+    Path("mine.toml").write_text(
+        f'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "{model}"\n'
+    )
     (error,) = run("simulate", "mine.toml", expect=2).stderr.split("safevar-sumo: ")[1:]
     assert problem in error
     assert len(error.splitlines()) == 2

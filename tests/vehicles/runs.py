@@ -19,8 +19,8 @@ Pedals = Callable[[float], tuple[Any, Any]]
 
 
 class Drive(NamedTuple):
-    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled distances [m] have shape (T,
-    N).
+    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled
+    distances [m] have shape (T, N).
     """
 
     prepared: Any
@@ -35,7 +35,10 @@ class Drive(NamedTuple):
     def distance(self) -> FloatArray:
         speed = self.speed
         return np.concatenate(
-            [np.zeros((1, speed.shape[1])), np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0)]
+            [
+                np.zeros((1, speed.shape[1])),
+                np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0),
+            ]
         )
 
     def at(self, time: float) -> int:
@@ -43,11 +46,20 @@ class Drive(NamedTuple):
 
 
 def prepare(
-    model: str, settings: FloatArray, road: float = 1.0, step: float = STEP, grade: float = 0.0, water: float = 0.0
+    model: str,
+    settings: FloatArray,
+    road: float = 1.0,
+    step: float = STEP,
+    grade: float = 0.0,
+    water: float = 0.0,
 ) -> Any:
     """The constants of vehicles with these settings, shape (N, n)."""
-    values = dict(zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True))
-    return SYSTEMS[model].vehicle.prepare(values, road, step, slope_of(np.full(len(settings), grade)), water)
+    values = dict(
+        zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True)
+    )
+    return SYSTEMS[model].vehicle.prepare(
+        values, road, step, slope_of(np.full(len(settings), grade)), water
+    )
 
 
 def drive(
@@ -61,8 +73,8 @@ def drive(
     grade: float = 0.0,
     water: float = 0.0,
 ) -> Drive:
-    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each. `rolling` is the
-    initial speed [m/s].
+    """Drive settings, shape (N, n); pedals(t) -> (throttle, brake), for all vehicles or one each.
+    `rolling` is the initial speed [m/s].
     """
     vehicle = SYSTEMS[model].vehicle
     prepared = prepare(model, settings, road, step, grade, water)
@@ -76,7 +88,11 @@ def drive(
 
 def _rolling(state: Any, prepared: Any, speed: float) -> Any:
     """The state of the vehicle at rest, changed to rolling without slip in the same gear."""
-    wheels = {"wheel_speed": speed / getattr(prepared, "car", prepared).radius} if hasattr(state, "wheel_speed") else {}
+    wheels = (
+        {"wheel_speed": speed / getattr(prepared, "car", prepared).radius}
+        if hasattr(state, "wheel_speed")
+        else {}
+    )
     return state._replace(speed=state.speed + speed, **wheels)
 
 
@@ -89,13 +105,17 @@ def ends(model: str, name: str, points: int = 5) -> FloatArray:
     characteristics = SYSTEMS[model].characteristics
     settings = original(model, points)
     column = characteristics.names.index(name)
-    settings[:, column] = np.linspace(characteristics.lower[column], characteristics.upper[column], points)
+    settings[:, column] = np.linspace(
+        characteristics.lower[column], characteristics.upper[column], points
+    )
     return settings
 
 
 def drawn(model: str, n: int, seed: int) -> FloatArray:
     characteristics = SYSTEMS[model].characteristics
-    return np.random.default_rng(seed).uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+    return np.random.default_rng(seed).uniform(
+        characteristics.lower, characteristics.upper, (n, len(characteristics))
+    )
 
 
 def full_throttle(time: float) -> tuple[float, float]:
@@ -111,4 +131,6 @@ def coasting_after(start: float) -> Pedals:
 
 
 def braking_after(start: float, coasting: float = 0.0) -> Pedals:
-    return lambda time: (1.0, 0.0) if time < start else (0.0, 1.0 if time >= start + coasting else 0.0)
+    return lambda time: (
+        (1.0, 0.0) if time < start else (0.0, 1.0 if time >= start + coasting else 0.0)
+    )

@@ -1,5 +1,5 @@
-"""The compiled step of `carla`: the bits of a plain Python loop over one vehicle, wherever a vehicle stands in a batch;
-compiled once, and without a cache, too.
+"""The compiled step of `carla`: the bits of a plain Python loop over one vehicle, wherever a
+vehicle stands in a batch; compiled once, and without a cache, too.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ def plain() -> ModuleType:
 
 @pytest.mark.parametrize("n", [1, 65])
 def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: ModuleType) -> None:
-    """From rest through all gears, with held gears, to a standstill with locked wheels; the first and the last of n."""
+    """From rest through all gears, with held gears, to a standstill with locked wheels; the first
+    and the last of n.
+    """
     names = SYSTEMS["carla"].characteristics.names
     values = dict(zip(names, np.ascontiguousarray(drawn("carla", n, 3).T), strict=True))
     p = CARLA.prepare(values, 0.6, STEP)
@@ -66,7 +68,10 @@ def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: Mod
             if one.brake > 0 and one.speed < cars[k].standstill:
                 one = one._replace(speed=0.0, wheel_speed=0.0)
             alone[k] = one
-            assert np.array([column[i] for column in state]).tobytes() == np.array(one, dtype=float).tobytes(), step
+            assert (
+                np.array([column[i] for column in state]).tobytes()
+                == np.array(one, dtype=float).tobytes()
+            ), step
     assert alone[0].speed == 0.0
 
 
@@ -79,9 +84,13 @@ print(vehicle.compile(only_load=True), vehicle.compile())
 
 
 def loaded(folder: str) -> str:
-    """What a new process finds in a cache: whether the step is compiled, and is then; and its errors."""
+    """What a new process finds in a cache: whether the step is compiled, and is then; and its
+    errors.
+    """
     environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-    done = subprocess.run([sys.executable, "-c", LOADING], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING], env=environment, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip() + done.stderr
 
 
@@ -90,17 +99,26 @@ def test_a_process_finds_compiled_what_an_earlier_one_compiled(tmp_path: Path) -
     assert [loaded(str(tmp_path)) for _ in range(2)] == ["False True", "True True"]
 
 
-def test_without_a_cache_functions_are_compiled_in_silence(capfd: pytest.CaptureFixture[str]) -> None:
+def test_without_a_cache_functions_are_compiled_in_silence(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     """Numba finds no folder for the file of a function that was typed."""
     code: dict[str, Any] = {}
     exec(compile("def double(x):\n    return 2.0 * x", "nowhere", "exec"), code)
     double = compiled.compiled(code["double"])
     assert not compiled.is_compiled(lambda: double(1.0))
-    assert (double(1.5), compiled.is_compiled(lambda: double(1.0)), *capfd.readouterr()) == (3.0, True, "", "")
+    assert (double(1.5), compiled.is_compiled(lambda: double(1.0)), *capfd.readouterr()) == (
+        3.0,
+        True,
+        "",
+        "",
+    )
 
 
 @pytest.mark.parametrize("is_ready", [False, True])
-def test_progress_says_that_the_vehicle_is_compiled_once_a_pool(is_ready: bool, monkeypatch: Any) -> None:
+def test_progress_says_that_the_vehicle_is_compiled_once_a_pool(
+    is_ready: bool, monkeypatch: Any
+) -> None:
     asked = list[bool]()
     shown = list[str]()
 

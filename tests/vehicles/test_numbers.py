@@ -10,10 +10,27 @@ from msgspec.structs import replace
 from scipy.integrate import solve_ivp
 
 from safevar_sumo.records import GRAVITY, Command
-from safevar_sumo.vehicles.carla import AIR_DENSITY, ENGINE_INERTIA, FINAL_RATIO, FRONTAL_AREA, GEAR_RATIOS, RPM
+from safevar_sumo.vehicles.carla import (
+    AIR_DENSITY,
+    ENGINE_INERTIA,
+    FINAL_RATIO,
+    FRONTAL_AREA,
+    GEAR_RATIOS,
+    RPM,
+)
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
 from tests.made_up import seen
-from tests.vehicles.runs import STEP, SYSTEMS, braking_after, drawn, drive, ends, full_throttle, original, prepare
+from tests.vehicles.runs import (
+    STEP,
+    SYSTEMS,
+    braking_after,
+    drawn,
+    drive,
+    ends,
+    full_throttle,
+    original,
+    prepare,
+)
 
 CARLA = SYSTEMS["carla"].vehicle
 
@@ -21,12 +38,17 @@ CARLA = SYSTEMS["carla"].vehicle
 def prepared(model: str, **changes: float) -> Any:
     """The constants of one vehicle: the original with some characteristics changed."""
     characteristics = SYSTEMS[model].characteristics
-    values = {member.name: np.full(1, changes.get(member.name, float(member.original))) for member in characteristics}
+    values = {
+        member.name: np.full(1, changes.get(member.name, float(member.original)))
+        for member in characteristics
+    }
     return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
 
 
 def step(model: str, state: Any, throttle: float = 0.0, brake: float = 0.0) -> Any:
-    return SYSTEMS[model].vehicle.advance(prepared(model), state, Command(np.full(1, throttle), np.full(1, brake)))
+    return SYSTEMS[model].vehicle.advance(
+        prepared(model), state, Command(np.full(1, throttle), np.full(1, brake))
+    )
 
 
 def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
@@ -34,17 +56,25 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
     slowed = []
     for drag in (0.2, 0.5):
         p = prepared("carla", dragCoeff=drag)
-        state = CARLA.at_rest(p)._replace(speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355))
-        slowed.append(20.0 - float(CARLA.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0]))
+        state = CARLA.at_rest(p)._replace(
+            speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355)
+        )
+        slowed.append(
+            20.0 - float(CARLA.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0])
+        )
     # The wheels' inertia takes part: four wheels of 20 kg, I / r^2 = 40 kg.
-    assert slowed[1] - slowed[0] == pytest.approx(0.5 * 1.2 * 2.2 * 0.3 * 400 / (2404 + 40) * STEP, rel=0.02)
+    assert slowed[1] - slowed[0] == pytest.approx(
+        0.5 * 1.2 * 2.2 * 0.3 * 400 / (2404 + 40) * STEP, rel=0.02
+    )
 
 
-def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_and_waits_two_seconds() -> None:
+def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_and_waits_two_seconds() -> None:
     # The values of sun are fitted.
     vehicle = replace(CARLA, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
     names = SYSTEMS["carla"].characteristics
-    p = vehicle.prepare({one.name: np.full(1, float(one.original)) for one in names}, 1.0, 1 / 60)  # one substep
+    p = vehicle.prepare(
+        {one.name: np.full(1, float(one.original)) for one in names}, 1.0, 1 / 60
+    )  # one substep
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
@@ -59,24 +89,28 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_of_the_engines_maximum_
         return float(vehicle.advance(p, state, Command(one, 0 * one)).target_gear[0])
 
     assert [target(1, 0.649), target(1, 0.651), target(1, 0.651, 1.9)] == [1, 2, 1]
-    assert [target(2, 0.501), target(2, 0.499), target(2, 0.499, 1.9), target(1, 0.1), target(4, 0.9)] == [
-        2,
-        1,
-        2,
-        1,
-        4,
-    ]
+    assert [
+        target(2, 0.501),
+        target(2, 0.499),
+        target(2, 0.499, 1.9),
+        target(1, 0.1),
+        target(4, 0.9),
+    ] == [2, 1, 2, 1, 4]
 
 
 def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> None:
-    """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the gear, and has no
-    latency afterwards.
+    """In first gear at 90 % of the engine's maximum: the gearbox waits while the selector holds the
+    gear, and has no latency afterwards.
     """
     p = prepared("carla")
     one = np.ones(1)
     rim = 0.9 * 5800 * 2 * np.pi / 60 / (2.85 * 4)
     state = CARLA.at_rest(p)._replace(
-        gear=one, target_gear=one, speed=rim * 0.355 * one, wheel_speed=rim * one, engine_speed=rim * 2.85 * 4 * one
+        gear=one,
+        target_gear=one,
+        speed=rim * 0.355 * one,
+        wheel_speed=rim * one,
+        engine_speed=rim * 2.85 * 4 * one,
     )
     for _ in range(100):
         state = step("carla", CARLA.hold_gear(p, state, one > 0), throttle=1.0)
@@ -102,7 +136,9 @@ def test_sumo_is_told_what_carlas_vehicle_can_do() -> None:
     assert result.max_speed[0] == pytest.approx(5800 * 2 * np.pi / 60 / 4.0 * 0.355), (
         "the highest gear is 1.0, the final drive 4.0"
     )
-    assert result.accel[0] == pytest.approx(min(CARLA.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip))
+    assert result.accel[0] == pytest.approx(
+        min(CARLA.engine_torque * 500 * 2.85 * 4 / 0.355 / 2404, grip)
+    )
     assert result.decel[0] == pytest.approx(min(4 * 1500 / 0.355 / 2404, grip))
     assert result.actuator_lag[0] == pytest.approx(STEP + 1 / CARLA.brake_rise)
     assert result.mass[0] == 2404
@@ -127,7 +163,9 @@ def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
 
 
 @pytest.mark.parametrize(("share", "gear"), [(0.12, 2), (0.14, 3), (0.32, 3), (0.34, 4)])
-def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(share: float, gear: int) -> None:
+def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(
+    share: float, gear: int
+) -> None:
     """From third gear, 8299 r/min at most."""
     one = np.ones(1)
     state = (
@@ -145,9 +183,13 @@ def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(
     assert step("lgsvl", state).gear[0] == gear
 
 
-@pytest.mark.parametrize(("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)])
+@pytest.mark.parametrize(
+    ("slip", "share"), [(0.2, 0.75), (0.4, 1.0), (0.6, 0.75), (0.8, 0.5), (0.95, 0.5)]
+)
 def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
-    """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2 N of downforce."""
+    """A parabola up to the extremum at slip 0.4, a line down to half of it at 0.8; load with 2 v^2
+    N of downforce.
+    """
     p = prepared("lgsvl")
     rim = 10.0
     one = np.ones(1)
@@ -165,16 +207,18 @@ def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, is_seen: boo
     assert bool(np.isfinite(result.gap[0])) == is_seen, "80 m in clear sight"
 
 
-def test_who_brakes_sumos_vehicle_does_not_go_on_speeding_up_until_the_lag_of_its_actuators_is_over() -> None:
-    """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the brake ends it at
-    once.
+def test_a_braked_sumo_vehicle_does_not_go_on_speeding_up_during_the_lag() -> None:
+    """A lag of 0.5 s leaves most of full throttle's acceleration to the next step; a tenth of the
+    brake ends it at once.
     """
     vehicle = SYSTEMS["sumo"].vehicle
     p = prepared("sumo", actuatorLag=0.5, brakeDelay=0.0)
     state = vehicle.at_rest(p)
     for _ in range(40):
         state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))
-    released, braked = (vehicle.advance(p, state, Command(np.zeros(1), np.full(1, brake))) for brake in (0.0, 0.1))
+    released, braked = (
+        vehicle.advance(p, state, Command(np.zeros(1), np.full(1, brake))) for brake in (0.0, 0.1)
+    )
     assert released.speed[0] > state.speed[0]
     assert braked.speed[0] <= state.speed[0]
 
@@ -193,8 +237,8 @@ def tyre_force(friction: float, load: float, speed: float, rim: float) -> float:
 
 @pytest.mark.parametrize("setting", drawn("carla", 5, 21), ids=range(5))
 def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarray) -> None:
-    """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first gear on until
-    0.5 m/s.
+    """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first
+    gear on until 0.5 m/s.
     """
     values = dict(zip(SYSTEMS["carla"].characteristics.names, setting, strict=True))
     run = drive("carla", setting[np.newaxis], braking_after(1.4), 2.8)
@@ -214,7 +258,10 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
             * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890))
             * (x <= 1)
         )
-        damping = values["dampRateZeroT_CE"] + (values["dampRateFullT"] - values["dampRateZeroT_CE"]) * throttle
+        damping = (
+            values["dampRateZeroT_CE"]
+            + (values["dampRateFullT"] - values["dampRateZeroT_CE"]) * throttle
+        )
         clutch = values["clutchStrength"] * (engine - ratio * wheel)
         force = tyre_force(friction, mass * GRAVITY, speed, radius * wheel)
         braking = brake * 4 * values["maxBrakeTorque"] * np.tanh(wheel / 0.01)

@@ -1,5 +1,5 @@
-"""Every vehicle model: physics that no parameter may break, every characteristic acting as physics says, and a steady
-state of every part that starts in motion.
+"""Every vehicle model: physics that no parameter may break, every characteristic acting as physics
+says, and a steady state of every part that starts in motion.
 """
 
 from __future__ import annotations
@@ -49,10 +49,16 @@ def kinetic_energy(model: str, run: Drive) -> FloatArray:
     states = run.states
     if isinstance(SYSTEMS[model].vehicle, Carla):
         wheels_and_engine = [
-            WHEELS * 0.5 * WHEEL_MASS * p.car.radius**2 * s.wheel_speed**2 + ENGINE_INERTIA * s.engine_speed**2
+            WHEELS * 0.5 * WHEEL_MASS * p.car.radius**2 * s.wheel_speed**2
+            + ENGINE_INERTIA * s.engine_speed**2
             for s in states
         ]
-        return np.stack([(p.mass * s.speed**2 + spins) / 2 for s, spins in zip(states, wheels_and_engine, strict=True)])
+        return np.stack(
+            [
+                (p.mass * s.speed**2 + spins) / 2
+                for s, spins in zip(states, wheels_and_engine, strict=True)
+            ]
+        )
     if isinstance(SYSTEMS[model].vehicle, Lgsvl):
         return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
     return np.stack([p.mass * s.speed**2 / 2 for s in states])
@@ -60,8 +66,8 @@ def kinetic_energy(model: str, run: Drive) -> FloatArray:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_energy_is_never_created(model: str) -> None:
-    """With pedals that change at random every second, the energy grows at most by the power of the engine; with the
-    throttle closed it does not grow.
+    """With pedals that change at random every second, the energy grows at most by the power of the
+    engine; with the throttle closed it does not grow.
     """
     n = 300
     rng = np.random.default_rng(12)
@@ -72,9 +78,9 @@ def test_energy_is_never_created(model: str) -> None:
     gained = np.diff(energy, axis=0)
     throttle = np.stack([state.throttle for state in run.states])
     closed = (throttle[1:] == 0) & (throttle[:-1] == 0)
-    if (
-        model == "sumo"
-    ):  # its acceleration lags behind the throttle, which counts as closed when the acceleration has died away
+    # The acceleration of SUMO's vehicle lags behind the throttle, which counts as closed when the
+    # acceleration has died away.
+    if model == "sumo":
         closed &= np.stack([state.acceleration for state in run.states[1:]]) <= 0
     assert np.count_nonzero(closed) > 1000
     assert np.all(gained[closed] <= 1e-9 * (1 + energy[:-1][closed]))
@@ -94,7 +100,9 @@ def speed_at(
     return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
 
 
-def stopping_distance(brake: float, road: float = 1.0, water: float = 0.0) -> Callable[..., FloatArray]:
+def stopping_distance(
+    brake: float, road: float = 1.0, water: float = 0.0
+) -> Callable[..., FloatArray]:
     return lambda model, population: drive(
         model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, water=water
     ).distance[-1]
@@ -159,11 +167,18 @@ ACTS = {
         "payload": (stopping_distance(0.6), +1),
     },
 }
-SENSED = {"sumo": {"sensorRange", "reactionTime", "tau"}, "worn": {"sensorRange", "sensorLatency", "payloadCentre"}}
-"""Characteristics that act on the observation, on the driver (test_ads.py), or on single axles (test_worn.py)."""
+SENSED = {
+    "sumo": {"sensorRange", "reactionTime", "tau"},
+    "worn": {"sensorRange", "sensorLatency", "payloadCentre"},
+}
+"""Characteristics that act on the observation, on the driver (test_ads.py), or on single axles
+(test_worn.py).
+"""
 
 
-@pytest.mark.parametrize(("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting])
+@pytest.mark.parametrize(
+    ("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting]
+)
 def test_a_characteristic_acts_in_the_direction_that_physics_says(model: str, name: str) -> None:
     measure, direction = ACTS[model][name]
     measured = direction * measure(model, ends(model, name))
@@ -192,12 +207,14 @@ def test_two_continuations_of_a_history_know_nothing_of_each_other() -> None:
             samples[one].insert(0, rng.random(3))
             histories[one] = histories[one].extended(samples[one][0])
             (a, b, c), share = zip(*samples[one][:6], strict=True), 0.17 / 0.1 - 1
-            assert histories[one].delayed() == pytest.approx([a[0], b[1] * (1 - share) + b[2] * share, c[4]])
+            assert histories[one].delayed() == pytest.approx(
+                [a[0], b[1] * (1 - share) + b[2] * share, c[4]]
+            )
 
 
 def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
-    """Five values of a characteristic, and the gaps that such vehicles report while an obstacle comes nearer at 10 m/s;
-    shape (T, 5).
+    """Five values of a characteristic, and the gaps that such vehicles report while an obstacle
+    comes nearer at 10 m/s; shape (T, 5).
     """
     vehicle = SYSTEMS[model].vehicle
     population = ends(model, name)
@@ -233,7 +250,9 @@ SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxe
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
-@pytest.mark.parametrize(("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)])
+@pytest.mark.parametrize(
+    ("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)]
+)
 def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
     vehicle = SYSTEMS[model].vehicle
     prepared = prepare(model, original(model), grade=grade)
@@ -263,7 +282,9 @@ def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path)
     system = assemble(load_study(study, scenario={"parameters": {"network": str(traffic.parent)}}))
     trace = simulate(system, system.characteristics.original[np.newaxis]).trace
     assert trace.speed[0, 0] == 5
-    assert abs(trace.speed[1, 0] - 5) < 0.3, "no jump in the first step, whatever the system commands"
+    assert abs(trace.speed[1, 0] - 5) < 0.3, (
+        "no jump in the first step, whatever the system commands"
+    )
 
 
 G = 9.81
@@ -279,13 +300,23 @@ def test_a_grade_is_the_tangent_of_the_slopes_angle_and_none_is_level_to_the_bit
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize("grade", [8.0, -8.0])
-def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(model: str, grade: float) -> None:
-    """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the brake has built
-    up.
+def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds(
+    model: str, grade: float
+) -> None:
+    """On ice, where the tyres limit the deceleration to mu g cos; between 10 and 4 m/s, after the
+    brake has built up.
     """
 
     def distance(grade: float) -> float:
-        run = drive(model, original(model), lambda time: (0.0, 1.0), 25.0, rolling=12.0, road=0.25, grade=grade)
+        run = drive(
+            model,
+            original(model),
+            lambda time: (0.0, 1.0),
+            25.0,
+            rolling=12.0,
+            road=0.25,
+            grade=grade,
+        )
         return float(
             np.interp(-4.0, -run.speed[:, 0], run.distance[:, 0])
             - np.interp(-10.0, -run.speed[:, 0], run.distance[:, 0])
@@ -298,7 +329,9 @@ def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize("grade", [12.0, -12.0])
-def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(model: str, grade: float) -> None:
+def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(
+    model: str, grade: float
+) -> None:
     braked = drive(model, original(model), lambda time: (0.0, 1.0), 20.0, rolling=5.0, grade=grade)
     assert np.all(braked.speed[-100:] == 0)
     released = drive(model, original(model), lambda time: (0.0, 0.0), 3.0, grade=grade).speed[-1, 0]
@@ -329,19 +362,34 @@ def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
             "vehicle.parameters.kerb_mass = 2.25 kg\nexpected: a plausible value, 50",
         ),
         ("wear", {"parameters": {"wheelbase": 270.0}}, "vehicle.parameters.wheelbase = 270 m\n"),
-        ("wear", {"parameters": {"brake_force": 16.5}}, "vehicle.parameters.brake_force = 16.5 N\n"),
-        ("sun", {"characteristics": {"radius": {"lower": 0.355}}}, "vehicle.characteristics.radius.lower = 0.355 cm\n"),
-        ("sun", {"characteristics": {"maxBrakeTorque": {"lower": 1.2}}}, "maxBrakeTorque.lower = 1.2 N m\n"),
+        (
+            "wear",
+            {"parameters": {"brake_force": 16.5}},
+            "vehicle.parameters.brake_force = 16.5 N\n",
+        ),
+        (
+            "sun",
+            {"characteristics": {"radius": {"lower": 0.355}}},
+            "vehicle.characteristics.radius.lower = 0.355 cm\n",
+        ),
+        (
+            "sun",
+            {"characteristics": {"maxBrakeTorque": {"lower": 1.2}}},
+            "maxBrakeTorque.lower = 1.2 N m\n",
+        ),
     ],
 )
-def test_what_is_implausible_is_named_with_its_unit(study: str, tables: JsonObject, message: str) -> None:
+def test_what_is_implausible_is_named_with_its_unit(
+    study: str, tables: JsonObject, message: str
+) -> None:
     with pytest.raises(InputError) as refusal:
         assemble(load_study(study, name="another", vehicle=tables))
     assert message in str(refusal.value)
 
 
 OWN = (
-    "from safevar_sumo.vehicles.sensing import WornVehicle\n\nclass Own(WornVehicle, frozen=True, kw_only=True):\n    "
+    "from safevar_sumo.vehicles.sensing import WornVehicle\n\nclass Own(WornVehicle, frozen=True,"
+    " kw_only=True):\n    "
 )
 
 
@@ -355,11 +403,19 @@ OWN = (
         ('PLAUSIBLE = {"kerb_mass": 500}', "PLAUSIBLE: Expected `array`"),
     ],
 )
-def test_an_own_vehicle_says_what_is_plausible_in_the_same_way(line: str, message: str, in_tmp: Path) -> None:
+def test_an_own_vehicle_says_what_is_plausible_in_the_same_way(
+    line: str, message: str, in_tmp: Path
+) -> None:
     Path("own.py").write_text(f"{OWN}{line}\n")
     characteristics = msgspec.to_builtins(load_study("wear").vehicle.characteristics)
-    vehicle = {"model": "own:Own", "parameters": {"kerb_mass": 300}, "characteristics": characteristics}
-    Path("own.toml").write_text(tomli_w.dumps({"extends": "wear", "name": "own", "spread": {}, "vehicle": vehicle}))
+    vehicle = {
+        "model": "own:Own",
+        "parameters": {"kerb_mass": 300},
+        "characteristics": characteristics,
+    }
+    Path("own.toml").write_text(
+        tomli_w.dumps({"extends": "wear", "name": "own", "spread": {}, "vehicle": vehicle})
+    )
     study = load_study("own.toml")
     if not message:
         assert assemble(study).vehicle.kerb_mass == 300  # type: ignore[attr-defined]

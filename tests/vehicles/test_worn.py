@@ -1,4 +1,6 @@
-"""The worn car's brakes against the balance of two axles, and its tyres and sensors against their numbers."""
+"""The worn car's brakes against the balance of two axles, and its tyres and sensors against their
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -45,19 +47,26 @@ HEALTHY = {
 
 
 def prepared(road: float, **changes: float):  # type: ignore[no-untyped-def]
-    return CAR.prepare({name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, 0.05)
+    return CAR.prepare(
+        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, 0.05
+    )
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"payload": 525.0, "payloadCentre": 3.2}, {"payload": 525.0, "payloadCentre": 1.2}, {"brakeTorque": 0.5}],
+    [
+        {},
+        {"payload": 525.0, "payloadCentre": 3.2},
+        {"payload": 525.0, "payloadCentre": 1.2},
+        {"brakeTorque": 0.5},
+    ],
 )
 def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
     road: float, changes: dict[str, float]
 ) -> None:
-    """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with the deceleration
-    a.
+    """Expected: the bisection of m a = sum of min(share F, mu N(a)); the load N moves forward with
+    the deceleration a.
     """
     p = prepared(road, **changes)
     mass = float(p.mass[0])
@@ -83,8 +92,8 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
 
 
 def test_sumo_is_told_what_the_worn_car_can_do() -> None:
-    """3900 N of engine on dry road, 1.079 of g times the road's friction on ice; the brakes respond after 0.1 s and a
-    step.
+    """3900 N of engine on dry road, 1.079 of g times the road's friction on ice; the brakes respond
+    after 0.1 s and a step.
     """
     dry = CAR.sumo_type(prepared(1.0))
     icy = CAR.sumo_type(prepared(0.1))
@@ -97,7 +106,11 @@ FITTED = {
     "lift": CAR.water_lift,
     "texture": CAR.road_texture,
     "film": WET_FRICTION["handbook"]["water_factor"],
-    **{f"{kind} {name}": value for kind in ("grip", "water") for name, value in WET_FRICTION[kind].items()},
+    **{
+        f"{kind} {name}": value
+        for kind in ("grip", "water")
+        for name, value in WET_FRICTION[kind].items()
+    },
 }
 """The constants by their names in the script of the fit."""
 PAGE = Path("docs/trust_wear.md").read_text(encoding="utf-8")
@@ -105,10 +118,15 @@ PAGE = Path("docs/trust_wear.md").read_text(encoding="utf-8")
 
 @cache
 def stopping_distances(speed: float, water: float, grip: float, *treads: float) -> FloatArray:
-    """Stops of the study `stop` from a speed [km/h] on a road with water [mm] and a grip [-], with tyres that alone
-    limit the brakes [m].
+    """Stops of the study `stop` from a speed [km/h] on a road with water [mm] and a grip [-], with
+    tyres that alone limit the brakes [m].
     """
-    weather = {"name": "test track", "road_friction": grip / CAR.tyre_friction, "visibility": 1.0, "water": water}
+    weather = {
+        "name": "test track",
+        "road_friction": grip / CAR.tyre_friction,
+        "visibility": 1.0,
+        "water": water,
+    }
     tests = [{"name": "stop", "over": {"speed": [speed]}}]
     tables = {"extends": "stop", "name": "one", "weather": weather, "matrix": {"tests": tests}}
     system = assemble(load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}}))
@@ -127,7 +145,9 @@ def simulated_stop(row: dict[str, str]) -> float:
 
 
 def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
-    """Targets: a median error of at most 6 %, none above 25 %; the page has the row of every stop."""
+    """Targets: a median error of at most 6 %, none above 25 %; the page has the row of every
+    stop.
+    """
     errors = []
     for row in fit.STOPS:
         source = fit.source_of(row)
@@ -136,17 +156,22 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
         errors.append(abs(here / published - 1))
         unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
         values = f"{published:.{digits}f} {unit}|{here:.{digits}f}|{here - published:+.{digits}f}"
-        line = f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{100 * (here / published - 1):+.0f} %|"
+        error = f"{100 * (here / published - 1):+.0f} %"
+        line = f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|"
         assert line in PAGE
     assert np.median(errors) <= 0.06
     assert max(errors) <= 0.25
-    assert f"median error {100 * np.median(errors):.1f} %, largest {100 * max(errors):.1f} %" in PAGE
+    assert (
+        f"median error {100 * np.median(errors):.1f} %, largest {100 * max(errors):.1f} %" in PAGE
+    )
 
 
 def test_the_handbooks_wet_rows_have_its_order() -> None:
     """Targets: a rank correlation of at least 0.95, a mean error of at most 0.08."""
     wet = [row for row in fit.HANDBOOK if float(row["water_mm"])]
-    published, here = np.array([(float(row["friction"]), fit.model_friction(row, FITTED)) for row in wet]).T
+    published, here = np.array(
+        [(float(row["friction"]), fit.model_friction(row, FITTED)) for row in wet]
+    ).T
     rank = spearmanr(published, here).statistic
     error = np.abs(here - published).mean()
     assert rank >= 0.95
@@ -175,8 +200,14 @@ def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None
     treads = np.array([1.6, 3.0, 8.0])
     energy = (speed / KMH_PER_MS) ** 2
     lifted = lift_of(1.0, treads, CAR.water_lift, CAR.road_texture) * energy
-    exact = energy * (np.sqrt(1 + lifted**2) + np.arcsinh(lifted) / lifted) / (4 * CAR.tyre_friction * GRAVITY)
-    assert stopping_distances(speed, 1.0, CAR.tyre_friction, *treads) == pytest.approx(exact, rel=0.002)
+    exact = (
+        energy
+        * (np.sqrt(1 + lifted**2) + np.arcsinh(lifted) / lifted)
+        / (4 * CAR.tyre_friction * GRAVITY)
+    )
+    assert stopping_distances(speed, 1.0, CAR.tyre_friction, *treads) == pytest.approx(
+        exact, rel=0.002
+    )
 
 
 def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> None:
@@ -200,35 +231,56 @@ ASSUMPTIONS = {
     "water 20 % deeper": {"weather": {**WET_ROAD, "water": 1.2}},
     "`water_lift` 20 % larger": {"vehicle": {"parameters": {"water_lift": 1.2 * CAR.water_lift}}},
     "brakes 20 % weaker": {"vehicle": {"parameters": {"brake_force": 0.8 * CAR.brake_force}}},
-    "healthy brake delay 20 % longer": {"vehicle": {"characteristics": {"brakeResponse": {"original": 0.12}}}},
-    "clean sensors see 20 % less far": {"vehicle": {"characteristics": {"sensorRange": {"original": 64, "upper": 64}}}},
-    "clean sensors 20 % later": {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.06}}}},
+    "healthy brake delay 20 % longer": {
+        "vehicle": {"characteristics": {"brakeResponse": {"original": 0.12}}}
+    },
+    "clean sensors see 20 % less far": {
+        "vehicle": {"characteristics": {"sensorRange": {"original": 64, "upper": 64}}}
+    },
+    "clean sensors 20 % later": {
+        "vehicle": {"characteristics": {"sensorLatency": {"original": 0.06}}}
+    },
 }
-LIMITED = {"treadDepth": 2, "brakeTorque": 2, "brakeResponse": 3, "sensorRange": 1, "sensorLatency": 3}
+LIMITED = {
+    "treadDepth": 2,
+    "brakeTorque": 2,
+    "brakeResponse": 3,
+    "sensorRange": 1,
+    "sensorLatency": 3,
+}
 """Characteristics of the headline, each with the decimals on the page."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("assumption", ASSUMPTIONS)
 def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumption: str) -> None:
-    evaluator = Evaluator(load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}), InlinePool())
+    evaluator = Evaluator(
+        load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}), InlinePool()
+    )
     columns = [list(evaluator.characteristics.names).index(name) for name in LIMITED]
     cells = []
     for found in scan(evaluator, columns, Unsafe(keep=0.3)):
         item = found.characteristic
-        end, worst = (ends[item.name in LATE] for ends in (found.safe or (0.0, 0.0), (item.lower, item.upper)))
+        end, worst = (
+            ends[item.name in LATE] for ends in (found.safe or (0.0, 0.0), (item.lower, item.upper))
+        )
         cells.append("whole" if end == worst else f"{end:.{LIMITED[item.name]}f}")
     assert f"|{assumption}|{'|'.join(cells)}|" in PAGE
 
 
 @pytest.mark.slow
 def test_the_shipped_constants_are_what_the_script_prints() -> None:
-    printed = subprocess.run([sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True).stdout
+    printed = subprocess.run(
+        [sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True
+    ).stdout
     constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(encoding="utf-8")
     assert constants.partition("\n\n")[2].strip() in printed
     study = tomllib.loads(Path("studies/wear.toml").read_text(encoding="utf-8"))
     of_study = tomllib.loads(printed.partition("[handbook]")[2].partition("\n\n")[2])
-    assert of_study == {"vehicle": {"parameters": study["vehicle"]["parameters"]}, "spread": study["spread"]}
+    assert of_study == {
+        "vehicle": {"parameters": study["vehicle"]["parameters"]},
+        "spread": study["spread"],
+    }
     assert study["vehicle"]["parameters"] == WET_FRICTION["worn"]
     assert len(study["spread"]["vehicle.parameters.tyre_friction"]) == 12
 
@@ -246,7 +298,9 @@ def test_the_shipped_constants_are_what_the_script_prints() -> None:
         ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "water": 2.0}, True),
     ],
 )
-def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(weather: object, is_wet: bool) -> None:
+def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(
+    weather: object, is_wet: bool
+) -> None:
     study = load_study(
         {
             "extends": "wear",
@@ -256,7 +310,8 @@ def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(wea
         }
     )
     new, worn = evaluate(
-        assemble(study), np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]])
+        assemble(study),
+        np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]]),
     ).metrics["ave_dece"]
     assert (worn < 0.995 * new) == is_wet
 
@@ -280,7 +335,9 @@ def one(lower: float, original: float, upper: float) -> Characteristic:
         (0, 0.5, 0.04),
     ],
 )
-def test_threshold_is_a_share_of_the_domains_width(lower: float, upper: float, threshold: float) -> None:
+def test_threshold_is_a_share_of_the_domains_width(
+    lower: float, upper: float, threshold: float
+) -> None:
     assert one(lower, upper, upper).threshold == pytest.approx(threshold)
 
 
@@ -304,7 +361,7 @@ def test_a_value_outside_the_domain_is_refused(value: float) -> None:
         SUN.setting({"tireFric": -abs(value)})
 
 
-def test_a_plausible_value_is_up_to_1000_times_the_largest_of_the_domain_and_positive_if_that_is() -> None:
+def test_a_plausible_value_is_at_most_1000_times_the_largest_of_the_domain() -> None:
     values = np.array([1e5, 1.001e5, 0.0, -1e5])
     assert one(0, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, True, True]
     assert one(1, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, False, False]
@@ -313,19 +370,33 @@ def test_a_plausible_value_is_up_to_1000_times_the_largest_of_the_domain_and_pos
 def test_a_change_of_just_the_threshold_is_noise() -> None:
     """Numbers that are exact in binary: 2 % of a width of 100."""
     exact = CharacteristicSet((one(0, 50, 100),))
-    assert exact.filter(np.array([[52.0], [48.0], [52.5], [47.5]])).ravel().tolist() == [50, 50, 52.5, 47.5]
+    assert exact.filter(np.array([[52.0], [48.0], [52.5], [47.5]])).ravel().tolist() == [
+        50,
+        50,
+        52.5,
+        47.5,
+    ]
 
 
 def seen_at(gap: Any, time: float = 0.0) -> Observation:
     """A pedestrian of 0.5 m in the middle of the lane, seen by one vehicle or several."""
     n = np.size(gap)
     zeros = np.zeros(n)
-    columns = {"speed": zeros + 10.0, "closing_speed": zeros + 10.0, "lateral": zeros, "lateral_speed": zeros}
-    return Observation(time=time, gap=zeros + gap, visibility=1.0, obstacle_width=zeros + 0.5, **columns)
+    columns = {
+        "speed": zeros + 10.0,
+        "closing_speed": zeros + 10.0,
+        "lateral": zeros,
+        "lateral_speed": zeros,
+    }
+    return Observation(
+        time=time, gap=zeros + gap, visibility=1.0, obstacle_width=zeros + 0.5, **columns
+    )
 
 
 def sensors(**values: float | list[float]) -> tuple[WornVehicle, Any, Any]:
-    """Worn cars with perfect sensors but for these values; the model, their constants and their state."""
+    """Worn cars with perfect sensors but for these values; the model, their constants and their
+    state.
+    """
     n = max(np.size(value) for value in values.values())
     table = load_study("wear").vehicle.characteristics
     original = {name: np.full(n, row.original) for name, row in table.items()}
@@ -336,7 +407,9 @@ def sensors(**values: float | list[float]) -> tuple[WornVehicle, Any, Any]:
 
 
 def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_metres() -> None:
-    """1.6 m / tan(1 degree) = 91.66 m; nearer he is inside, at every angle in proportion to 1 / tan."""
+    """1.6 m / tan(1 degree) = 91.66 m; nearer he is inside, at every angle in proportion to 1 /
+    tan.
+    """
     for angle in (-4.0, 1.0, 2.0):
         border = 1.6 / abs(math.tan(math.radians(angle)))
         vehicle, prepared, state = sensors(sensorAngle=[angle, angle], sensorRange=200.0)
@@ -355,7 +428,9 @@ def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() 
         seeded = vehicle.seeded(seed)
         gaps = []
         for k in range(400):
-            seen, state = seeded.sense(prepared, state, seen_at(np.full(4, 1000.0 - k) / 20, k * 0.05))
+            seen, state = seeded.sense(
+                prepared, state, seen_at(np.full(4, 1000.0 - k) / 20, k * 0.05)
+            )
             gaps.append(seen.gap * 20)
         steps = np.diff(np.array(gaps), axis=0)
         patterns.append(steps == 0)
@@ -385,5 +460,7 @@ def test_a_study_without_them_drives_as_with_none() -> None:
 def test_an_original_of_0_is_refused_where_changes_are_relative() -> None:
     row = {"unit": "mm", "original": 0, "lower": 0, "upper": 8}
     study = load_study("wear", vehicle={"characteristics": {"treadDepth": row}})
-    with pytest.raises(InputError, match=r"treadDepth: original = 0\nexpected: a value other than 0"):
+    with pytest.raises(
+        InputError, match=r"treadDepth: original = 0\nexpected: a value other than 0"
+    ):
         assemble(study)

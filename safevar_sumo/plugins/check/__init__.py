@@ -1,5 +1,6 @@
-"""The check of user code before the first batch of a study, and the command `check`: does a result depend on its
-setting alone, and does every call keep its contract? Nothing below `sumo` and `search` imports this package.
+"""The check of user code before the first batch of a study, and the command `check`: does a result
+depend on its setting alone, and does every call keep its contract? Nothing below `sumo` and
+`search` imports this package.
 """
 
 from __future__ import annotations
@@ -26,32 +27,38 @@ STUDY_OF_AN_ADS = "smoke"
 """The study in which `check` lets an ADS drive that is given by its name."""
 CHECKS: Mapping[str, str] = {
     "contract": (
-        "return what the base class documents, leave arguments as they are, and guard divisions and roots where "
-        "the domain ends"
+        "return what the base class documents, leave arguments as they are, and guard divisions and"
+        " roots where the domain ends"
     ),
     "repetition": (
-        "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing in a class or "
-        "a module"
+        "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing"
+        " in a class or a module"
     ),
-    "order": "compute element i of a result from element i of the arguments alone, whatever its place",
+    "order": (
+        "compute element i of a result from element i of the arguments alone, whatever its place"
+    ),
     "alone": (
-        "compute element i of a result from element i of the arguments alone: no mean, sum or maximum over the "
-        "vehicles; keep what a vehicle remembers in its memory or its own instance, not in a class or a module"
+        "compute element i of a result from element i of the arguments alone: no mean, sum or"
+        " maximum over the vehicles; keep what a vehicle remembers in its memory or its own"
+        " instance, not in a class or a module"
     ),
     "reaction": (
-        "command enough throttle while nobody is in sight, where `gap` is infinite; check that the code reads the "
-        "quantity that it should react to, with the right sign and unit"
+        "command enough throttle while nobody is in sight, where `gap` is infinite; check that the"
+        " code reads the quantity that it should react to, with the right sign and unit"
     ),
-    "meeting": "choose values of the scenario's parameters at which the vehicle meets the others before they have left",
+    "meeting": (
+        "choose values of the scenario's parameters at which the vehicle meets the others before"
+        " they have left"
+    ),
 }
-"""The checks, with advice on a failure. All but the last two, of which every answer itself warns, also keep a study
-from starting.
+"""The checks, with advice on a failure. All but the last two, of which every answer itself warns,
+also keep a study from starting.
 """
 
 
 class Finding(NamedTuple):
-    """A failed check: its name and the wrong result, the place of the user code, the input that shows it, and what is
-    expected.
+    """A failed check: its name and the wrong result, the place of the user code, the input that
+    shows it, and what is expected.
     """
 
     check: str
@@ -76,7 +83,9 @@ def study_to_check(name: str) -> Study:
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
     no_data: dict[str, Any] = {key: {} for key in WHOLE_TABLES}  # about the study's own ADS
-    return load_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else load_study(name)
+    return (
+        load_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else load_study(name)
+    )
 
 
 def check(study: Study) -> list[Finding]:
@@ -93,7 +102,11 @@ def check(study: Study) -> list[Finding]:
         where = _definition(study, "scenario.model", study.scenario.model)
         return [Finding("meeting", words, where, "", "an encounter while the others are there")]
     where = _definition(study, "ads.model", study.ads.model)
-    return [Finding("reaction", words, where, "", "a drive to the encounter, without braking for nobody")]
+    return [
+        Finding(
+            "reaction", words, where, "", "a drive to the encounter, without braking for nobody"
+        )
+    ]
 
 
 def refuse_defects(study: Study) -> None:
@@ -107,7 +120,9 @@ def refuse_defects(study: Study) -> None:
     for finding in find_defects(study):
         command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
         problem = f"{finding}; to reproduce it: {command}"
-        raise UserCodeError(study.source, problem, f"{finding.expected}; {CHECKS[finding.check]}", finding.where)
+        raise UserCodeError(
+            study.source, problem, f"{finding.expected}; {CHECKS[finding.check]}", finding.where
+        )
 
 
 def find_defects(study: Study) -> Iterator[Finding]:
@@ -121,16 +136,24 @@ def find_defects(study: Study) -> Iterator[Finding]:
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 
 
-def _first_defect(study: Study, names: Mapping[str, str], failures: Iterator[Failure]) -> Iterator[Finding]:
-    """The first of the failures of user code, or the error that it raises; `names` are its names by their keys."""
-    where = " or ".join(_definition(study, key, name) for key, name in names.items()) or study.source
+def _first_defect(
+    study: Study, names: Mapping[str, str], failures: Iterator[Failure]
+) -> Iterator[Finding]:
+    """The first of the failures of user code, or the error that it raises; `names` are its names by
+    their keys.
+    """
+    where = (
+        " or ".join(_definition(study, key, name) for key, name in names.items()) or study.source
+    )
     try:
         with about(study.source), np.errstate(all="ignore"):
             failure = next(failures, None)
         if failure is not None:
             yield Finding(failure.check, failure.got, where, failure.input, failure.expected)
     except UserCodeError as error:
-        yield Finding("contract", error.problem, error.place or where, "", error.legal or "no exception")
+        yield Finding(
+            "contract", error.problem, error.place or where, "", error.legal or "no exception"
+        )
 
 
 def _definition(study: Study, key: str, name: str) -> str:

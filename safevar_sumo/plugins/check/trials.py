@@ -1,4 +1,6 @@
-"""Trials of user code: simulations, repeated, in another order and alone, and searches, repeated."""
+"""Trials of user code: simulations, repeated, in another order and alone, and searches,
+repeated.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,16 @@ class Failure(NamedTuple):
 
 
 def try_simulations(study: Study) -> Iterator[Failure]:
-    """Simulate a study with the original vehicle, the corners of the domains and random settings."""
+    """Simulate a study with the original vehicle, the corners of the domains and random
+    settings.
+    """
     region = region_of(study)
     settings = region.repaired(
         region.characteristics.filter(
-            _settings(region.characteristics, SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED)
+            _settings(
+                region.characteristics,
+                SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED,
+            )
         )
     )
 
@@ -70,7 +77,11 @@ def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
-        yield Failure("repetition", f"{len(repeated)} settings instead of {len(outputs)} in another run", expected)
+        yield Failure(
+            "repetition",
+            f"{len(repeated)} settings instead of {len(outputs)} in another run",
+            expected,
+        )
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
         difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
@@ -78,7 +89,9 @@ def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
 
 
 def _try(
-    load: Callable[[], Callable[[Rows], Results]], characteristics: CharacteristicSet, settings: FloatArray
+    load: Callable[[], Callable[[Rows], Results]],
+    characteristics: CharacteristicSet,
+    settings: FloatArray,
 ) -> Iterator[Failure]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     run = load()
@@ -88,13 +101,18 @@ def _try(
     other_runs = [
         (run, "repetition", "in a second run", all_rows),
         (run_anew, "order", "in another order", all_rows[::-1]),
-        *((run_anew, "alone", "in a smaller batch", rows) for rows in np.array_split(all_rows, SMALLER_BATCHES)),
+        *(
+            (run_anew, "alone", "in a smaller batch", rows)
+            for rows in np.array_split(all_rows, SMALLER_BATCHES)
+        ),
         (run_anew, "alone", "alone", all_rows[:1]),
         (run_anew, "alone", "alone", all_rows[-1:]),
     ]
     for other_run, check, circumstance, rows in other_runs:
         other_outputs = other_run(rows)
-        for row, difference in differences({name: values[rows] for name, values in outputs.items()}, other_outputs):
+        for row, difference in differences(
+            {name: values[rows] for name, values in outputs.items()}, other_outputs
+        ):
             changes = _changes(characteristics, settings[rows[row]])
             yield Failure(check, f"{difference} {circumstance}", "the same, to the bit", changes)
 
@@ -113,25 +131,42 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
     lower = characteristics.lower
     upper = characteristics.upper
     is_odd = np.arange(len(characteristics)) % 2 == 1
-    corners = [characteristics.original, lower, upper, np.where(is_odd, lower, upper), np.where(is_odd, upper, lower)]
-    return np.concatenate([corners, np.random.default_rng(0).uniform(lower, upper, (count - len(corners), len(lower)))])
+    corners = [
+        characteristics.original,
+        lower,
+        upper,
+        np.where(is_odd, lower, upper),
+        np.where(is_odd, upper, lower),
+    ]
+    return np.concatenate(
+        [
+            corners,
+            np.random.default_rng(0).uniform(lower, upper, (count - len(corners), len(lower))),
+        ]
+    )
 
 
 def _system(study: Study) -> System:
-    """The system of a study, with only a few points of its matrix; `assemble` loads all user code again."""
+    """The system of a study, with only a few points of its matrix; `assemble` loads all user code
+    again.
+    """
     system = assemble(study)
-    return replace(system, matrix=system.matrix[:: max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None)
+    return replace(
+        system, matrix=system.matrix[:: max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None
+    )
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
-    """All settings that a run with the last seed, after runs with the others, requests, and then those that it returns;
-    shape (k, n).
+    """All settings that a run with the last seed, after runs with the others, requests, and then
+    those that it returns; shape (k, n).
     """
     system = _system(study)
     lookup = Lookup.of(study)
     label = label_of(name)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
-    parameters = lookup.with_paths(member, study.search.parameters.get(label, {}), f"search.{label}")
+    parameters = lookup.with_paths(
+        member, study.search.parameters.get(label, {}), f"search.{label}"
+    )
     problem = Problem(
         characteristics=system.characteristics,
         original=evaluate(system, system.characteristics.original[np.newaxis]),
@@ -141,7 +176,9 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         scoring=system.measuring.scoring,
     )
     for seed in seeds:
-        algorithm = instance_of(member, parameters, f"search.algorithms = {name!r}", f"search.{label}")
+        algorithm = instance_of(
+            member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
+        )
         search = algorithm.search(problem, np.random.default_rng(seed))
         settings = []
         try:

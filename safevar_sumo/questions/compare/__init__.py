@@ -1,8 +1,8 @@
 """What changes from one system to another: another driving system, vehicle, weather or version?
 
-The same settings are simulated in both systems, A and B: all solutions of results on either side that both domains
-hold, and settings drawn on lines from the original vehicles into the common domain, near to where the systems begin to
-fail.
+The same settings are simulated in both systems, A and B: all solutions of results on either side
+that both domains hold, and settings drawn on lines from the original vehicles into the common
+domain, near to where the systems begin to fail.
 """
 
 from __future__ import annotations
@@ -66,7 +66,15 @@ from safevar_sumo.sumo.system import assemble
 @question
 @contents(
     *("unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12", "better_in", "worse_in"),
-    *("limits_grown", "limits_shrunk", "outside", "not_simulated", *ENDS, "metres_earlier", "metres_later"),
+    *(
+        "limits_grown",
+        "limits_shrunk",
+        "outside",
+        "not_simulated",
+        *ENDS,
+        "metres_earlier",
+        "metres_later",
+    ),
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
     "benign_scenes",
     limits=LIMIT_COLUMNS,
@@ -84,19 +92,21 @@ def compare(
 ) -> Answer:
     """Compare two studies or results, A and B: what is better in B, and what is worse.
 
-    A version B whose original vehicle collides where A's does not is not to be released: exit code 3. One criterion
-    counts for both. Where the original vehicles differ, the same changes of each are compared. The filter
-    of small changes, whose thresholds are a search's, does not act.
+    A version B whose original vehicle collides where A's does not is not to be released: exit code
+    3. One criterion counts for both. Where the original vehicles differ, the same changes of each
+    are compared. The filter of small changes, whose thresholds are a search's, does not act.
 
     Parameters
     ----------
     samples
-        Number of settings that are drawn in the common domain beside the solutions, near to where A and B begin to
-        fail: their counts are no shares of the domain.
+        Number of settings that are drawn in the common domain beside the solutions, near to where A
+        and B begin to fail: their counts are no shares of the domain.
     limits
-        A limit in the characteristic's unit, such as "treadDepth >= 3", within which is compared; may be repeated.
+        A limit in the characteristic's unit, such as "treadDepth >= 3", within which is compared;
+        may be repeated.
     margin
-        Distance to keep from a collision [m], as in `tolerance`; by default the larger one of the two studies.
+        Distance to keep from a collision [m], as in `tolerance`; by default the larger one of the
+        two studies.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
@@ -118,7 +128,9 @@ def compare(
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
     limits_table = limits_of_both(evaluators, criteria, within)
-    originals_numbers, originals_difference = compare_originals(evaluators, originals, criteria, titles[0])
+    originals_numbers, originals_difference = compare_originals(
+        evaluators, originals, criteria, titles[0]
+    )
     difference = Difference.joined(
         [
             compare_counts(counts, titles[0]),
@@ -176,7 +188,9 @@ def _criteria(
     stated: Sequence[Unsafe],
     margin: float | None,
 ) -> list[Unsafe]:
-    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its bodies touch."""
+    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its
+    bodies touch.
+    """
     if stated:
         criterion = stated[0]
     elif margin is not None:
@@ -185,14 +199,20 @@ def _criteria(
         criterion = _default_criterion(subjects, evaluators, originals)
     check_margin(criterion, margin)
     if criterion.is_collision and (margin is not None or not stated):
-        criterion = replace(criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators))
+        criterion = replace(
+            criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators)
+        )
     return [replace(criterion, contact=assemble(one.study).contact) for one in evaluators]
 
 
 def _default_criterion(
-    subjects: Sequence[Study | Case], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
+    subjects: Sequence[Study | Case],
+    evaluators: Sequence[Evaluator],
+    originals: Sequence[Evaluations],
 ) -> Unsafe:
-    """A collision if any vehicle of either system collides, else a safety degree; points only if both are rated."""
+    """A collision if any vehicle of either system collides, else a safety degree; points only if
+    both are rated.
+    """
     defaults = list[Unsafe]()
     for subject, evaluator, original in zip(subjects, evaluators, originals, strict=True):
         default = evaluator.choose_criterion(None, subject, original)
@@ -209,8 +229,13 @@ def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsaf
     is_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
     of_pairs = table_of_pairs(frame["solution"], *runs, *is_unsafe)
     values = {name: settings[0][:, column] for column, name in enumerate(names)}
-    moved = {f"b_{names[column]}": settings[1][:, column] for column in np.flatnonzero(common.shift).tolist()}
-    return pd.concat([frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})], axis=1)
+    moved = {
+        f"b_{names[column]}": settings[1][:, column]
+        for column in np.flatnonzero(common.shift).tolist()
+    }
+    return pd.concat(
+        [frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})], axis=1
+    )
 
 
 def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
@@ -237,8 +262,8 @@ class _PairedTest(NamedTuple):
 def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
     """Test a metric in A and B in pairs.
 
-    A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs, over the settings
-    that were drawn on a line.
+    A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs,
+    over the settings that were drawn on a line.
     """
     a, b = (run.column(metric) for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
@@ -254,7 +279,9 @@ def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
     return _PairedTest(p, a12, number_of(len(pairs), unit))
 
 
-def _verdict(difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool) -> Iterator[str]:
+def _verdict(
+    difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool
+) -> Iterator[str]:
     """Whether B is better: in something and worse in nothing, needless braking included."""
     a, b = titles
     better, worse, facts = ("; ".join(phrases) for phrases in difference)
@@ -265,7 +292,9 @@ def _verdict(difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, i
     elif better and is_measured:
         yield f"{b} is better than {a}: it {better}; nothing that was measured is worse"
     elif better:
-        yield f"{b} is not called better than {a}, as needless braking was not measured: it {better}"
+        yield (
+            f"{b} is not called better than {a}, as needless braking was not measured: it {better}"
+        )
     else:
         yield f"No difference between {a} and {b} was found"
     yield f"(unsafe: {unsafe.description})."
@@ -292,4 +321,7 @@ def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str
         if common.shift[column]
     ]
     if texts:
-        yield f"The original vehicles differ ({join_phrases(texts)}): the same changes of each are compared."
+        yield (
+            f"The original vehicles differ ({join_phrases(texts)}): the same changes of each are"
+            " compared."
+        )

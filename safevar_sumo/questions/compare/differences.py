@@ -1,4 +1,6 @@
-"""What is better and what is worse in B than in A: limits, needless braking, when the new vehicle brakes."""
+"""What is better and what is worse in B than in A: limits, needless braking, when the new vehicle
+brakes.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,12 @@ from safevar_sumo.vehicles import Characteristic
 LIMIT_COLUMNS = {
     "characteristic": Column("", "characteristic of the vehicle"),
     "unit": Column("", "its unit"),
-    **with_interval("a", Column("", "value of A's original vehicle; the interval is safe alone in A", ".10g")),
-    **with_interval("b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")),
+    **with_interval(
+        "a", Column("", "value of A's original vehicle; the interval is safe alone in A", ".10g")
+    ),
+    **with_interval(
+        "b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")
+    ),
     "change": Column("", "what becomes of the interval: grown, shrunk, both, or the same"),
 }
 GROWN = "grown"
@@ -50,7 +56,9 @@ LEAST_METRES = 0.05
 
 
 class Difference(NamedTuple):
-    """What B does in comparison with A, each a phrase: `better`, `worse`, and `facts` that are neither."""
+    """What B does in comparison with A, each a phrase: `better`, `worse`, and `facts` that are
+    neither.
+    """
 
     better: Sequence[str] = ()
     worse: Sequence[str] = ()
@@ -79,7 +87,9 @@ def compare_counts(counts: Mapping[str, int], a: str) -> Difference:
 
 
 def compare_values(quantity: str, p: float, a12: float) -> Difference:
-    """A significant difference of the safety degree, or of the rating, over all pairs; p is NaN without pairs."""
+    """A significant difference of the safety degree, or of the rating, over all pairs; p is NaN
+    without pairs.
+    """
     if not p < ALPHA:
         return Difference()
     is_better = a12 < 0.5
@@ -91,8 +101,8 @@ def compare_values(quantity: str, p: float, a12: float) -> Difference:
 def limits_of_both(
     evaluators: Sequence[Evaluator], criteria: Sequence[Unsafe], limits: Mapping[str, Limit]
 ) -> pd.DataFrame:
-    """The table of limits alone with the study's own fit, rounded as `tolerance` rounds them, within the user's limits;
-    no interval where the original is unsafe.
+    """The table of limits alone with the study's own fit, rounded as `tolerance` rounds them,
+    within the user's limits; no interval where the original is unsafe.
     """
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     scans = [scan(one, columns, unsafe) for one, unsafe in zip(evaluators, criteria, strict=True)]
@@ -100,11 +110,16 @@ def limits_of_both(
     rows = []
     for a, b in zip(*scans, strict=True):
         name = a.characteristic.name
-        in_a, in_b = (_within(one, within(limits, name, of[name])) for one, of in zip((a, b), domains, strict=True))
+        in_a, in_b = (
+            _within(one, within(limits, name, of[name]))
+            for one, of in zip((a, b), domains, strict=True)
+        )
         ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
         ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
         rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
-    return tabulate(f"Limits of each alone {OF_OWN_FIT}, rounded to the safe side", LIMIT_COLUMNS, rows)
+    return tabulate(
+        f"Limits of each alone {OF_OWN_FIT}, rounded to the safe side", LIMIT_COLUMNS, rows
+    )
 
 
 def _within(one: OneAtATimeScan, ends: Interval) -> Interval | None:
@@ -121,7 +136,9 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
         return SAME if a is b else (GROWN if a is None else SHRUNK)
     grows = b[0] < a[0] or b[1] > a[1]
     shrinks = b[0] > a[0] or b[1] < a[1]
-    return {(True, True): BOTH, (True, False): GROWN, (False, True): SHRUNK}.get((grows, shrinks), SAME)
+    return {(True, True): BOTH, (True, False): GROWN, (False, True): SHRUNK}.get(
+        (grows, shrinks), SAME
+    )
 
 
 def compare_limits(limits: pd.DataFrame, members: Sequence[Characteristic]) -> Difference:
@@ -132,11 +149,18 @@ def compare_limits(limits: pd.DataFrame, members: Sequence[Characteristic]) -> D
     return Difference(grown + moved, shrunk + moved)
 
 
-def _moved_limits(limits: pd.DataFrame, members: Sequence[Characteristic], change: str, verb: str) -> list[str]:
-    """The phrase about limits with this change that exist in both systems; empty if there are none."""
+def _moved_limits(
+    limits: pd.DataFrame, members: Sequence[Characteristic], change: str, verb: str
+) -> list[str]:
+    """The phrase about limits with this change that exist in both systems; empty if there are
+    none.
+    """
     is_named = (limits["change"] == change) & limits[["a_low", "b_low"]].notna().all(axis=1)
     numbers = np.flatnonzero(is_named).tolist()
-    texts = [_limit_in_words(limits.iloc[number], members[number]) for number in numbers[:MAX_LIMITS_NAMED]]
+    texts = [
+        _limit_in_words(limits.iloc[number], members[number])
+        for number in numbers[:MAX_LIMITS_NAMED]
+    ]
     if len(numbers) > MAX_LIMITS_NAMED:
         texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
     return [f"has limits {OF_OWN_FIT} that {verb}: {join_phrases(texts)}"] if texts else []
@@ -150,10 +174,13 @@ def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
 
 
 def compare_originals(
-    evaluators: Sequence[Evaluator], originals: Sequence[Evaluations], criteria: Sequence[Unsafe], a: str
+    evaluators: Sequence[Evaluator],
+    originals: Sequence[Evaluations],
+    criteria: Sequence[Unsafe],
+    a: str,
 ) -> tuple[JsonObject, Difference]:
-    """How both original vehicles end, how often they brake needlessly, and how much earlier B's brakes: the numbers,
-    and what they say.
+    """How both original vehicles end, how often they brake needlessly, and how much earlier B's
+    brakes: the numbers, and what they say.
     """
     in_a, in_b = (bool(unsafe.of(one)[0]) for unsafe, one in zip(criteria, originals, strict=True))
     braking = _needless_braking(*evaluators)
@@ -162,37 +189,49 @@ def compare_originals(
     numbers = {**_ends_of_originals(evaluators, originals), **braking, **points, **metres}
     parts = list[Difference]()
     if in_a != in_b:
-        phrase = f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}"
+        phrase = (
+            f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}"
+        )
         parts.append(Difference.judged(phrase, is_better=in_a))
     if braking["a_needless_braking"] != braking["b_needless_braking"]:
         before = braking["a_needless_braking"]
         after = braking["b_needless_braking"]
-        phrase = f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes ({before} in {a})"
+        phrase = (
+            f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes ({before} in"
+            f" {a})"
+        )
         parts.append(Difference.judged(phrase, is_better=after < before))
     if points and points["a_points"] != points["b_points"]:
         phrase = f"earns {points['b_points']:.4g} points ({points['a_points']:.4g} in {a})"
         parts.append(Difference.judged(phrase, is_better=points["b_points"] > points["a_points"]))
     onsets = ((metres["metres_earlier"], "earlier"), (metres["metres_later"], "later"))
-    phrases = [f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES]
+    phrases = [
+        f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES
+    ]
     if phrases:
         parts.append(Difference(facts=[f"brakes {join_phrases(phrases)}"]))
     return numbers, Difference.joined(parts)
 
 
 def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> tuple[str, ...]:
-    """Why B is not to be released: the fastest collision of its original vehicle at a point where A's does not collide,
-    if there is one. A point that A does not have counts unless A's original vehicle collides anywhere.
+    """Why B is not to be released: the fastest collision of its original vehicle at a point where
+    A's does not collide, if there is one. A point that A does not have counts unless A's original
+    vehicle collides anywhere.
     """
     systems = [assemble(one.study) for one in evaluators]
     in_a, in_b = (
-        {result.point.name: result for result in simulate_all_points(system, one.characteristics.original[np.newaxis])}
+        {
+            result.point.name: result
+            for result in simulate_all_points(system, one.characteristics.original[np.newaxis])
+        }
         for system, one in zip(systems, evaluators, strict=True)
     )
     collides_in_a = {name: bool(result.evaluations.collided[0]) for name, result in in_a.items()}
     new = [
         (float(-result.evaluations.f_safe[0]), result.point)
         for name, result in in_b.items()
-        if result.evaluations.collided[0] and not collides_in_a.get(name, any(collides_in_a.values()))
+        if result.evaluations.collided[0]
+        and not collides_in_a.get(name, any(collides_in_a.values()))
     ]
     if not new:
         return ()
@@ -209,23 +248,29 @@ def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -
     if not all(is_rated(one.study) for one in evaluators):
         return {}
     return {
-        f"{side}_points": float(one.column(RATING_POINTS.name)[0]) for side, one in zip(SIDES, originals, strict=True)
+        f"{side}_points": float(one.column(RATING_POINTS.name)[0])
+        for side, one in zip(SIDES, originals, strict=True)
     }
 
 
-def _ends_of_originals(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
+def _ends_of_originals(
+    evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
+) -> JsonObject:
     """How both original vehicles end, with the gap where bodies do not touch at a degree of 0."""
     numbers: JsonObject = {}
     for side, one, original in zip(SIDES, evaluators, originals, strict=True):
-        numbers |= {f"{side}_outcome": str(original.outcome[0]), f"{side}_degree": float(original.f_safe[0])}
+        numbers |= {
+            f"{side}_outcome": str(original.outcome[0]),
+            f"{side}_degree": float(original.f_safe[0]),
+        }
         if contact := assemble(one.study).contact:
             numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
     return numbers
 
 
 def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
-    """In how many of A's benign scenes the original vehicles of A and B brake, None without any; and the number of
-    these scenes.
+    """In how many of A's benign scenes the original vehicles of A and B brake, None without any;
+    and the number of these scenes.
     """
     systems = [assemble(one.study) for one in (a, b)]
     # What a study searches in its scenario, these scenes do not have.
@@ -233,12 +278,17 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     scenes = benign_scenes(a.study, systems[0])
     brakes = [needless_braking(system, scenes) for system in systems]
     counts = [sum(one) if one else None for one in brakes]
-    return {"a_needless_braking": counts[0], "b_needless_braking": counts[1], "benign_scenes": len(brakes[0])}
+    return {
+        "a_needless_braking": counts[0],
+        "b_needless_braking": counts[1],
+        "benign_scenes": len(brakes[0]),
+    }
 
 
 def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
-    """By how much B's original vehicle begins to brake earlier, and later, where the difference is largest [m]; None in
-    rated studies, in other scenarios than A's, and where either does not brake.
+    """By how much B's original vehicle begins to brake earlier, and later, where the difference is
+    largest [m]; None in rated studies, in other scenarios than A's, and where either does not
+    brake.
     """
     metres = np.empty(0)
     is_same_scenario = (a.study.scenario, a.study.matrix) == (b.study.scenario, b.study.matrix)
@@ -247,10 +297,17 @@ def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
         metres = metres[np.isfinite(metres)]
     if not len(metres):
         return {"metres_earlier": None, "metres_later": None}
-    return {"metres_earlier": max(0.0, float(metres.max())), "metres_later": max(0.0, float(-metres.min()))}
+    return {
+        "metres_earlier": max(0.0, float(metres.max())),
+        "metres_later": max(0.0, float(-metres.min())),
+    }
 
 
 def _onset_places(evaluator: Evaluator) -> FloatArray:
-    """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does not [m]."""
-    onsets, _ = drive_new_cars(assemble(evaluator.study), evaluator.characteristics.original[np.newaxis])
+    """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does
+    not [m].
+    """
+    onsets, _ = drive_new_cars(
+        assemble(evaluator.study), evaluator.characteristics.original[np.newaxis]
+    )
     return np.asarray(onsets[0])

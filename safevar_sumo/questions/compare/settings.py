@@ -1,5 +1,5 @@
-"""The settings with which two systems, A and B, are compared: the same changes of both original vehicles, in the same
-encounters.
+"""The settings with which two systems, A and B, are compared: the same changes of both original
+vehicles, in the same encounters.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from safevar_sumo.study import Limit, Study
 from safevar_sumo.study.characteristics import Domain, check_limits
 
 MAX_FACTOR = 512
-"""Largest number of settings that are drawn for each one that satisfies the constraints of both studies."""
+"""Largest number of settings that are drawn for each one that satisfies the constraints of both
+studies.
+"""
 SAMPLE = "sample"
 """Source of the settings that are drawn."""
 RUN_COLUMNS = ["source", "algorithm", "run"]
@@ -31,8 +33,8 @@ RUN_COLUMNS = ["source", "algorithm", "run"]
 LINE = "line"
 """Column with the number of a drawn setting's line."""
 ROUNDS = 4
-"""Number of settings on a line: at half of its changes, then each half as far from the last one as that from its own
-last one.
+"""Number of settings on a line: at half of its changes, then each half as far from the last one as
+that from its own last one.
 """
 
 
@@ -42,7 +44,8 @@ class Pairs(NamedTuple):
     Attributes
     ----------
     frame
-        Where each comes from: `source`, `solution`, `algorithm` and `run` of solutions, `line` of drawn settings.
+        Where each comes from: `source`, `solution`, `algorithm` and `run` of solutions, `line` of
+        drawn settings.
     settings
         Their values in A and in B, each of shape (M, n).
     runs
@@ -75,7 +78,11 @@ class Pairs(NamedTuple):
         """Some of the pairs, in their order."""
         a, b = self.settings
         in_a, in_b = self.runs
-        return Pairs(self.frame[rows].reset_index(drop=True), (a[rows], b[rows]), (in_a.take(rows), in_b.take(rows)))
+        return Pairs(
+            self.frame[rows].reset_index(drop=True),
+            (a[rows], b[rows]),
+            (in_a.take(rows), in_b.take(rows)),
+        )
 
 
 class CommonDomain(NamedTuple):
@@ -97,14 +104,16 @@ class CommonDomain(NamedTuple):
     upper: FloatArray
 
     @classmethod
-    def of(cls, evaluators: tuple[Evaluator, Evaluator], limits: Mapping[str, Limit]) -> CommonDomain:
+    def of(
+        cls, evaluators: tuple[Evaluator, Evaluator], limits: Mapping[str, Limit]
+    ) -> CommonDomain:
         """The common domain, within limits that both original vehicles keep.
 
         Raises
         ------
         InputError
-            If B's original vehicle does not keep a limit, or the domains of a searched parameter have nothing in
-            common.
+            If B's original vehicle does not keep a limit, or the domains of a searched parameter
+            have nothing in common.
         """
         a, b = (one.characteristics for one in evaluators)
         second = evaluators[1].study
@@ -112,13 +121,20 @@ class CommonDomain(NamedTuple):
             check_limits(second.domains, limits, "limits: ")
         shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
         domains = [one.study.domains for one in evaluators]
-        ends = np.array([[within(limits, name, of_study[name]) for name in a.names] for of_study in domains])
+        ends = np.array(
+            [[within(limits, name, of_study[name]) for name in a.names] for of_study in domains]
+        )
         common = cls(evaluators, shift, lower=ends[:, :, 0], upper=ends[:, :, 1])
         lower, upper = common.ends_in_a
         is_empty = lower > upper
         if is_empty.any():
-            problem = f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not overlap"
-            raise InputError(second.source, problem, "studies with a common domain of each parameter")
+            problem = (
+                f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
+                " overlap"
+            )
+            raise InputError(
+                second.source, problem, "studies with a common domain of each parameter"
+            )
         return common
 
     @property
@@ -142,13 +158,17 @@ class CommonDomain(NamedTuple):
         return np.asarray(((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2)))
 
     def in_both(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A's settings, and the same in B; what rounding moves out of B's domain is put onto its end."""
+        """A's settings, and the same in B; what rounding moves out of B's domain is put onto its
+        end.
+        """
         return settings, np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
 
     def evaluate(self, settings: tuple[FloatArray, FloatArray]) -> tuple[Evaluations, Evaluations]:
         """Evaluate settings in both systems."""
         in_a, in_b = self.evaluators
-        return in_a.evaluate(settings[0], "settings in A"), in_b.evaluate(settings[1], "settings in B")
+        return in_a.evaluate(settings[0], "settings in A"), in_b.evaluate(
+            settings[1], "settings in B"
+        )
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
@@ -171,7 +191,9 @@ def in_order_of(a: Study, b: Study) -> Study:
         return msgspec.structs.replace(
             b,
             vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
-            scenario=msgspec.structs.replace(b.scenario, search={name: b.domains[name] for name in a.scenario.search}),
+            scenario=msgspec.structs.replace(
+                b.scenario, search={name: b.domains[name] for name in a.scenario.search}
+            ),
         )
 
     def in_words(units: set[tuple[str, str]]) -> str:
@@ -188,8 +210,8 @@ def in_order_of(a: Study, b: Study) -> Study:
 def pairs_of(
     subjects: Sequence[Study | Case], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
 ) -> tuple[Pairs, int]:
-    """The solutions of both sides and the drawn settings, evaluated in both systems; and the number of solutions that
-    are not in both domains.
+    """The solutions of both sides and the drawn settings, evaluated in both systems; and the number
+    of solutions that are not in both domains.
     """
     names = list(common.evaluators[0].characteristics.names)
     groups = []
@@ -201,7 +223,9 @@ def pairs_of(
         settings = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
         is_inside = common.holds(settings)
         kept = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
-        frame = case.solutions[kept].assign(source=side, solution=list(map(str, handles_of(case.solutions))))
+        frame = case.solutions[kept].assign(
+            source=side, solution=list(map(str, handles_of(case.solutions)))
+        )
         outside += int(np.count_nonzero(~is_inside))
         inside = settings[0][is_inside], settings[1][is_inside]
         groups.append(Pairs(frame[is_inside], inside, common.evaluate(inside)))
@@ -210,12 +234,13 @@ def pairs_of(
 
 
 def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: int) -> Pairs:
-    """`samples` settings on lines from the original vehicles to Sobol points of the common domain, in the encounters of
-    these points: each nearer to where the systems begin to fail.
+    """`samples` settings on lines from the original vehicles to Sobol points of the common domain,
+    in the encounters of these points: each nearer to where the systems begin to fail.
 
-    Nearly every vehicle with random changes of all characteristics fails in both systems, which says nothing. So a line
-    goes on with smaller changes after a failure in both, with larger ones after none, and beside a difference. Which of
-    both systems fails does not matter: without a difference between them, a line favours none.
+    Nearly every vehicle with random changes of all characteristics fails in both systems, which
+    says nothing. So a line goes on with smaller changes after a failure in both, with larger ones
+    after none, and beside a difference. Which of both systems fails does not matter: without a
+    difference between them, a line favours none.
     """
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))
@@ -232,7 +257,9 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
         runs = common.evaluate(settings)
         frame = pd.DataFrame({"source": SAMPLE, "solution": "", LINE: lines})
         rounds.append(Pairs(frame, settings, runs))
-        failures = np.sum([unsafe.of(one) for unsafe, one in zip(criteria, runs, strict=True)], axis=0)
+        failures = np.sum(
+            [unsafe.of(one) for unsafe, one in zip(criteria, runs, strict=True)], axis=0
+        )
         step /= 2
         beside = np.where(lines % 2, step, -step)
         shares[lines] += np.choose(failures, [step, beside, -step])
@@ -240,15 +267,17 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
 
 
 def _common_sample(common: CommonDomain, number: int) -> FloatArray:
-    """`number` settings of A that cover the common domain evenly and satisfy the constraints of both studies; fewer if
-    hardly any settings do.
+    """`number` settings of A that cover the common domain evenly and satisfy the constraints of
+    both studies; fewer if hardly any settings do.
     """
     lower, upper = common.ends_in_a
     factor = 1
     while True:
         settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
         both = common.in_both(settings)
-        is_feasible = [one.region.feasible(values) for one, values in zip(common.evaluators, both, strict=True)]
+        is_feasible = [
+            one.region.feasible(values) for one, values in zip(common.evaluators, both, strict=True)
+        ]
         settings = settings[is_feasible[0] & is_feasible[1]]
         if len(settings) >= number or factor >= MAX_FACTOR:
             return settings[:number]

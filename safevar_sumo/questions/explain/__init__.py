@@ -1,5 +1,5 @@
-"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, is the failure robust, and
-would a reference driver have avoided it?
+"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, is the
+failure robust, and would a reference driver have avoided it?
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.across_fits import Ranges, conclusions_across_fits
 from safevar_sumo.questions.explain.causes import BOUNDARIES, SUBSETS, count_needed
-from safevar_sumo.questions.explain.failures import TO_EXPLAIN, Population, choose_failures, find_failures
+from safevar_sumo.questions.explain.failures import (
+    TO_EXPLAIN,
+    Population,
+    choose_failures,
+    find_failures,
+)
 from safevar_sumo.questions.explain.margins import MARGINS, find_margins
 from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS
 from safevar_sumo.questions.explain.robustness import robustness_in_words
@@ -68,7 +73,15 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the
 
 @question
 @contents(
-    *("unsafe", "settings", "failures", "other_outcomes", "left_out", "original_outcome", "original_degree"),
+    *(
+        "unsafe",
+        "settings",
+        "failures",
+        "other_outcomes",
+        "left_out",
+        "original_outcome",
+        "original_degree",
+    ),
     *("analysed", "explained", *COLLISION_NUMBERS, "fits", "unsafe_in_fits"),
     causes=CAUSE_COLUMNS,
     solutions=SOLUTION_COLUMNS,
@@ -88,25 +101,27 @@ def explain(
     limit: Count = 40_000,
     fits: Annotated[int, Range(0, 1000)] = 20,
 ) -> Answer:
-    """Explain failures: which changes cause them, how small a change is enough, and who would have avoided them.
+    """Explain failures: which changes cause them, how small a change is enough, and who would have
+    avoided them.
 
     Of a study without results, failures among settings drawn from its whole domain are explained.
 
     Parameters
     ----------
     solution
-        Handle of a solution, such as nsga2:3:0; may be repeated. By default the robust failure with the fewest changes,
-        those with the fewest and the smallest changes, the most severe one, and one of each distinct cause.
+        Handle of a solution, such as nsga2:3:0; may be repeated. By default the robust failure with
+        the fewest changes, those with the fewest and the smallest changes, the most severe one, and
+        one of each distinct cause.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     top
         Largest number of failures that are explained.
     limit
-        Approximate number of simulations for the minimal causes of all failures; if all would take more, a random
-        sample is analysed.
+        Approximate number of simulations for the minimal causes of all failures; if all would take
+        more, a random sample is analysed.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) with which each conclusion
-        is drawn again; 0 leaves this out.
+        Number of vehicle models that fit the published data about as well (sets of [spread]) with
+        which each conclusion is drawn again; 0 leaves this out.
     """
     evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES, BORDERS)
     study = evaluator.study
@@ -114,11 +129,15 @@ def explain(
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
     # Of an unsafe original no change is a cause; in another encounter it may be safe.
-    is_unsafe_original = not study.scenario.search and bool(population.unsafe.of(population.original)[0])
+    is_unsafe_original = not study.scenario.search and bool(
+        population.unsafe.of(population.original)[0]
+    )
     if is_unsafe_original:
         causes = {row: [] for row in causes}
     changed = evaluator.characteristics.changed(runs.settings[sample])
-    needed = count_needed(evaluator.characteristics, changed, [causes[row] for row in sample], len(population.rows))
+    needed = count_needed(
+        evaluator.characteristics, changed, [causes[row] for row in sample], len(population.rows)
+    )
     needed = needed.head(0) if is_unsafe_original else needed
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
@@ -127,13 +146,19 @@ def explain(
     ranges = Ranges()
     if fits and study.spread and len(runs):
         shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-        holding, ranges = conclusions_across_fits(evaluator, fits, runs, population.unsafe, of_chosen, *shares)
+        holding, ranges = conclusions_across_fits(
+            evaluator, fits, runs, population.unsafe, of_chosen, *shares
+        )
     solutions = solutions_frame(population, evaluator, reasons)
     tables = {
         "causes": causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
-        **statistics_tables(needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)),
-        "margins": tabulate("By the margin of the original", MARGINS, find_margins(population, evaluator, limit)),
+        **statistics_tables(
+            needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)
+        ),
+        "margins": tabulate(
+            "By the margin of the original", MARGINS, find_margins(population, evaluator, limit)
+        ),
         "moved": moved_table(evaluator, of_chosen),
         "distinct_causes": distinct_table(evaluator, [causes[row] for row in sample]),
     }
@@ -141,20 +166,34 @@ def explain(
         **_counts(population, subject),
         "analysed": len(sample),
         "explained": len(solutions),
-        **(dict.fromkeys(COLLISION_NUMBERS) if is_rated(study) else _collision_numbers(verdicts, collisions)),
+        **(
+            dict.fromkeys(COLLISION_NUMBERS)
+            if is_rated(study)
+            else _collision_numbers(verdicts, collisions)
+        ),
         "fits": len(holding),
         "unsafe_in_fits": ranges.get(("unsafe", "")),
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
-    sentences = [_verdict(evaluator, population, kind, len(holding), tables["causes"]), _avoided_in_words(verdicts)]
+    sentences = [
+        _verdict(evaluator, population, kind, len(holding), tables["causes"]),
+        _avoided_in_words(verdicts),
+    ]
     sentences += counted_in_words(study, len(population.left_out)) if kind == DRAWN else []
     verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
-    return Answer(question="explain", study=study, verdict=verdict, numbers=numbers, tables=tables, draw=draw_needed)
+    return Answer(
+        question="explain",
+        study=study,
+        verdict=verdict,
+        numbers=numbers,
+        tables=tables,
+        draw=draw_needed,
+    )
 
 
 def _counts(population: Population, subject: Study | Case) -> JsonObject:
-    """The numbers of settings, how the original vehicle ends, and the number of collisions that the search simulated
-    but its objectives leave out of the solutions.
+    """The numbers of settings, how the original vehicle ends, and the number of collisions that the
+    search simulated but its objectives leave out of the solutions.
     """
     runs = population.evaluations
     original = population.original
@@ -173,18 +212,31 @@ def _counts(population: Population, subject: Study | Case) -> JsonObject:
 
 
 def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
-    """The numbers of all collisions, of those judged that some driver avoids, and that even full braking does not."""
+    """The numbers of all collisions, of those judged that some driver avoids, and that even full
+    braking does not.
+    """
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
-    return dict(zip(COLLISION_NUMBERS, (collisions, int(is_avoided.sum()), int(unavoidable.sum())), strict=True))
+    return dict(
+        zip(
+            COLLISION_NUMBERS,
+            (collisions, int(is_avoided.sum()), int(unavoidable.sum())),
+            strict=True,
+        )
+    )
 
 
-def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame) -> str:
+def _verdict(
+    evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame
+) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
     unsafe = population.unsafe
     contact = assemble(evaluator.study).contact
     runs = population.evaluations
-    counts = f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe ({unsafe.description})."
+    counts = (
+        f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe"
+        f" ({unsafe.description})."
+    )
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
         demand = f" {unsafe.smaller_demand}".rstrip()
@@ -205,13 +257,17 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, fits: int,
     boundary = {**leading["boundary"], **leading.get("encounter", {})}
     setting = np.array([boundary.get(item.name, item.original) for item in members], dtype=float)
     printed = describe(Model(0, evaluator, unsafe), {"": setting})
-    values = dict(zip(members.names, (printed[""].setting if printed else setting).tolist(), strict=True))
-    limits = [
-        f"{item.short_name} {'above' if values[item.name] > item.original else 'below'} "
-        f"{limit_text(item, values[item.name]) if printed else item.text(values[item.name]) + item.suffix}"
-        for item in members
-        if item.name in leading["boundary"]
-    ]
+    values = dict(
+        zip(members.names, (printed[""].setting if printed else setting).tolist(), strict=True)
+    )
+    limits = []
+    for item in members:
+        if item.name not in leading["boundary"]:
+            continue
+        value = values[item.name]
+        side = "above" if value > item.original else "below"
+        text = limit_text(item, value) if printed else item.text(value) + item.suffix
+        limits.append(f"{item.short_name} {side} {text}")
     encounter = encounter_in_words(members, values, are_printed=bool(printed))
     where = f"{encounter}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
@@ -225,14 +281,25 @@ def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     """What a competent driver, and full braking, would have avoided."""
     shares = avoided_shares(verdicts)
     titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
-    phrases = [f"{title} avoids {share_in_words(shares[name])}" for name, title in titles.items() if name in shares]
+    phrases = [
+        f"{title} avoids {share_in_words(shares[name])}"
+        for name, title in titles.items()
+        if name in shares
+    ]
     number = number_of(len(verdicts), "collision")
     return f"In the same vehicle, of {number} {join_phrases(phrases)}." if phrases else ""
 
 
 def draw_needed(answer: Answer) -> Figure:
     """How often each characteristic is needed, beside how often it is changed."""
-    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, GREY, SKY_BLUE, escape_dollars, new_figure
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        FONT_SIZE,
+        GREY,
+        SKY_BLUE,
+        escape_dollars,
+        new_figure,
+    )
 
     frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))

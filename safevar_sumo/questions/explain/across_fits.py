@@ -12,7 +12,12 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import Cause, count_needed, find_minimal_causes, settings_of
+from safevar_sumo.questions.explain.causes import (
+    Cause,
+    count_needed,
+    find_minimal_causes,
+    settings_of,
+)
 from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import avoided_shares, judge_sample
 from safevar_sumo.questions.sampling import Interval
@@ -21,24 +26,27 @@ from safevar_sumo.records import BoolArray, Evaluations
 MAX_SHARE_SETS = 8
 """Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
 MAX_VEHICLES = 300
-"""Maximum number of vehicles, drawn at random, that are simulated with each set; those that collide show which
-collisions the reference drivers avoid.
+"""Maximum number of vehicles, drawn at random, that are simulated with each set; those that collide
+show which collisions the reference drivers avoid.
 """
 MAX_FAILURES = 20
-"""Maximum number of failures, those with the fewest changes, whose minimal causes are found with each set."""
+"""Maximum number of failures, those with the fewest changes, whose minimal causes are found with
+each set.
+"""
 STAGE = "other fitted vehicle models"
 Ranges = dict[tuple[str, str], Interval]
-"""Ranges over parameter sets by kind and name of a share: (`unsafe`, ""), the settings that are unsafe; (`needed`, a
-characteristic), the failures that need it; (`avoided`, a driver), the collisions that he avoids.
+"""Ranges over parameter sets by kind and name of a share: (`unsafe`, ""), the settings that are
+unsafe; (`needed`, a characteristic), the failures that need it; (`avoided`, a driver), the
+collisions that he avoids.
 
-The ends of a range are the share with the study's own parameters plus the least, and plus the greatest difference that
-another set makes on a sample.
+The ends of a range are the share with the study's own parameters plus the least, and plus the
+greatest difference that another set makes on a sample.
 """
 
 
 def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> BoolArray:
-    """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe, and safe if any one
-    of them is left out.
+    """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe,
+    and safe if any one of them is left out.
     """
     if not causes:
         return np.zeros(0, dtype=bool)
@@ -47,7 +55,9 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     for setting in settings_of(characteristics, causes):
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
         is_left_out = np.diag(is_changed)[is_changed]  # in a row for each change
-        groups.append(np.vstack([setting, np.where(is_left_out, characteristics.original, setting)]))
+        groups.append(
+            np.vstack([setting, np.where(is_left_out, characteristics.original, setting)])
+        )
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
     # The first setting of a group, with all changes, is the only unsafe one.
@@ -64,8 +74,8 @@ def ranges_across_fits(
 ) -> Ranges:
     """The ranges of the shares over the study's own parameters and the first `fits` sets.
 
-    With its own parameters, the shares of failures that need a characteristic are `needed`, and of collisions that a
-    driver avoids `avoided`.
+    With its own parameters, the shares of failures that need a characteristic are `needed`, and of
+    collisions that a driver avoids `avoided`.
     """
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(len(evaluations))
     vehicles = evaluations.settings[shuffled[:MAX_VEHICLES]]
@@ -77,13 +87,17 @@ def ranges_across_fits(
         causes = find_minimal_causes(of_set, failures.settings, unsafe)
         rows = [row for row, of_failure in enumerate(causes) if of_failure]
         changed = of_set.characteristics.changed(failures.settings[rows])
-        frame = count_needed(of_set.characteristics, changed, [causes[row] for row in rows], len(rows))
+        frame = count_needed(
+            of_set.characteristics, changed, [causes[row] for row in rows], len(rows)
+        )
         runs = of_set.evaluate(vehicles, STAGE)
         avoided_here = avoided
         if not avoided.empty:
             judged, *_ = judge_sample(of_set, runs.take(runs.collided))
             avoided_here = avoided_shares(judged)
-        return _shares_by_kind(unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here)
+        return _shares_by_kind(
+            unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here
+        )
 
     shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
     of_sets = across(evaluator, min(fits, MAX_SHARE_SETS), sample_shares)
@@ -106,14 +120,20 @@ def conclusions_across_fits(
     needed: pd.Series[float],
     avoided: pd.Series[float],
 ) -> tuple[list[BoolArray], Ranges]:
-    """Whether each cause is one, with each of the first `fits` sets, and the result of `ranges_across_fits`."""
+    """Whether each cause is one, with each of the first `fits` sets, and the result of
+    `ranges_across_fits`.
+    """
     evaluator = evaluator.for_study(evaluator.study, verified=0)  # as those of the sets
     flat = [cause for group in causes for cause in group]
     holding = across(evaluator, fits, lambda each: are_causes(each, flat, unsafe))
     return holding, ranges_across_fits(evaluator, fits, evaluations, unsafe, needed, avoided)
 
 
-def _shares_by_kind(is_unsafe: BoolArray, needed: pd.Series[float], avoided: pd.Series[float]) -> pd.Series[float]:
+def _shares_by_kind(
+    is_unsafe: BoolArray, needed: pd.Series[float], avoided: pd.Series[float]
+) -> pd.Series[float]:
     kinds = {"unsafe": {"": is_unsafe.mean()}, "needed": needed, "avoided": avoided}
-    shares: pd.Series[float] = pd.concat({kind: pd.Series(values, dtype=float) for kind, values in kinds.items()})
+    shares: pd.Series[float] = pd.concat(
+        {kind: pd.Series(values, dtype=float) for kind, values in kinds.items()}
+    )
     return shares

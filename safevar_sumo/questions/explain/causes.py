@@ -1,8 +1,9 @@
-"""Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves; their limits; and which
-changes failures need.
+"""Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves; their
+limits; and which changes failures need.
 
-Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a size are simulated,
-size by size, until some are unsafe. These are minimal, as no smaller subset is unsafe.
+Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a
+size are simulated, size by size, until some are unsafe. These are minimal, as no smaller subset is
+unsafe.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ MAX_SUBSETS = 20_000
 
 
 class Cause(NamedTuple):
-    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the original vehicle: the
-    values of these characteristics in their units; outcome and safety degree [m, or -m/s] of a vehicle with these
-    changes only. `encounter` are the failure's parameters of the scenario, in a study that searches them.
+    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the
+    original vehicle: the values of these characteristics in their units; outcome and safety degree
+    [m, or -m/s] of a vehicle with these changes only. `encounter` are the failure's parameters of
+    the scenario, in a study that searches them.
     """
 
     changes: dict[str, float]
@@ -43,9 +45,11 @@ class Cause(NamedTuple):
     encounter: dict[str, float]
 
 
-def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> list[list[Cause]]:
-    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list if no subset is
-    unsafe.
+def find_minimal_causes(
+    evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe
+) -> list[list[Cause]]:
+    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list
+    if no subset is unsafe.
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
@@ -61,7 +65,11 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
             # Where a smaller subset is a cause, no larger one is minimal.
             rows_left = [row for row, of_row in enumerate(causes) if not of_row]
             expect(sum(_subset_counts((len(changed[row]) for row in rows_left), size)))
-            subsets = ((row, list(columns)) for row in rows_left for columns in combinations(changed[row], size))
+            subsets = (
+                (row, list(columns))
+                for row in rows_left
+                for columns in combinations(changed[row], size)
+            )
             while chunk := list(islice(subsets, MAX_SUBSETS)):
                 partial_settings = originals[[row for row, _ in chunk]]
                 for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
@@ -81,17 +89,24 @@ def find_minimal_causes(evaluator: Evaluator, settings: FloatArray, unsafe: Unsa
 
 
 def _subset_counts(numbers: Iterable[int], least: int = 0) -> list[int]:
-    """About how many subsets of at least so many of each number of changes are tried: up to half of them, as in the
-    shipped studies.
+    """About how many subsets of at least so many of each number of changes are tried: up to half of
+    them, as in the shipped studies.
     """
-    return [sum(comb(number, size) for size in range(least, (number + 1) // 2 + 1)) for number in numbers]
+    return [
+        sum(comb(number, size) for size in range(least, (number + 1) // 2 + 1))
+        for number in numbers
+    ]
 
 
-def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evaluations: int) -> list[int]:
-    """All rows of `settings`, or a random sample of them, so that finding their minimal causes takes at most about
-    `max_evaluations`.
+def select_affordable_rows(
+    settings: FloatArray, evaluator: Evaluator, max_evaluations: int
+) -> list[int]:
+    """All rows of `settings`, or a random sample of them, so that finding their minimal causes
+    takes at most about `max_evaluations`.
     """
-    costs = np.array(_subset_counts(evaluator.characteristics.number_changed(settings).astype(int).tolist()))
+    costs = np.array(
+        _subset_counts(evaluator.characteristics.number_changed(settings).astype(int).tolist())
+    )
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
@@ -99,7 +114,10 @@ def select_affordable_rows(settings: FloatArray, evaluator: Evaluator, max_evalu
 
 
 def count_needed(
-    characteristics: CharacteristicSet, changed: BoolArray, causes: Sequence[Sequence[Cause]], failures: int
+    characteristics: CharacteristicSet,
+    changed: BoolArray,
+    causes: Sequence[Sequence[Cause]],
+    failures: int,
 ) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
 
@@ -115,11 +133,12 @@ def count_needed(
     Returns
     -------
     pandas.DataFrame
-        One row per characteristic: `characteristic`, and the shares of failures in which it is `changed`, `needed`
-        (part of every minimal cause) and `in_some` (part of at least one). `needed_low` and `needed_high` are the 95 %
-        interval of `needed` among all failures: Clopper and Pearson's for a sample (slightly too wide, because the
-        sample is drawn without replacement from finitely many failures), the share itself if all failures were
-        analysed. Ordered by needed, in_some, changed; no rows if there is no failure.
+        One row per characteristic: `characteristic`, and the shares of failures in which it is
+        `changed`, `needed` (part of every minimal cause) and `in_some` (part of at least one).
+        `needed_low` and `needed_high` are the 95 % interval of `needed` among all failures: Clopper
+        and Pearson's for a sample (slightly too wide, because the sample is drawn without
+        replacement from finitely many failures), the share itself if all failures were analysed.
+        Ordered by needed, in_some, changed; no rows if there is no failure.
     """
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
@@ -142,7 +161,9 @@ def count_needed(
         "in_some": in_some / number,
     }
     frame = pd.DataFrame(shares).head(len(names) if len(changed) else 0)
-    return frame.sort_values(["needed", "in_some", "changed"], ascending=False, kind="stable", ignore_index=True)
+    return frame.sort_values(
+        ["needed", "in_some", "changed"], ascending=False, kind="stable", ignore_index=True
+    )
 
 
 def directions(characteristics: CharacteristicSet, changes: Mapping[str, float]) -> tuple[str, ...]:
@@ -154,14 +175,16 @@ def directions(characteristics: CharacteristicSet, changes: Mapping[str, float])
     )
 
 
-def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
+def count_distinct_causes(
+    characteristics: CharacteristicSet, causes: Sequence[Sequence[Cause]]
+) -> pd.DataFrame:
     """Every distinct minimal cause, most frequent first.
 
     Returns
     -------
     pandas.DataFrame
-        Columns `cause`, a tuple of changes with their directions; `failures`, the number of failures with this cause;
-        and `share`, their share of all failures.
+        Columns `cause`, a tuple of changes with their directions; `failures`, the number of
+        failures with this cause; and `share`, their share of all failures.
     """
     counts = Counter[tuple[str, ...]]()
     for of_failure in causes:
@@ -172,8 +195,8 @@ def count_distinct_causes(characteristics: CharacteristicSet, causes: Sequence[S
 
 
 def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame:
-    """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe solutions: those with
-    the fewest, then the smallest changes.
+    """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe
+    solutions: those with the fewest, then the smallest changes.
 
     Returns
     -------
@@ -187,17 +210,22 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     examined = failures.groupby(keys).head(limit)
     causes = find_minimal_causes(evaluator, examined[names].to_numpy(dtype=float), case.unsafe)
     by_run: dict[tuple[str, int], set[tuple[str, ...]]] = {run: set() for run in case.finished_runs}
-    kinds = [{directions(evaluator.characteristics, one.changes) for one in group} for group in causes]
+    kinds = [
+        {directions(evaluator.characteristics, one.changes) for one in group} for group in causes
+    ]
     for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
         by_run[run].update(group)
     counts = [frame.groupby(keys).size().to_dict() for frame in (failures, examined)]
-    rows = [(*run, *(count.get(run, 0) for count in counts), len(kinds_of_run)) for run, kinds_of_run in by_run.items()]
+    rows = [
+        (*run, *(count.get(run, 0) for count in counts), len(kinds_of_run))
+        for run, kinds_of_run in by_run.items()
+    ]
     return pd.DataFrame(rows, columns=[*keys, "failures", "examined", "causes"])
 
 
 LINE_SETTINGS = 32
-"""Number of settings first simulated on each line from the original to a setting. The search finds every unsafe stretch
-of the line that is as long as their spacing.
+"""Number of settings first simulated on each line from the original to a setting. The search finds
+every unsafe stretch of the line that is as long as their spacing.
 """
 PARTS_PER_ROUND = 8
 """Number of parts into which each further round divides the interval with the boundary."""
@@ -206,7 +234,9 @@ ROUNDS = 3
 
 
 class BoundaryState(StrEnum):
-    """What lies on a line from the original just below the smallest share of the line that is unsafe."""
+    """What lies on a line from the original just below the smallest share of the line that is
+    unsafe.
+    """
 
     SAFE = "safe"
     FILTER = "filter threshold"
@@ -214,14 +244,17 @@ class BoundaryState(StrEnum):
 
 
 class Limits(NamedTuple):
-    """How far the changes of a cause shrink while they stay unsafe and above the filter's thresholds.
+    """How far the changes of a cause shrink while they stay unsafe and above the filter's
+    thresholds.
 
     Attributes
     ----------
     boundary
-        The values after all changes are multiplied by `fraction`, the smallest factor at which the vehicle is unsafe.
+        The values after all changes are multiplied by `fraction`, the smallest factor at which the
+        vehicle is unsafe.
     single_boundary
-        For each characteristic, the value to which this one can return towards the original while the others stay.
+        For each characteristic, the value to which this one can return towards the original while
+        the others stay.
     fraction
         The factor.
     end
@@ -250,34 +283,53 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
     original = np.repeat(original, line_counts, axis=0)
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
-        characteristics.threshold, np.abs(ends - original), out=np.zeros(ends.shape), where=is_scaled
+        characteristics.threshold,
+        np.abs(ends - original),
+        out=np.zeros(ends.shape),
+        where=is_scaled,
     )
-    with evaluator.stage(BOUNDARIES, len(starts) * (LINE_SETTINGS - 1 + ROUNDS * (PARTS_PER_ROUND - 1))):
-        shares, states = find_boundary_shares(evaluator, starts, ends, unsafe, thresholds.max(axis=1))
+    with evaluator.stage(
+        BOUNDARIES, len(starts) * (LINE_SETTINGS - 1 + ROUNDS * (PARTS_PER_ROUND - 1))
+    ):
+        shares, states = find_boundary_shares(
+            evaluator, starts, ends, unsafe, thresholds.max(axis=1)
+        )
     limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
     first_lines = np.cumsum([0, *line_counts])
     return [
         Limits(
             boundary=dict(zip(cause.changes, limits[first, flags].tolist(), strict=True)),
             single_boundary=dict(
-                zip(cause.changes, np.diagonal(limits[first + 1 : stop, flags]).tolist(), strict=True)
+                zip(
+                    cause.changes,
+                    np.diagonal(limits[first + 1 : stop, flags]).tolist(),
+                    strict=True,
+                )
             ),
             fraction=float(shares[first]) if cause.changes else 0.0,
             end=states[first],
         )
-        for cause, flags, (first, stop) in zip(causes, is_changed, pairwise(first_lines), strict=True)
+        for cause, flags, (first, stop) in zip(
+            causes, is_changed, pairwise(first_lines), strict=True
+        )
     ]
 
 
 def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> FloatArray:
-    """The original vehicle with the changes of each of M causes only, in its encounter; shape (M, n)."""
+    """The original vehicle with the changes of each of M causes only, in its encounter; shape (M,
+    n).
+    """
     of_causes = [cause.changes | cause.encounter for cause in causes]
-    values = [[values.get(item.name, item.original) for item in characteristics] for values in of_causes]
+    values = [
+        [values.get(item.name, item.original) for item in characteristics] for values in of_causes
+    ]
     return np.array(values).reshape(-1, len(characteristics))
 
 
 def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
-    """Settings at K `shares`, shape (M, K), of M lines from `starts` to `ends`, shape (M, n); shape (M, K, n)."""
+    """Settings at K `shares`, shape (M, K), of M lines from `starts` to `ends`, shape (M, n); shape
+    (M, K, n).
+    """
     factors = shares[..., np.newaxis]
     start = starts[:, np.newaxis]
     end = ends[:, np.newaxis]
@@ -289,11 +341,12 @@ def find_boundary_shares(
 ) -> tuple[FloatArray, list[BoundaryState]]:
     """The first unsafe share of each of M lines, shape (M,), and what lies just below it.
 
-    A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`, shape (M,), on, and
-    its end must be unsafe. Each round simulates the bounds between equal parts of the interval from `low` to `high`,
-    and keeps the part below the first unsafe one. The error is at most 1 / 16,384 of the line above `lowest`: one part
-    of the last round. A setting that cannot be simulated is neither safe nor unsafe; just below the share, it gives the
-    state `NOT_SIMULATED`.
+    A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`,
+    shape (M,), on, and its end must be unsafe. Each round simulates the bounds between equal parts
+    of the interval from `low` to `high`, and keeps the part below the first unsafe one. The error
+    is at most 1 / 16,384 of the line above `lowest`: one part of the last round. A setting that
+    cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
+    `NOT_SIMULATED`.
     """
     lines = np.arange(len(starts))
     always = np.ones(len(starts), dtype=bool)
@@ -314,6 +367,8 @@ def find_boundary_shares(
         low_is_valid = is_valid[lines, first_unsafe - 1]
     is_at_threshold = (low == lowest) & (lowest > 0)
     states = np.select(
-        [is_at_threshold, low_is_valid], [BoundaryState.FILTER, BoundaryState.SAFE], BoundaryState.NOT_SIMULATED
+        [is_at_threshold, low_is_valid],
+        [BoundaryState.FILTER, BoundaryState.SAFE],
+        BoundaryState.NOT_SIMULATED,
     )
     return high, [BoundaryState(state) for state in states]

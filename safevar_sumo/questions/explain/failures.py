@@ -1,5 +1,5 @@
-"""Which failures are explained: those that matter among the solutions of results, or among settings drawn from a
-study's whole domain; and how each of them ends beside the original vehicle.
+"""Which failures are explained: those that matter among the solutions of results, or among settings
+drawn from a study's whole domain; and how each of them ends beside the original vehicle.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ REQUESTED = "requested"
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
 SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
-"""Number of settings drawn from the whole domain if there are no results, in an unrated and in a rated study."""
+"""Number of settings drawn from the whole domain if there are no results, in an unrated and in a
+rated study.
+"""
 
 
 class Population(NamedTuple):
@@ -64,8 +66,8 @@ class Population(NamedTuple):
     otherwise
         Number of rows with another outcome than in the results.
     left_out
-        Settings in whose encounter the original vehicle does not keep its margin, which are no rows: drawn ones, or the
-        unsafe ones of a search; shape (L, n).
+        Settings in whose encounter the original vehicle does not keep its margin, which are no
+        rows: drawn ones, or the unsafe ones of a search; shape (L, n).
     """
 
     original: Evaluations
@@ -79,7 +81,10 @@ class Population(NamedTuple):
 
 
 def find_failures(
-    subject: Study | Case, evaluator: Evaluator, solutions: Sequence[str], criterion: Unsafe | str | None
+    subject: Study | Case,
+    evaluator: Evaluator,
+    solutions: Sequence[str],
+    criterion: Unsafe | str | None,
 ) -> Population:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain.
 
@@ -93,7 +98,11 @@ def find_failures(
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
         if named:
-            raise InputError("solution", f"{subject.name!r} is a study and has no solutions", "a results directory")
+            raise InputError(
+                "solution",
+                f"{subject.name!r} is a study and has no solutions",
+                "a results directory",
+            )
         candidates = _drawn_from(subject, evaluator)
     else:
         candidates = _solutions_of(subject, named)
@@ -110,12 +119,16 @@ def find_failures(
         left_out = _left_out_of_search(subject, unsafe)
         recorded = candidates.recorded
         otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
-    rows = list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
+    rows = (
+        list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
+    )
     return Population(original, evaluations, names, unsafe, rows, bool(named), otherwise, left_out)
 
 
 class _Candidates(NamedTuple):
-    """Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results, shape (M,)."""
+    """Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results,
+    shape (M,).
+    """
 
     settings: FloatArray
     names: list[str]
@@ -127,7 +140,9 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     number = RATED_SAMPLED_SETTINGS if is_rated(study) else SAMPLED_SETTINGS
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
-    return _Candidates(settings, [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN))
+    return _Candidates(
+        settings, [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN)
+    )
 
 
 def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
@@ -138,11 +153,17 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
     chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
     handles = handles_of(table)
     settings = table[characteristics].to_numpy(dtype=float)[chosen]
-    return _Candidates(settings, [str(handles[row]) for row in chosen], table["outcome"].to_numpy(dtype=str)[chosen])
+    return _Candidates(
+        settings,
+        [str(handles[row]) for row in chosen],
+        table["outcome"].to_numpy(dtype=str)[chosen],
+    )
 
 
 def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
-    """The unsafe settings of a search in whose encounter the original vehicle does not keep its margin."""
+    """The unsafe settings of a search in whose encounter the original vehicle does not keep its
+    margin.
+    """
     evaluations = case.evaluations
     names = [*case.characteristics.names]
     if "feasible" not in evaluations or not {*names} <= {*evaluations}:
@@ -152,7 +173,9 @@ def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
 
 
 class Chosen(NamedTuple):
-    """Why failures are chosen, by row; the rows of a sample of all failures; and the minimal causes of both, by row."""
+    """Why failures are chosen, by row; the rows of a sample of all failures; and the minimal causes
+    of both, by row.
+    """
 
     reasons: Reasons
     sample: list[int]
@@ -162,15 +185,18 @@ class Chosen(NamedTuple):
 def choose_failures(population: Population, evaluator: Evaluator, limit: int, top: int) -> Chosen:
     """At most `top` failures that matter, and a sample of all failures; of named rows these alone.
 
-    The sample are all failures, if that takes at most about `limit` simulations. What matters: the smallest robust
-    failure, a failure for each of `REASONS`, and the simplest failure with each minimal cause that these do not have.
+    The sample are all failures, if that takes at most about `limit` simulations. What matters: the
+    smallest robust failure, a failure for each of `REASONS`, and the simplest failure with each
+    minimal cause that these do not have.
     """
     rows = population.rows
     settings = population.evaluations.settings
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
         return Chosen(dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True)))
-    limit //= len(assemble(evaluator.study).points)  # an evaluation simulates a setting at every point
+    limit //= len(
+        assemble(evaluator.study).points
+    )  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = _failures_that_matter(population, evaluator, limit)
     analysed = sorted({*sample, *reasons})
@@ -178,11 +204,18 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     causes = dict(zip(analysed, found, strict=True))
     reasons = dict(list(reasons.items())[:top])
     runs = population.evaluations
-    keys = {row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]} for row in causes}
-    for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])["cause"]:
+    keys = {
+        row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]}
+        for row in causes
+    }
+    for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])[
+        "cause"
+    ]:
         if len(reasons) < top and not any(key in keys[row] for row in reasons):
             of_this_cause = [row for row in sample if key in keys[row]]
-            simplest = min(of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row))
+            simplest = min(
+                of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row)
+            )
             reasons[simplest] = DISTINCT_CAUSE
     return Chosen(reasons, sample, causes)
 
@@ -206,9 +239,9 @@ def _failures_that_matter(population: Population, evaluator: Evaluator, limit: i
 
 
 PointComparison = tuple[str, tuple[str, ...]]
-"""How the runs of the original vehicle and of a failure end at the failure's worst point, in a sentence; and the names
-of the points of a test matrix at which it is unsafe (in a rated study, of the cells whose colour is worse than the
-original's), in the study's order.
+"""How the runs of the original vehicle and of a failure end at the failure's worst point, in a
+sentence; and the names of the points of a test matrix at which it is unsafe (in a rated study, of
+the cells whose colour is worse than the original's), in the study's order.
 """
 
 
@@ -220,7 +253,9 @@ def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
 
-def compare_at_points(system: System, settings: FloatArray, unsafe: Unsafe) -> list[PointComparison]:
+def compare_at_points(
+    system: System, settings: FloatArray, unsafe: Unsafe
+) -> list[PointComparison]:
     """Compare M settings, shape (M, n), with the original vehicle, each in its own encounter."""
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
@@ -229,16 +264,24 @@ def compare_at_points(system: System, settings: FloatArray, unsafe: Unsafe) -> l
     worst = worst_points(system, at_points)
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
-        names = (result.point.name for result, fails in zip(results, is_unsafe[:, vehicle], strict=True) if fails)
+        names = (
+            result.point.name
+            for result, fails in zip(results, is_unsafe[:, vehicle], strict=True)
+            if fails
+        )
         at_worst = results[worst[vehicle]]
-        sentence = _endings_in_words(system, at_worst.point.name, at_worst.evaluations.take([original, vehicle]))
-        comparisons.append((sentence, tuple(filter(None, names))))  # without a matrix, the only point has no name
+        sentence = _endings_in_words(
+            system, at_worst.point.name, at_worst.evaluations.take([original, vehicle])
+        )
+        comparisons.append(
+            (sentence, tuple(filter(None, names)))
+        )  # without a matrix, the only point has no name
     return comparisons
 
 
 def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointComparison]:
-    """Compare settings with the original as `compare_at_points` does, for a rated study: at the cell whose colour
-    worsens most.
+    """Compare settings with the original as `compare_at_points` does, for a rated study: at the
+    cell whose colour worsens most.
 
     An unknown colour is neither better nor worse.
     """

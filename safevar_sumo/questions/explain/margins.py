@@ -1,4 +1,6 @@
-"""How an answer depends on the margin that the original keeps, in a study that searches its scenario."""
+"""How an answer depends on the margin that the original keeps, in a study that searches its
+scenario.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,11 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes, settings_of
 from safevar_sumo.questions.explain.failures import Population
-from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, find_smallest_robust_failure, robust_shares
+from safevar_sumo.questions.explain.robustness import (
+    MIN_ROBUST_SHARE,
+    find_smallest_robust_failure,
+    robust_shares,
+)
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE
@@ -20,16 +26,21 @@ FACTORS = (0.5, 1.0, 2.0)
 STAGE = "encounters with other margins"
 MARGINS: Columns = {
     "margin": Column("m", "distance that the original vehicle keeps in the same encounter", ".3g"),
-    "settings": "explained settings whose originals keep so much; below the study's margin also those left out",
+    "settings": (
+        "explained settings whose originals keep so much; below the study's margin also those"
+        " left out"
+    ),
     "failures": "those that are unsafe",
-    "boundary": Column("", "smallest robust cause among them, scaled back as far as it stays unsafe", ".5g"),
+    "boundary": Column(
+        "", "smallest robust cause among them, scaled back as far as it stays unsafe", ".5g"
+    ),
     "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
 }
 
 
 def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd.DataFrame:
-    """A row of `MARGINS` for each margin; none unless the study searches its scenario, and where a user names
-    solutions.
+    """A row of `MARGINS` for each margin; none unless the study searches its scenario, and where a
+    user names solutions.
     """
     study = evaluator.study
     rows = list[JsonObject]()
@@ -38,7 +49,9 @@ def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd
         least = _with_margin(evaluator, min(margins))
         further = least.evaluate(population.left_out, STAGE)
         runs = (
-            population.evaluations if not len(further) else Evaluations.concatenate([population.evaluations, further])
+            population.evaluations
+            if not len(further)
+            else Evaluations.concatenate([population.evaluations, further])
         )
         contact = assemble(study).contact
         for margin in margins:
@@ -47,25 +60,46 @@ def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd
             cause = _smallest_cause(
                 _with_margin(evaluator, margin), runs.take(np.flatnonzero(fails)), population, limit
             )
-            rows.append({"margin": margin, "settings": int(counts.sum()), "failures": int(fails.sum()), **cause})
+            rows.append(
+                {
+                    "margin": margin,
+                    "settings": int(counts.sum()),
+                    "failures": int(fails.sum()),
+                    **cause,
+                }
+            )
     return pd.DataFrame(rows, columns=[*MARGINS])
 
 
 def _with_margin(evaluator: Evaluator, margin: float) -> Evaluator:
     study = evaluator.study
-    return evaluator.for_study(replace_in(study, scenario=replace_in(study.scenario, margin=margin)), verified=0)
+    return evaluator.for_study(
+        replace_in(study, scenario=replace_in(study.scenario, margin=margin)), verified=0
+    )
 
 
-def _smallest_cause(evaluator: Evaluator, failures: Evaluations, population: Population, limit: int) -> JsonObject:
+def _smallest_cause(
+    evaluator: Evaluator, failures: Evaluations, population: Population, limit: int
+) -> JsonObject:
     """The most robust cause of the smallest robust failure, if there is one."""
     unsafe = population.unsafe
     step = assemble(evaluator.study).step
-    most = limit // len(assemble(evaluator.study).points)  # an evaluation simulates a setting at every point
-    row = find_smallest_robust_failure(evaluator, failures, step, unsafe, most) if len(failures) else None
-    causes = [] if row is None else find_minimal_causes(evaluator, failures.settings[[row]], unsafe)[0]
+    most = limit // len(
+        assemble(evaluator.study).points
+    )  # an evaluation simulates a setting at every point
+    row = (
+        find_smallest_robust_failure(evaluator, failures, step, unsafe, most)
+        if len(failures)
+        else None
+    )
+    causes = (
+        [] if row is None else find_minimal_causes(evaluator, failures.settings[[row]], unsafe)[0]
+    )
     if not causes:
         return {}
-    shares = robust_shares(evaluator, settings_of(evaluator.characteristics, causes), step, unsafe).mean(axis=1)
+    shares = robust_shares(
+        evaluator, settings_of(evaluator.characteristics, causes), step, unsafe
+    ).mean(axis=1)
     best = int(np.argmax(shares))
     if shares[best] < MIN_ROBUST_SHARE:
         return {}

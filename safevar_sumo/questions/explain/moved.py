@@ -1,4 +1,6 @@
-"""Encounters that wear has cost: those that a competent driver avoids in the new car, and no longer in the worn one."""
+"""Encounters that wear has cost: those that a competent driver avoids in the new car, and no longer
+in the worn one.
+"""
 
 from __future__ import annotations
 
@@ -20,22 +22,31 @@ from safevar_sumo.sumo.system import assemble
 BORDERS = "borders of what a competent driver avoids"
 """The stage of progress."""
 STEPS, ROUNDS = 12, 3
-"""Number of values between which a border is sought; and how often, from the second time on between two neighbours."""
+"""Number of values between which a border is sought; and how often, from the second time on between
+two neighbours.
+"""
 COLUMNS: Columns = {
     "characteristic": "characteristic that is changed alone",
     "value": Column("", "its value, the furthest from the original in the causes", ".5g"),
     "scenario": "scenario, and the parameter that has the border",
     "border_before": Column(
-        "", "value from which on, up to the study's own, a competent driver avoids the collision in the new car", ".4g"
+        "",
+        "value from which on, up to the study's own, a competent driver avoids the collision in the"
+        " new car",
+        ".4g",
     ),
     "border_now": Column(
-        "", "the same in the car with this change, above the study's value if need be; undefined if at no value", ".4g"
+        "",
+        "the same in the car with this change, above the study's value if need be; undefined if at"
+        " no value",
+        ".4g",
     ),
 }
 
 
 def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.DataFrame:
-    """A row of `COLUMNS` for each characteristic of the causes and each scenario with a border that it moves.
+    """A row of `COLUMNS` for each characteristic of the causes and each scenario with a border that
+    it moves.
 
     The driver reacts to any braking of a leader.
     """
@@ -61,17 +72,27 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
         study = _with_border(evaluator.study, point, border, domain)
         with_driver = evaluator.for_study(study, verified=0)
         vehicle = original[evaluator.characteristics.of_vehicle]
-        cars = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[changed]
+        cars = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[
+            changed
+        ]
         before, *borders = _borders(with_driver, np.vstack([vehicle, cars]), domain).tolist()
         title = f"{point.name or evaluator.study.scenario.model}: {border} [{domain.unit}]"
         moved = [pair for pair in zip(changed, borders, strict=True) if pair[1] > before]
-        rows += [(names[k], furthest[k], title, before, now if now < np.inf else None) for k, now in moved]
+        rows += [
+            (names[k], furthest[k], title, before, now if now < np.inf else None)
+            for k, now in moved
+        ]
     return pd.DataFrame(rows, columns=[*COLUMNS])
 
 
 def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Study:
-    """The study at one of its points, with a competent driver, and this parameter of the scenario alone searched."""
-    parameters = {**study.scenario.parameters, **{name: one.original for name, one in study.scenario.search.items()}}
+    """The study at one of its points, with a competent driver, and this parameter of the scenario
+    alone searched.
+    """
+    parameters = {
+        **study.scenario.parameters,
+        **{name: one.original for name, one in study.scenario.search.items()},
+    }
     model = study.scenario.model
     over = dict(point.parameters)
     if study.matrix is not None and study.matrix.tests:
@@ -79,21 +100,39 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
         shared = parameters if test.model in ("", model) else {}
         parameters = {**shared, **test.parameters, **{key: over[key] for key in test.over}}
         model = test.model or model
-    fixed = {name: value for name, value in parameters.items() if name not in (border, *WEATHER_PARAMETERS)}
-    scenario = replace(study.scenario, model=model, parameters=fixed, search={border: domain}, margin=0.0)
+    fixed = {
+        name: value
+        for name, value in parameters.items()
+        if name not in (border, *WEATHER_PARAMETERS)
+    }
+    scenario = replace(
+        study.scenario, model=model, parameters=fixed, search={border: domain}, margin=0.0
+    )
     driver = ModelTable(model=LETTER, parameters=ANY)
-    return replace(study, scenario=scenario, matrix=None, weather=point.weather, ads=driver, spread={}, constraints=[])
+    return replace(
+        study,
+        scenario=scenario,
+        matrix=None,
+        weather=point.weather,
+        ads=driver,
+        spread={},
+        constraints=[],
+    )
 
 
 def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArray:
-    """The values from which on each of M cars, shape (M, n), is safe, up to the study's own value or, if it is unsafe
-    there, up to the first safe value above; shape (M,). The first car is the new one.
+    """The values from which on each of M cars, shape (M, n), is safe, up to the study's own value
+    or, if it is unsafe there, up to the first safe value above; shape (M,). The first car is the
+    new one.
 
-    It is the domain's lower end if a car is safe from there on, and infinite if no value from the study's own on is.
+    It is the domain's lower end if a car is safe from there on, and infinite if no value from the
+    study's own on is.
     """
     rows = np.arange(len(cars))
     size = STEPS + 1
-    values = np.tile(np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original]), (len(cars), 1))
+    values = np.tile(
+        np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original]), (len(cars), 1)
+    )
     own = int(np.searchsorted(values[0], domain.original))
     is_never_safe = np.zeros(len(cars), dtype=bool)
     for _ in range(ROUNDS):

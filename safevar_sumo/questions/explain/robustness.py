@@ -23,21 +23,31 @@ FAILURES_PER_BATCH = 8
 """Number of failures whose robustness is estimated at a time, the smallest failures first."""
 
 
-def draw_neighbours(characteristics: CharacteristicSet, settings: FloatArray, seed: int) -> FloatArray:
+def draw_neighbours(
+    characteristics: CharacteristicSet, settings: FloatArray, seed: int
+) -> FloatArray:
     """The neighbours of M settings, shape (M, n), those of one setting after those of another.
 
     A neighbour differs from its setting by at most the filter's threshold.
     """
     n = len(characteristics)
-    offsets = np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
-    return np.clip(settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper).reshape(-1, n)
+    offsets = (
+        np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
+    )
+    return np.clip(
+        settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper
+    ).reshape(-1, n)
 
 
 def robust_shares(
-    evaluator: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe, factors: Sequence[float] = STEP_FACTORS
+    evaluator: Evaluator,
+    settings: FloatArray,
+    step: float,
+    unsafe: Unsafe,
+    factors: Sequence[float] = STEP_FACTORS,
 ) -> FloatArray:
-    """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of `factors` times the
-    study's time step (`step` seconds); shape (M, factors).
+    """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of
+    `factors` times the study's time step (`step` seconds); shape (M, factors).
 
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
@@ -48,7 +58,8 @@ def robust_shares(
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
             is_unsafe, is_valid = (
-                flags.reshape(len(settings), NEIGHBOUR_COUNT) for flags in (unsafe.of(evaluations), evaluations.valid)
+                flags.reshape(len(settings), NEIGHBOUR_COUNT)
+                for flags in (unsafe.of(evaluations), evaluations.valid)
             )
             shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)
@@ -57,25 +68,30 @@ def robust_shares(
 def find_smallest_robust_failure(
     evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, max_evaluations: int
 ) -> int | None:
-    """The row of the robust failure with the fewest changes; of several, the one whose largest change is smallest.
+    """The row of the robust failure with the fewest changes; of several, the one whose largest
+    change is smallest.
 
-    A failure is robust by the mean over the time steps. Failures are tried in this order until one is robust, or about
-    `max_evaluations` settings are evaluated with each time step; None if no tried failure is robust.
+    A failure is robust by the mean over the time steps. Failures are tried in this order until one
+    is robust, or about `max_evaluations` settings are evaluated with each time step; None if no
+    tried failure is robust.
     """
     order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])[
         : max_evaluations // NEIGHBOUR_COUNT + 1
     ]
     for start in range(0, len(order), FAILURES_PER_BATCH):
         rows = order[start : start + FAILURES_PER_BATCH]
-        is_robust = robust_shares(evaluator, failures.settings[rows], step, unsafe).mean(axis=1) >= MIN_ROBUST_SHARE
+        is_robust = (
+            robust_shares(evaluator, failures.settings[rows], step, unsafe).mean(axis=1)
+            >= MIN_ROBUST_SHARE
+        )
         if is_robust.any():
             return int(rows[np.argmax(is_robust)])
     return None
 
 
 def robustness_in_words(share: float) -> str:
-    """How robust a failure is, by the share of its unsafe neighbours: `robust: 84 % of its neighbours are unsafe too`;
-    empty if unknown.
+    """How robust a failure is, by the share of its unsafe neighbours: `robust: 84 % of its
+    neighbours are unsafe too`; empty if unknown.
     """
     if np.isnan(share):
         return ""

@@ -10,11 +10,25 @@ import pandas as pd
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.across_fits import Ranges
-from safevar_sumo.questions.explain.causes import Cause, count_distinct_causes, find_limits, settings_of
-from safevar_sumo.questions.explain.failures import Population, Reasons, compare_at_cells, compare_at_points
+from safevar_sumo.questions.explain.causes import (
+    Cause,
+    count_distinct_causes,
+    find_limits,
+    settings_of,
+)
+from safevar_sumo.questions.explain.failures import (
+    Population,
+    Reasons,
+    compare_at_cells,
+    compare_at_points,
+)
 from safevar_sumo.questions.explain.moved import COLUMNS as MOVED_COLUMNS, find_moved_borders
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
-from safevar_sumo.questions.preventability import COLUMNS as DRIVER_COLUMNS, avoided_by, judge_collisions
+from safevar_sumo.questions.preventability import (
+    COLUMNS as DRIVER_COLUMNS,
+    avoided_by,
+    judge_collisions,
+)
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray
@@ -24,19 +38,33 @@ MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
 CAUSE_COLUMNS: Columns = {
     "solution": "handle of the failure",
-    "changes": Column("", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False),
+    "changes": Column(
+        "", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False
+    ),
     "encounter": Column("", "the encounter, in which the original vehicle is safe", ".5g"),
-    "boundary": Column("", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"),
-    "single_boundary": Column("", "of each, the value if this change alone is scaled back", ".5g", is_shown=False),
-    "fraction": Column("-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False),
+    "boundary": Column(
+        "", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"
+    ),
+    "single_boundary": Column(
+        "", "of each, the value if this change alone is scaled back", ".5g", is_shown=False
+    ),
+    "fraction": Column(
+        "-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False
+    ),
     "end": Column("", "what lies just below the boundary", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
     "elsewhere": "whether these changes are unsafe in the original encounter, too",
     "outcome": Column("", "outcome with these changes only", is_shown=False),
-    "safety_degree": Column("m", "safety degree with these changes only; -m/s on a collision", is_shown=False),
-    "robust_share": Column("-", "share of the neighbours of these changes that are unsafe, too", ".2f"),
+    "safety_degree": Column(
+        "m", "safety degree with these changes only; -m/s on a collision", is_shown=False
+    ),
+    "robust_share": Column(
+        "-", "share of the neighbours of these changes that are unsafe, too", ".2f"
+    ),
     "fits_holding": "number of fitted vehicle models in which these changes are a cause, too",
-    "avoided_by": Column("", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False),
+    "avoided_by": Column(
+        "", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False
+    ),
 }
 OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns of a study that searches its scenario."""
@@ -46,19 +74,32 @@ SOLUTION_COLUMNS: Columns = {
     "outcome": Column("", "outcome", is_shown=False),
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
     "changed": "number of changes",
-    "largest_change": Column("-", "largest change, as a share of the original value", is_shown=False),
+    "largest_change": Column(
+        "-", "largest change, as a share of the original value", is_shown=False
+    ),
     "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
-    "ends": Column("", "how the original vehicle and this one end, where this one is worst", is_shown=False),
-    "points": Column("", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False),
-    "avoided_by": "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable",
+    "ends": Column(
+        "", "how the original vehicle and this one end, where this one is worst", is_shown=False
+    ),
+    "points": Column(
+        "", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False
+    ),
+    "avoided_by": (
+        "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable"
+    ),
 }
 CHARACTERISTIC_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
     "changed": Column("-", "share of the failures that change it", ".2f"),
-    **with_interval("needed", Column("-", "share of the failures of which every minimal cause contains it", ".2f")),
+    **with_interval(
+        "needed",
+        Column("-", "share of the failures of which every minimal cause contains it", ".2f"),
+    ),
     "in_some": Column("-", "share of the failures of which some minimal cause contains it", ".2f"),
 }
-"""The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else the share itself."""
+"""The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else
+the share itself.
+"""
 DISTINCT_COLUMNS: Columns = {
     "cause": "a minimal cause, without the sizes of its changes",
     "failures": "failures with this cause",
@@ -89,7 +130,9 @@ def solutions_frame(population: Population, evaluator: Evaluator, reasons: Reaso
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "robust_share": robust_shares(evaluator, settings, assemble(study).step, unsafe, factors).mean(axis=1),
+        "robust_share": (
+            robust_shares(evaluator, settings, assemble(study).step, unsafe, factors).mean(axis=1)
+        ),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
         "avoided_by": [avoided_by(next(judged)) if flag else None for flag in is_judged],
@@ -104,7 +147,9 @@ def causes_table(
     solutions: pd.DataFrame,
     causes_of: Sequence[Sequence[Cause]],
 ) -> pd.DataFrame:
-    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust one first."""
+    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust
+    one first.
+    """
     study = evaluator.study
     unsafe = population.unsafe
     causes = [cause for group in causes_of for cause in group]
@@ -160,11 +205,15 @@ def statistics_tables(
 
 def moved_table(evaluator: Evaluator, causes_of: Sequence[Sequence[Cause]]) -> pd.DataFrame:
     causes = [] if is_rated(evaluator.study) else [cause for group in causes_of for cause in group]
-    title = "Avoidable in a new car, no longer in this one: a competent driver, any braking of a leader"
+    title = (
+        "Avoidable in a new car, no longer in this one: a competent driver, any braking of a leader"
+    )
     return tabulate(title, MOVED_COLUMNS, find_moved_borders(evaluator, causes))
 
 
 def distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
     distinct = count_distinct_causes(evaluator.characteristics, causes)
     rows = distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT)
-    return tabulate(f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows)
+    return tabulate(
+        f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows
+    )

@@ -1,8 +1,10 @@
-"""Which smallest change of the driving system survives the wear that the user promises, and what does it cost?
+"""Which smallest change of the driving system survives the wear that the user promises, and what
+does it cost?
 
-The first counterexamples are corners and Sobol points of the promise, without vehicles that no driving system survives.
-The smallest changes that survive them (`smallest`) are attacked and proved (`attack`); what breaks one is a new
-counterexample (`survivors`). Today's driving system is the change of no parameter.
+The first counterexamples are corners and Sobol points of the promise, without vehicles that no
+driving system survives. The smallest changes that survive them (`smallest`) are attacked and proved
+(`attack`); what breaks one is a new counterexample (`survivors`). Today's driving system is the
+change of no parameter.
 """
 
 from __future__ import annotations
@@ -44,20 +46,32 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 SOBOL_VEHICLES = 256
-"""Sobol points of the promise among the first counterexamples, and corners: the same points rounded."""
+"""Sobol points of the promise among the first counterexamples, and corners: the same points
+rounded.
+"""
 CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
 SHOWN_LIMITS = 3
 """Number of limits of full braking that the verdict names."""
 REPAIRS = {
-    "parameters": Column("", "the parameters that change, with their new values", ".10g", is_shown=False),
+    "parameters": Column(
+        "", "the parameters that change, with their new values", ".10g", is_shown=False
+    ),
     "change": Column("", "what changes, in words"),
     "changed": Column("-", "number of parameters that change", is_shown=False),
-    "fits": Column("-", "number of fits of the vehicle with which it was attacked and holds", is_shown=False),
+    "fits": Column(
+        "-", "number of fits of the vehicle with which it was attacked and holds", is_shown=False
+    ),
     "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
-    "metres_earlier": Column("m", "how much earlier a new vehicle brakes, at most over all points", ".2f"),
-    "metres_earlier_mean": Column("m", "how much earlier it brakes on average over all points", ".2f", is_shown=False),
-    "seconds_earlier": Column("s", "how much earlier it brakes where that is most metres", ".2f", is_shown=False),
+    "metres_earlier": Column(
+        "m", "how much earlier a new vehicle brakes, at most over all points", ".2f"
+    ),
+    "metres_earlier_mean": Column(
+        "m", "how much earlier it brakes on average over all points", ".2f", is_shown=False
+    ),
+    "seconds_earlier": Column(
+        "s", "how much earlier it brakes where that is most metres", ".2f", is_shown=False
+    ),
     "most_at": Column("", "the point where that is", is_shown=False),
     "largest_deceleration": Column("m/s^2", "its largest deceleration", ".1f"),
     "needless_braking": Column("-", "number of benign scenes in which it brakes"),
@@ -65,13 +79,24 @@ REPAIRS = {
     "benign_scenes": Column("-", "number of scenes in which nobody needs to brake"),
     "proof_samples": Column("-", "number of worn vehicles drawn after the parameters were chosen"),
     "proof_failures": Column("-", "number of them that are unsafe"),
-    "at_most": Column("-", f"share of unsafe vehicles at most, with {100 * CONFIDENCE:g} % confidence", ".2g"),
+    "at_most": Column(
+        "-", f"share of unsafe vehicles at most, with {100 * CONFIDENCE:g} % confidence", ".2g"
+    ),
 }
 
 
 @question
 @contents(
-    *("unsafe", "margin", "promise", "worst_today", "kept_today", "repairs", "not_repairable", "simulations"),
+    *(
+        "unsafe",
+        "margin",
+        "promise",
+        "worst_today",
+        "kept_today",
+        "repairs",
+        "not_repairable",
+        "simulations",
+    ),
     *("fits", "fits_tried"),
     repairs=REPAIRS,
 )
@@ -93,26 +118,34 @@ def repair(
     Parameters
     ----------
     promise
-        Wear that is promised, such as "treadDepth >= 3"; may be repeated. Characteristics that no promise names stay as
-        in the original; "all" promises the whole domain. By default the study's [repair.promise], else its [limits].
+        Wear that is promised, such as "treadDepth >= 3"; may be repeated. Characteristics that no
+        promise names stay as in the original; "all" promises the whole domain. By default the
+        study's [repair.promise], else its [limits].
     margin
-        Distance to keep from a collision [m], between bumpers; by default the model's error that the study states, else
-        0.3 m.
+        Distance to keep from a collision [m], between bumpers; by default the model's error that
+        the study states, else 0.3 m.
     unsafe
-        What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac > 6".
+        What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac >
+        6".
     change
-        Parameter of the driving system that may change; may be repeated. By default those under [repair], else those
-        that come with a shipped driving system.
+        Parameter of the driving system that may change; may be repeated. By default those under
+        [repair], else those that come with a shipped driving system.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) in which a repair holds:
-        the margin with the study's own, no collision with any other; by default all, 0 for the study's own alone.
+        Number of vehicle models that fit the published data about as well (sets of [spread]) in
+        which a repair holds: the margin with the study's own, no collision with any other; by
+        default all, 0 for the study's own alone.
     out
         Study file to write with the first repair; it extends the study.
     """
     study = evaluator.study
     if is_rated(study):
-        text = f"{study.name!r} is rated, and its repair would take a whole test matrix for every vehicle and change"
-        raise InputError(study.source, text, "the study without the rating, such as wear for euro_ncap_rating")
+        text = (
+            f"{study.name!r} is rated, and its repair would take a whole test matrix for every"
+            " vehicle and change"
+        )
+        raise InputError(
+            study.source, text, "the study without the rating, such as wear for euro_ncap_rating"
+        )
     if out is not None:
         _check_file(Path(out), study)
     criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
@@ -125,7 +158,11 @@ def repair(
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
-            evaluator=model.evaluator, promise=promised, parameters=parameters, unsafe=model.unsafe, fit=model.fit
+            evaluator=model.evaluator,
+            promise=promised,
+            parameters=parameters,
+            unsafe=model.unsafe,
+            fit=model.fit,
         )
         for model in models.members
     ]
@@ -134,7 +171,9 @@ def repair(
     if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
         text = f"{study.name!r}: the new vehicle {kept} in no encounter that was tried"
-        raise InputError(study.source, text, "a smaller --margin, or other domains under [scenario.search]")
+        raise InputError(
+            study.source, text, "a smaller --margin, or other domains under [scenario.search]"
+        )
     left = problem.lefts_with(problem.today, first, "the driving system of today")
     worst_first = np.argsort(left, kind="stable")
     vehicles = first[worst_first]
@@ -155,11 +194,17 @@ def repair(
 
 
 def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray:
-    """The new vehicle, corners and Sobol points of the promise, and failures of results in it; shape (L, n)."""
+    """The new vehicle, corners and Sobol points of the promise, and failures of results in it;
+    shape (L, n).
+    """
     promise = problem.promise
     seed = problem.study.search.seed
     points = sobol_points(SOBOL_VEHICLES, len(promise.lower), seed)
-    settings = [promise.region.characteristics.original[np.newaxis], promise.at(np.round(points)), promise.at(points)]
+    settings = [
+        promise.region.characteristics.original[np.newaxis],
+        promise.at(np.round(points)),
+        promise.at(points),
+    ]
     if not isinstance(subject, Study):
         failures = subject.solutions[problem.unsafe.rows(subject.solutions)]
         settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
@@ -168,8 +213,9 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
-    """What no driving system can survive: the minimal causes of failures of full braking, shrunk to the limit; for each
-    characteristic of a cause the value from which on even full braking at once fails.
+    """What no driving system can survive: the minimal causes of failures of full braking, shrunk to
+    the limit; for each characteristic of a cause the value from which on even full braking at once
+    fails.
     """
     if not len(failures) or problem.best_driver is None:
         return []
@@ -192,17 +238,20 @@ def _answer_of(
     worst_today: Evaluations,
     not_repairable: list[dict[str, float]],
 ) -> Answer:
-    """The answer from the changes that survive, each with its proof: today's parameters alone if they do.
+    """The answer from the changes that survive, each with its proof: today's parameters alone if
+    they do.
 
-    `worst_today` is how the driving system of today ends with the worst vehicle of the promise that was tried and that
-    a driving system can keep safe.
+    `worst_today` is how the driving system of today ends with the worst vehicle of the promise that
+    was tried and that a driving system can keep safe.
     """
     unsafe = problem.unsafe
     worst = float(worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0])
     kept_today = any(not problem.changed_values(change) for change, _ in survivors.changes)
     repairs = []
     if not kept_today:
-        repairs = [_row(problem, change, proof, survivors.fits) for change, proof in survivors.changes]
+        repairs = [
+            _row(problem, change, proof, survivors.fits) for change, proof in survivors.changes
+        ]
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "unsafe": str(unsafe),
@@ -223,8 +272,8 @@ def _answer_of(
         degree = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
         ending = unsafe.value_in_words(worst) if unsafe.bound else degree
         verdict = (
-            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried {ending}, and "
-            f"{_proof_in_words(survivors)}."
+            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried"
+            f" {ending}, and {_proof_in_words(survivors)}."
         )
     elif repairs:
         verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors)}."
@@ -237,8 +286,13 @@ def _answer_of(
         parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
         more = len(fewest) - SHOWN_LIMITS
         others = f" (or {more} more, not_repairable)" if more > 0 else ""
-        verdict += f" No driving system survives {parts}{others}: that needs another part, not a parameter."
-    return Answer(question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables)
+        verdict += (
+            f" No driving system survives {parts}{others}: that needs another part, not a"
+            " parameter."
+        )
+    return Answer(
+        question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables
+    )
 
 
 def _fits_in_words(models: Models, survivors: Survivors) -> str:
@@ -246,9 +300,18 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
     count = len(models.members)
     if count == 1 or not survivors.changes:
         return ""
-    broken = f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
-    left_out = f"; left out: {fit_names(models.left_out)}, where the original is unsafe" if models.left_out else ""
-    return f" It holds in {survivors.fits} of {count} fits of the vehicle, attacked with each{broken}{left_out}."
+    broken = (
+        f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
+    )
+    left_out = (
+        f"; left out: {fit_names(models.left_out)}, where the original is unsafe"
+        if models.left_out
+        else ""
+    )
+    return (
+        f" It holds in {survivors.fits} of {count} fits of the vehicle, attacked with"
+        f" each{broken}{left_out}."
+    )
 
 
 def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) -> JsonObject:
@@ -283,7 +346,10 @@ def _repair_in_words(repair: JsonObject, wear: str) -> str:
             f"in {repair['needless_braking']} of {repair['benign_scenes']} benign scenes "
             f"({repair['needless_braking_today']} today)"
         )
-    return f"{number} this wear {wear}: {repair['change']}. A new vehicle {earlier} and needlessly {needless}"
+    return (
+        f"{number} this wear {wear}: {repair['change']}. A new vehicle {earlier} and needlessly"
+        f" {needless}"
+    )
 
 
 def _proof_in_words(survivors: Survivors) -> str:
@@ -296,7 +362,9 @@ def _proof_in_words(survivors: Survivors) -> str:
 
 
 def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
-    """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its encounter."""
+    """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its
+    encounter.
+    """
     characteristics = problem.promise.region.characteristics
     limits = list[str]()
     for member in characteristics.vehicle:
@@ -304,19 +372,23 @@ def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
             value = part[member.name]
             side = "below" if value < member.original else "above"
             limits.append(f"{member.name} {side} {member.text(value)}{member.suffix}")
-    return (" with ".join(limits) or "even the original") + encounter_in_words(characteristics, part)
+    return (" with ".join(limits) or "even the original") + encounter_in_words(
+        characteristics, part
+    )
 
 
 def _check_file(path: Path, study: Study) -> None:
-    """Refuse a file that is no study file, cannot be written, or is one of the study's own, before the work begins."""
+    """Refuse a file that is no study file, cannot be written, or is one of the study's own, before
+    the work begins.
+    """
     if path.suffix != ".toml" or (path.exists() and any(map(path.samefile, study.origin.files))):
         raise InputError("out", str(path), "a file that ends in .toml, and is not the study's own")
     check_writable(path, "out")
 
 
 def write_repair(path: Path, answer: Answer) -> None:
-    """Write a study file with the first repair. It extends the study's file; without a file, it is the whole repaired
-    study.
+    """Write a study file with the first repair. It extends the study's file; without a file, it is
+    the whole repaired study.
 
     Raises
     ------
@@ -325,7 +397,9 @@ def write_repair(path: Path, answer: Answer) -> None:
     """
     study = answer.study
     values = answer.table("repairs")["parameters"][0]
-    comment = answer.verdict + (f" Only {study.origin.point} was simulated." if study.origin.point else "")
+    comment = answer.verdict + (
+        f" Only {study.origin.point} was simulated." if study.origin.point else ""
+    )
     if not study.origin.called and study.name not in study_names():
         write_study(path, with_parameters(study, values), comment)
         return

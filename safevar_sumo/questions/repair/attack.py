@@ -19,14 +19,20 @@ KNOWN = 256
 """Number of the worst known settings with which an attack begins; with each other fit an eighth."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
-SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = "search of a change", "attack on the change", "proof on fresh wear"
+SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = (
+    "search of a change",
+    "attack on the change",
+    "proof on fresh wear",
+)
 Failures = dict[int, FloatArray]
 """Failures by the number of the problem, of one fit, in which they are, shape (M, n)."""
 
 
-def find_failures(problems: Sequence[RepairProblem], change: FloatArray, known: FloatArray, number: int) -> Failures:
-    """Attack a change in all fits: promised settings that it does not keep safe, and a driving system could; `number`
-    counts the attacks, for their random numbers.
+def find_failures(
+    problems: Sequence[RepairProblem], change: FloatArray, known: FloatArray, number: int
+) -> Failures:
+    """Attack a change in all fits: promised settings that it does not keep safe, and a driving
+    system could; `number` counts the attacks, for their random numbers.
     """
     own = problems[0]
     # These numbers are of no `Stream`: repairs depend on them.
@@ -37,17 +43,19 @@ def find_failures(problems: Sequence[RepairProblem], change: FloatArray, known: 
         found = attack(own.promise, judges, starts, BUDGET, rng)
     is_unsafe = found.left < 0
     numbers = np.unique(found.judges[is_unsafe]).tolist()
-    return {row: np.unique(found.settings[is_unsafe & (found.judges == row)], axis=0) for row in numbers}
+    return {
+        row: np.unique(found.settings[is_unsafe & (found.judges == row)], axis=0) for row in numbers
+    }
 
 
 def prove_change(
     problems: Sequence[RepairProblem], change: FloatArray, number: int, attempt: int
 ) -> tuple[Proof, Failures]:
-    """Draw fresh wear for a change: its proof with the study's own fit, and the unsafe settings; only without them the
-    change is proved.
+    """Draw fresh wear for a change: its proof with the study's own fit, and the unsafe settings;
+    only without them the change is proved.
 
-    As many settings again each meet one of the other fits, at random. `number` counts the attacks, for the random
-    numbers, and `attempt` the proofs that failed before.
+    As many settings again each meet one of the other fits, at random. `number` counts the attacks,
+    for the random numbers, and `attempt` the proofs that failed before.
     """
     own = problems[0]
     seed = problems[0].study.search.seed

@@ -1,4 +1,6 @@
-"""Which vehicles full braking at the first possible moment keeps safe: of many points, the hardest are asked first."""
+"""Which vehicles full braking at the first possible moment keeps safe: of many points, the hardest
+are asked first.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,8 @@ from safevar_sumo.sumo.system import assemble
 HARDEST = (2, 8)
 """Numbers of the hardest points that are asked first, and then; all others follow."""
 LEAST_SETTINGS = 128
-"""Number of settings from which on the points are asked one after another: fewer cost no more than the steps of a
-simulation.
+"""Number of settings from which on the points are asked one after another: fewer cost no more than
+the steps of a simulation.
 """
 STAGE = "full braking"
 
@@ -22,7 +24,8 @@ STAGE = "full braking"
 class FullBraking:
     """Full braking at the first possible moment, which must not be unsafe at any point.
 
-    Who is not safe at one point need not drive at the others; so those points come first at which most others were not.
+    Who is not safe at one point need not drive at the others; so those points come first at which
+    most others were not.
     """
 
     def __init__(self, evaluator: Evaluator, unsafe: Unsafe) -> None:
@@ -48,5 +51,7 @@ class FullBraking:
 
 
 def lefts_of(evaluations: Evaluations, unsafe: Unsafe) -> FloatArray:
-    """What evaluations leave to a limit, shape (M,): infinite without a conflict, minus infinity if invalid."""
+    """What evaluations leave to a limit, shape (M,): infinite without a conflict, minus infinity if
+    invalid.
+    """
     return np.where(evaluations.valid, unsafe.left(evaluations), -np.inf)

@@ -1,4 +1,6 @@
-"""The price of a repair on a new vehicle: how much earlier it brakes, how hard, and how often needlessly."""
+"""The price of a repair on a new vehicle: how much earlier it brakes, how hard, and how often
+needlessly.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,15 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
 NEEDLESS_BRAKE = 0.1
-"""Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the speed."""
+"""Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the
+speed.
+"""
 
 
 def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) -> JsonObject:
-    """The price of other values of parameters against today's, by the names of the answer's columns; None where the new
-    vehicle brakes nowhere. `encounters` are new vehicles in K encounters, shape (K, n).
+    """The price of other values of parameters against today's, by the names of the answer's
+    columns; None where the new vehicle brakes nowhere. `encounters` are new vehicles in K
+    encounters, shape (K, n).
     """
     today = assemble(study)
     changed = assemble(with_parameters(study, values))
@@ -50,26 +55,31 @@ def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) 
 
 
 def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:
-    """Where and when the new vehicle begins to brake at each of N points in each of K encounters, shape (2, N K), NaN
-    if it does not [m, s]; its largest deceleration [m/s^2].
+    """Where and when the new vehicle begins to brake at each of N points in each of K encounters,
+    shape (2, N K), NaN if it does not [m, s]; its largest deceleration [m/s^2].
     """
     onsets = list[tuple[float, float]]()
     deceleration = 0.0
     for result, row in product(simulate_all_points(system, encounters), range(len(encounters))):
         trace = result.runs.trace
         step = brake_onset(result.runs, row)
-        onsets.append((np.nan, np.nan) if step is None else (trace.position[step, row], trace.time[step]))
+        onsets.append(
+            (np.nan, np.nan) if step is None else (trace.position[step, row], trace.time[step])
+        )
         speed = trace.speed[trace.active[:, row], row]
         deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
     return np.transpose(onsets), deceleration
 
 
 def benign_scenes(study: Study, system: System) -> list[Point]:
-    """The benign scenes that a study names, else those that its scenarios know, in the original encounter and with all
-    searched parameters of the scenario at their lower or upper ends; there may be none.
+    """The benign scenes that a study names, else those that its scenarios know, in the original
+    encounter and with all searched parameters of the scenario at their lower or upper ends; there
+    may be none.
     """
     if study.repair.benign:
-        return list(assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix)
+        return list(
+            assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix
+        )
     searched = system.characteristics.scenario
     ends = [
         dict(zip(searched.names, end.tolist(), strict=True))
@@ -85,15 +95,27 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
 
 
 def needless_braking(system: System, benign: list[Point]) -> list[bool]:
-    """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road without anybody."""
+    """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road
+    without anybody.
+    """
     one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
     vehicle = system.characteristics.vehicle
     return [
-        bool((np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE).any())
+        bool(
+            (
+                np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE
+            ).any()
+        )
         for points, sees_nobody in ((benign, False), (one_per_speed, True))
         if points
         for result in simulate_all_points(
-            replace(system, matrix=tuple(points), rater=None, sees_nobody=sees_nobody, characteristics=vehicle),
+            replace(
+                system,
+                matrix=tuple(points),
+                rater=None,
+                sees_nobody=sees_nobody,
+                characteristics=vehicle,
+            ),
             vehicle.original[np.newaxis],
         )
     ]

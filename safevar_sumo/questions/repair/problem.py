@@ -30,8 +30,8 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import FeasibleRegion
 
 DIGITS = 4
-"""Significant digits of a parameter's changed value, more where its range is small beside it: the value that is printed
-is the one that has been tried.
+"""Significant digits of a parameter's changed value, more where its range is small beside it: the
+value that is printed is the one that has been tried.
 """
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
@@ -49,7 +49,9 @@ class Parameter(NamedTuple):
     today: float
 
     def share(self, value: float) -> float:
-        """Where a value lies in the range, in [0, 1]; of the logarithm if the parameter is logarithmic."""
+        """Where a value lies in the range, in [0, 1]; of the logarithm if the parameter is
+        logarithmic.
+        """
         ends = np.array([self.range.lower, self.range.upper, value])
         lower, upper, place = (np.log(ends) if self.range.log else ends).tolist()
         return float((place - lower) / (upper - lower))
@@ -59,14 +61,22 @@ class Parameter(NamedTuple):
         lower = self.range.lower
         upper = self.range.upper
         digits = DIGITS + max(0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower))))
-        exact = lower * (upper / lower) ** shares if self.range.log else lower + shares * (upper - lower)
+        exact = (
+            lower * (upper / lower) ** shares
+            if self.range.log
+            else lower + shares * (upper - lower)
+        )
         distinct, row_of = np.unique(exact, return_inverse=True)
-        return np.clip([float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper)[row_of]
+        return np.clip([float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper)[
+            row_of
+        ]
 
 
 @dataclass(frozen=True)
 class Promise(Box):
-    """The promised wear: a box in which parameters of the scenario that the study searches take their whole domain."""
+    """The promised wear: a box in which parameters of the scenario that the study searches take
+    their whole domain.
+    """
 
     @classmethod
     def of(cls, study: Study, region: FeasibleRegion, texts: Sequence[str]) -> Promise:
@@ -75,7 +85,8 @@ class Promise(Box):
         Raises
         ------
         InputError
-            If a promise cannot be read, names no characteristic, lies outside its domain, or lets nothing wear.
+            If a promise cannot be read, names no characteristic, lies outside its domain, or lets
+            nothing wear.
         """
         rows = study.domains
         stated = study.repair.promise
@@ -88,19 +99,28 @@ class Promise(Box):
         with about("promise"):
             limits = limits_of(texts, rows, None if texts else of_study)
         if not limits:
-            raise InputError("promise", "nothing is promised", f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}')
+            raise InputError(
+                "promise",
+                "nothing is promised",
+                f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}',
+            )
         lower, upper = (
-            np.where(everything.of_vehicle, everything.original, ends) for ends in (everything.lower, everything.upper)
+            np.where(everything.of_vehicle, everything.original, ends)
+            for ends in (everything.lower, everything.upper)
         )
         for name, limit in limits.items():
             column = everything.names.index(name)
             lower[column], upper[column] = limit.interval(rows[name])
         if (lower == upper)[everything.of_vehicle].all():
-            raise InputError("promise", "promises a new vehicle only", "a limit short of the original's value")
+            raise InputError(
+                "promise", "promises a new vehicle only", "a limit short of the original's value"
+            )
         return cls(region, lower, upper)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """The ends of every characteristic that may wear, and of every parameter of the scenario that varies."""
+        """The ends of every characteristic that may wear, and of every parameter of the scenario
+        that varies.
+        """
         names = self.region.characteristics.names
         ends = np.transpose([self.lower, self.upper]).tolist()
         return {name: pair for name, pair in zip(names, ends, strict=True) if pair[0] < pair[1]}
@@ -110,7 +130,10 @@ class Promise(Box):
         """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, and the encounters."""
         ends = self.to_dict()
         characteristics = self.region.characteristics
-        whole_domain = all(ends.get(member.name) == [member.lower, member.upper] for member in characteristics.vehicle)
+        whole_domain = all(
+            ends.get(member.name) == [member.lower, member.upper]
+            for member in characteristics.vehicle
+        )
         worn = ", ".join(
             f"{member.name} {sign} {end:.5g}{member.suffix}"
             for member in characteristics.vehicle
@@ -124,12 +147,17 @@ class Promise(Box):
             for member in characteristics.scenario
             if member.name in ends
         ]
-        where = f", in the encounters with {join_phrases(encounters)} that a new vehicle survives" if encounters else ""
+        where = (
+            f", in the encounters with {join_phrases(encounters)} that a new vehicle survives"
+            if encounters
+            else ""
+        )
         return worn + where
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
-    """The parameters that may change: those called `names`, or all under [repair], or those of a shipped ADS.
+    """The parameters that may change: those called `names`, or all under [repair], or those of a
+    shipped ADS.
 
     Raises
     ------
@@ -141,10 +169,19 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     table = study.repair.parameters or shipped
     if not table:
         problem = f"ads.model = {study.ads.model!r}: no parameter may change"
-        raise InputError(source, problem, "parameters under [repair], such as gain = { lower, upper, unit, meaning }")
+        raise InputError(
+            source,
+            problem,
+            "parameters under [repair], such as gain = { lower, upper, unit, meaning }",
+        )
     for name in names:
         if name not in table:
-            raise unknown_name("change", f"{study.ads.model} has no parameter {name!r} that may change", name, table)
+            raise unknown_name(
+                "change",
+                f"{study.ads.model} has no parameter {name!r} that may change",
+                name,
+                table,
+            )
     ads = assemble(study).ads
     parameters = []
     for name in (name for name in table if name in (names or table)):
@@ -153,9 +190,18 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
         number = float(today) if isinstance(today, int | float) else math.nan
         if table is shipped:
             row = replace_in(row, lower=min(row.lower, number), upper=max(row.upper, number))
-        if not row.lower <= number <= row.upper or row.lower == row.upper or (row.log and row.lower <= 0):
-            problem = f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g}, ads.parameters.{name} = {today!r}"
-            legal = f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
+        if (
+            not row.lower <= number <= row.upper
+            or row.lower == row.upper
+            or (row.log and row.lower <= 0)
+        ):
+            problem = (
+                f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g},"
+                f" ads.parameters.{name} = {today!r}"
+            )
+            legal = (
+                f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
+            )
             raise InputError(source, problem, legal)
         parameters.append(Parameter(name, row, number))
     return parameters
@@ -163,8 +209,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
-    """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with one `fit` of the
-    vehicle.
+    """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with
+    one `fit` of the vehicle.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """
@@ -185,7 +231,9 @@ class RepairProblem:
         return np.array([parameter.share(parameter.today) for parameter in self.parameters])
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The parameters' values in their units, shape (M, P): today's value where a share is today's."""
+        """The parameters' values in their units, shape (M, P): today's value where a share is
+        today's.
+        """
         columns = [
             np.where(column == today, parameter.today, parameter.values(column))
             for parameter, column, today in zip(self.parameters, shares.T, self.today, strict=True)
@@ -200,8 +248,9 @@ class RepairProblem:
 
     @cached_property
     def arrays(self) -> bool:
-        """Whether one ADS drives vehicles with different parameters: a shipped one, or the user's class if a sample has
-        the same results to the bit; otherwise there is an instance for each set.
+        """Whether one ADS drives vehicles with different parameters: a shipped one, or the user's
+        class if a sample has the same results to the bit; otherwise there is an instance for each
+        set.
         """
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
@@ -209,28 +258,44 @@ class RepairProblem:
         settings = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1))
         try:
             alone, together = (
-                self._evaluate(values, settings, "is it one driving system?", arrays=arrays) for arrays in (False, True)
+                self._evaluate(values, settings, "is it one driving system?", arrays=arrays)
+                for arrays in (False, True)
             )
         except UserCodeError:
             return False
         return not any(differences(alone.results, together.results))
 
     def _evaluate(
-        self, values: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = (), *, arrays: bool
+        self,
+        values: FloatArray,
+        settings: FloatArray,
+        stage: str,
+        points: Sequence[int] = (),
+        *,
+        arrays: bool,
     ) -> Evaluations:
-        """Evaluate each set of values with the setting of its row, at the worst of `points`, or of all without any."""
-        selection = Selection(tuple(parameter.name for parameter in self.parameters), tuple(points), arrays)
+        """Evaluate each set of values with the setting of its row, at the worst of `points`, or of
+        all without any.
+        """
+        selection = Selection(
+            tuple(parameter.name for parameter in self.parameters), tuple(points), arrays
+        )
         return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
 
     def lefts(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
     ) -> tuple[FloatArray, npt.NDArray[np.intp] | None]:
-        """What each of M sets of parameters leaves to the limit with each of L settings, shape (M, L), and the worst
-        points of these M L rows; None without a matrix.
+        """What each of M sets of parameters leaves to the limit with each of L settings, shape (M,
+        L), and the worst points of these M L rows; None without a matrix.
         """
         values = self.values(np.repeat(shares, len(settings), axis=0))
-        evaluations = self._evaluate(values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays)
-        return lefts_of(evaluations, self.unsafe).reshape(len(shares), len(settings)), evaluations.worst_points
+        evaluations = self._evaluate(
+            values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays
+        )
+        return (
+            lefts_of(evaluations, self.unsafe).reshape(len(shares), len(settings)),
+            evaluations.worst_points,
+        )
 
     def lefts_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """What one set of parameters leaves to the limit with each of L settings, shape (L,)."""
@@ -239,11 +304,13 @@ class RepairProblem:
     def worst_today(self, setting: FloatArray) -> Evaluations:
         """How the ADS of today ends with one setting, shape (n,)."""
         values = self.values(self.today[np.newaxis])
-        return self._evaluate(values, setting[np.newaxis], "the driving system of today", arrays=self.arrays)
+        return self._evaluate(
+            values, setting[np.newaxis], "the driving system of today", arrays=self.arrays
+        )
 
     def left(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
-        """What settings leave to the margin with one set of parameters, shape (L,); infinite where they do not hold, or
-        no driving system keeps them safe.
+        """What settings leave to the margin with one set of parameters, shape (L,); infinite where
+        they do not hold, or no driving system keeps them safe.
         """
         left = np.full(len(settings), np.inf)
         rows = np.flatnonzero(self.holds(settings))
@@ -253,8 +320,8 @@ class RepairProblem:
         return left
 
     def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps a new vehicle safe;
-        without a search of the scenario, all promised ones count.
+        """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps
+        a new vehicle safe; without a search of the scenario, all promised ones count.
         """
         is_promised = self.promise.holds(settings)
         characteristics = self.promise.region.characteristics
@@ -264,7 +331,9 @@ class RepairProblem:
         return is_promised
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Settings that hold, drawn uniformly, shape (number, n); fewer if `DRAWS` times as many do not suffice."""
+        """Settings that hold, drawn uniformly, shape (number, n); fewer if `DRAWS` times as many do
+        not suffice.
+        """
         settings = np.zeros((0, len(self.promise.lower)))
         for _ in range(DRAWS):
             drawn = self.promise.draw(number, rng)
@@ -275,8 +344,8 @@ class RepairProblem:
 
     @cached_property
     def encounters(self) -> FloatArray:
-        """The new vehicle in the original encounter, and in those promised ones in which it is least safe of many drawn
-        ones, shape (K, n).
+        """The new vehicle in the original encounter, and in those promised ones in which it is
+        least safe of many drawn ones, shape (K, n).
         """
         original = self.promise.region.characteristics.original
         settings = self.evaluator.critical_encounters
@@ -284,8 +353,8 @@ class RepairProblem:
 
     @cached_property
     def best_driver(self) -> FullBraking | None:
-        """Full braking at the first possible moment; None where it has no approach (`approach_parameters`), and by a
-        bound of a measure, of which it need not be the best.
+        """Full braking at the first possible moment; None where it has no approach
+        (`approach_parameters`), and by a bound of a measure, of which it need not be the best.
         """
         approach = None if self.unsafe.bound else approach_parameters(assemble(self.study))
         if approach is None:
@@ -295,8 +364,8 @@ class RepairProblem:
         return FullBraking(self.evaluator.for_study(study, verified=0), self.unsafe)
 
     def repairable(self, settings: FloatArray) -> BoolArray:
-        """Which settings full braking at the first possible moment, or else the ADS of today, keeps safe; all without
-        that driver.
+        """Which settings full braking at the first possible moment, or else the ADS of today, keeps
+        safe; all without that driver.
         """
         if self.best_driver is None:
             return np.ones(len(settings), dtype=bool)

@@ -1,9 +1,9 @@
 """The smallest changes of one and of two parameters that survive all known counterexamples.
 
-A change is a set of parameters; its size is the largest change of one of them. Changes on rings around the parameters
-of today, the smallest first, are tried with single settings at single points. Only the smallest of those that survive
-is tried with all settings at all points. Either it fails with a setting, with which all changes are then tried, or it
-is the smallest change.
+A change is a set of parameters; its size is the largest change of one of them. Changes on rings
+around the parameters of today, the smallest first, are tried with single settings at single points.
+Only the smallest of those that survive is tried with all settings at all points. Either it fails
+with a setting, with which all changes are then tried, or it is the smallest change.
 """
 
 from __future__ import annotations
@@ -21,24 +21,26 @@ from safevar_sumo.records import FloatArray
 MOST_CHANGED = 2
 """Largest number of parameters that change together."""
 RINGS, SIDE = 32, 12
-"""Number of sizes that are tried, and again between the size that survives and the one below; of places on a side of a
-ring. It is even, so that both parameters change everywhere.
+"""Number of sizes that are tried, and again between the size that survives and the one below; of
+places on a side of a ring. It is even, so that both parameters change everywhere.
 """
 THINNING = 4
-"""Factor by which an ADS that needs an instance for each set of parameters has fewer rings and places on a side."""
+"""Factor by which an ADS that needs an instance for each set of parameters has fewer rings and
+places on a side.
+"""
 LEAST_GAIN = 0.006
 """By how much a change of two parameters has to be smaller than that of one."""
 CHUNK, BATCH = 2048, 2048
 """Number of changes that are tried at a time, the smallest first; of simulations in a batch."""
 FIRST_SETTINGS = 64
-"""Number of the worst settings with which a change is tried at all points first; then with four times as many, and so
-on.
+"""Number of the worst settings with which a change is tried at all points first; then with four
+times as many, and so on.
 """
 
 
 class Failure(NamedTuple):
-    """A setting, shape (n,), with which a change failed, the number of the problem, of one fit, and the point; none
-    without a matrix.
+    """A setting, shape (n,), with which a change failed, the number of the problem, of one fit, and
+    the point; none without a matrix.
     """
 
     setting: FloatArray
@@ -47,11 +49,11 @@ class Failure(NamedTuple):
 
 
 class Search:
-    """Searches the smallest changes that survive the settings of problems, one for each fit of the vehicle, shape
-    (L, n), worst first.
+    """Searches the smallest changes that survive the settings of problems, one for each fit of the
+    vehicle, shape (L, n), worst first.
 
-    Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a size at which there
-    was none, is a lower bound for ever.
+    Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a
+    size at which there was none, is a lower bound for ever.
     """
 
     def __init__(self, problems: Sequence[RepairProblem], settings: FloatArray) -> None:
@@ -74,8 +76,8 @@ class Search:
         self.settings_of[problem] = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
 
     def smallest_changes(self) -> list[FloatArray]:
-        """The parameters of today if they survive all counterexamples; otherwise the smallest change of one parameter
-        and that of two, if it is smaller.
+        """The parameters of today if they survive all counterexamples; otherwise the smallest
+        change of one parameter and that of two, if it is smaller.
         """
         today = self.problem.today
         if self._failure_of(today) is None:
@@ -113,11 +115,13 @@ class Search:
         return best
 
     def _rings(self, number: int, sizes: FloatArray) -> FloatArray:
-        """Changes of each subset of a number of parameters with these sizes; of equal ones first that with the smallest
-        sum.
+        """Changes of each subset of a number of parameters with these sizes; of equal ones first
+        that with the smallest sum.
         """
         today = self.problem.today
-        ring = np.array(list(product(np.linspace(-1.0, 1.0, SIDE // self._thinning), repeat=number)))
+        ring = np.array(
+            list(product(np.linspace(-1.0, 1.0, SIDE // self._thinning), repeat=number))
+        )
         ring = ring[np.max(np.abs(ring), axis=1) == 1]
         subsets = list(combinations(range(len(today)), number))
         moves = np.zeros((len(subsets) * len(ring), len(today)))
@@ -128,23 +132,31 @@ class Search:
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
     def _failure_of(self, change: FloatArray) -> Failure | None:
-        """The worst failure among the first settings with which a change fails; None if it survives all."""
+        """The worst failure among the first settings with which a change fails; None if it survives
+        all.
+        """
         for number, settings in self.settings_of.items():
             start = 0
             size = FIRST_SETTINGS
             while start < len(settings):
                 rows = settings[start : start + size]
                 problem = self.problems[number]
-                (left,), points = problem.lefts(change[np.newaxis], rows, "changes with all vehicles")
+                (left,), points = problem.lefts(
+                    change[np.newaxis], rows, "changes with all vehicles"
+                )
                 worst = int(np.argmin(left))
                 if left[worst] < 0:
-                    return Failure(rows[worst], number, () if points is None else (int(points[worst]),))
+                    return Failure(
+                        rows[worst], number, () if points is None else (int(points[worst]),)
+                    )
                 start = start + size
                 size = 4 * size
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
-        """The row of the first change, shape (M, P), that survives all settings; None if none does."""
+        """The row of the first change, shape (M, P), that survives all settings; None if none
+        does.
+        """
         for start in range(0, len(changes), CHUNK):
             rows = np.arange(start, min(start + CHUNK, len(changes)))
             rows = rows[self._survivors(changes[rows], self._failures)]
@@ -157,15 +169,23 @@ class Search:
         return None
 
     def _survivors(self, changes: FloatArray, failures: Sequence[Failure]) -> npt.NDArray[np.intp]:
-        """The rows of the changes that survive the settings of failures at their points; few at a time."""
+        """The rows of the changes that survive the settings of failures at their points; few at a
+        time.
+        """
         alive = np.arange(len(changes))
-        for number, points in dict.fromkeys((failure.problem, failure.points) for failure in failures):
-            same = [each.setting for each in failures if (each.problem, each.points) == (number, points)]
+        for number, points in dict.fromkeys(
+            (failure.problem, failure.points) for failure in failures
+        ):
+            same = [
+                each.setting for each in failures if (each.problem, each.points) == (number, points)
+            ]
             settings = np.array(same)
             problem = self.problems[number]
             while len(settings) and len(alive):
                 count = max(1, BATCH // len(alive))
-                left, _ = problem.lefts(changes[alive], settings[:count], "changes with one vehicle", points)
+                left, _ = problem.lefts(
+                    changes[alive], settings[:count], "changes with one vehicle", points
+                )
                 alive = alive[(left >= 0).all(axis=1)]
                 settings = settings[count:]
         return alive

@@ -1,4 +1,6 @@
-"""Search, attack and prove in turns: the smallest changes that survive everything, and in which fits of the vehicle."""
+"""Search, attack and prove in turns: the smallest changes that survive everything, and in which
+fits of the vehicle.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ class Survivors(NamedTuple):
 
 
 def find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
-    """The smallest changes that survive in all fits; where none does, those of the study's own fit, and the fits in
-    which an attack breaks one of them.
+    """The smallest changes that survive in all fits; where none does, those of the study's own fit,
+    and the fits in which an attack breaks one of them.
     """
     changes = _survivors_in(problems, vehicles)
     if changes or len(problems) == 1:
@@ -44,8 +46,12 @@ def find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> S
     return Survivors(changes, len(problems) - len(broken), broken)
 
 
-def _survivors_in(problems: Sequence[RepairProblem], vehicles: FloatArray) -> list[tuple[FloatArray, Proof]]:
-    """Search, attack and prove in turns until the smallest changes survive everything; none if no change does."""
+def _survivors_in(
+    problems: Sequence[RepairProblem], vehicles: FloatArray
+) -> list[tuple[FloatArray, Proof]]:
+    """Search, attack and prove in turns until the smallest changes survive everything; none if no
+    change does.
+    """
     search = Search(problems, vehicles)
     proofs = dict[bytes, Proof]()
     attacks = 0

@@ -14,10 +14,21 @@ import pandas as pd
 from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Jobs, Range, Share
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, load_cases, solutions_for_metric
+from safevar_sumo.questions.case import (
+    NSGA2,
+    Case,
+    UnanswerableError,
+    are_collisions,
+    load_cases,
+    solutions_for_metric,
+)
 from safevar_sumo.questions.research_questions import changes
 from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choices, titles_of
-from safevar_sumo.questions.research_questions.figures import draw_change_counts, draw_figures, save_figures
+from safevar_sumo.questions.research_questions.figures import (
+    draw_change_counts,
+    draw_figures,
+    save_figures,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     describe_evaluations,
@@ -25,7 +36,14 @@ from safevar_sumo.questions.research_questions.fronts import (
     few_evaluations,
 )
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
-from safevar_sumo.questions.research_questions.tables import CAUSES, CHOSEN, OVER_RUNS, POOLED, TABLES, WEATHER
+from safevar_sumo.questions.research_questions.tables import (
+    CAUSES,
+    CHOSEN,
+    OVER_RUNS,
+    POOLED,
+    TABLES,
+    WEATHER,
+)
 from safevar_sumo.questions.words import demanded_in_words, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
@@ -38,7 +56,13 @@ if TYPE_CHECKING:
 REMARKS: Columns = {"table": "table", "remark": "what is missing or left out there, and why"}
 
 
-@contents("cases", "solutions", "alpha", **{name: table.columns for name, table in TABLES.items()}, remarks=REMARKS)
+@contents(
+    "cases",
+    "solutions",
+    "alpha",
+    **{name: table.columns for name, table in TABLES.items()},
+    remarks=REMARKS,
+)
 def tables(
     *results: Results | str | Path,
     algorithm: str = "",
@@ -48,18 +72,22 @@ def tables(
     figures: Path | None = None,
     jobs: Jobs = None,
 ) -> Answer:
-    """Answer the research questions of the paper from results, one for each case, as tables and figures.
+    """Answer the research questions of the paper from results, one for each case, as tables and
+    figures.
 
-    Readers see RQ1 and RQ2 over runs, collisions and causes; JSON has every table, and `--table` prints any.
+    Readers see RQ1 and RQ2 over runs, collisions and causes; JSON has every table, and `--table`
+    prints any.
 
     Parameters
     ----------
     algorithm
-        The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the study's first.
+        The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the
+        study's first.
     alpha
         A p-value below it is significant, and intervals have the confidence 1 - alpha.
     causes
-        Simulate the minimal causes of up to this many unsafe solutions of each run, and compare their numbers.
+        Simulate the minimal causes of up to this many unsafe solutions of each run, and compare
+        their numbers.
     all
         Show every table.
     figures
@@ -71,7 +99,9 @@ def tables(
     if algorithm:
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
         check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
-    causes_of_cases = {case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs}
+    causes_of_cases = {
+        case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs
+    }
     answer = answer_questions(cases, Choices(label_of(algorithm), alpha, causes_of_cases))
     if figures is not None:
         save_figures(cases, figures)
@@ -81,13 +111,17 @@ def tables(
     words += ["--alpha", str(alpha)] if alpha != ALPHA else []
     words += ["--causes", str(causes)] if causes else []
     main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
-    folded = () if all else tuple(name for name in answer.tables if name not in (*main_tables, "remarks"))
+    folded = (
+        ()
+        if all
+        else tuple(name for name in answer.tables if name not in (*main_tables, "remarks"))
+    )
     return replace(answer, command=" ".join(words), folded=folded)
 
 
 def figures(*results: Results | str | Path) -> dict[str, Figure]:
-    """Every figure of results by name, such as "pareto-fronts"; of several results, the case's name comes first:
-    "rain-pareto-fronts".
+    """Every figure of results by name, such as "pareto-fronts"; of several results, the case's name
+    comes first: "rain-pareto-fronts".
 
     Raises
     ------
@@ -111,8 +145,11 @@ def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
         return causes_of_runs(case, evaluator, limit)
 
 
-def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = TABLES) -> Answer:
-    """Every named table of the cases; a table that no case answers has no row, and a remark says why.
+def answer_questions(
+    cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = TABLES
+) -> Answer:
+    """Every named table of the cases; a table that no case answers has no row, and a remark says
+    why.
 
     Raises
     ------
@@ -146,14 +183,23 @@ def answer_questions(cases: Sequence[Case], choices: Choices = DEFAULT, names: C
         frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
     if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
-    of_all = [("all", remark) for case in cases for remark in (*case.remarks, few_evaluations(case)) if remark]
+    of_all = [
+        ("all", remark)
+        for case in cases
+        for remark in (*case.remarks, few_evaluations(case))
+        if remark
+    ]
     different = dict.fromkeys([*of_all, *remarks])
     frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
     return Answer(
         question="tables",
         study=cases[0].study,
         verdict=" ".join(map(_verdict, cases)),
-        numbers={"cases": len(cases), "solutions": sum(len(case.solutions) for case in cases), "alpha": choices.alpha},
+        numbers={
+            "cases": len(cases),
+            "solutions": sum(len(case.solutions) for case in cases),
+            "alpha": choices.alpha,
+        },
         tables=frames,
         draw=lambda answer: draw_change_counts(cases),
     )
@@ -169,12 +215,17 @@ def _verdict(case: Case) -> str:
         return f"{text}."
     of_all = len(case.solutions_of(NSGA2))
     where = " in the same encounter" if case.study.scenario.search else ""
-    less_safe = f"{critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original vehicle{where}."
+    less_safe = (
+        f"{critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original"
+        f" vehicle{where}."
+    )
     return " ".join([f"{text}; {less_safe}", *demanded_in_words(case.study)])
 
 
 def _equal_solutions(case: Case) -> str:
-    """How many solutions of pooled tables are equal to another one of their run, in a sentence; "" if none is."""
+    """How many solutions of pooled tables are equal to another one of their run, in a sentence; ""
+    if none is.
+    """
     run = ["algorithm", "run"] if case.has_runs else ["algorithm"]
     count = int(case.solutions.duplicated([*run, *case.characteristics.names]).sum())
     if not count:
@@ -195,39 +246,57 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     if table == "rq2-runs":
         remarks += filter(None, [describe_rules(case)])
     if table == "a12" and len(frame):
-        remarks.append(f"* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2.")
+        remarks.append(
+            f"* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2."
+        )
     if table == "combinations" and frame.empty:
         remarks.append("no critical solution has exactly four characteristics changed.")
     return (f"{case.name}: {remark}" for remark in remarks)
 
 
 def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
-    """What tests of pooled solutions leave out: algorithms with too few runs, and undefined values."""
+    """What tests of pooled solutions leave out: algorithms with too few runs, and undefined
+    values.
+    """
     tested = "algorithm" if table == "rq1" else "baseline"
     with_few_runs = frame.loc[~frame["enough_runs"], tested].unique()
     if len(with_few_runs):
         names = ", ".join(map(case.title_of, with_few_runs))
         needed = fewest_runs(table.upper(), alpha)
         yield (
-            f"too few runs of {names} for a test ({needed} are needed): no p-value of pooled solutions is significant."
+            f"too few runs of {names} for a test ({needed} are needed): no p-value of pooled"
+            " solutions is significant."
         )
     for metric in case.scoring.metrics:
         values = solutions_for_metric(case.solutions, metric)[metric.name]
         undefined = int(values.isna().sum())
         if undefined:
-            yield f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests omit."
+            yield (
+                f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests"
+                " omit."
+            )
     if table == "rq1":
-        known = {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}  # in a solution's encounter
-        omitted = [name for name, value in case.original.items() if math.isnan(value) or name not in known]
+        known = (
+            {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}
+        )  # in a solution's encounter
+        omitted = [
+            name for name, value in case.original.items() if math.isnan(value) or name not in known
+        ]
         if omitted:
-            yield f"the original vehicle's {', '.join(omitted)} is undefined, so that no test uses it."
+            yield (
+                f"the original vehicle's {', '.join(omitted)} is undefined, so that no test"
+                " uses it."
+            )
     elif not case.has_runs:
         yield (
-            "igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is their number of "
-            "evaluations known."
+            "igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is"
+            " their number of evaluations known."
         )
     elif len(case.evaluations):
-        yield f"settings that a run simulates, mean: {describe_evaluations(case, count_evaluations(case))}."
+        yield (
+            "settings that a run simulates, mean:"
+            f" {describe_evaluations(case, count_evaluations(case))}."
+        )
 
 
 def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> Iterator[str]:
@@ -238,6 +307,9 @@ def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> It
     few = len(tests) - int(tests["enough_runs"].sum())
     if few:
         needed = fewest_runs(rq, alpha, len(tests))
-        yield f"too few runs for {few} of {tests_in_words} of {rq} ({needed} are needed after the correction)."
+        yield (
+            f"too few runs for {few} of {tests_in_words} of {rq} ({needed} are needed after the"
+            " correction)."
+        )
     if len(tests):
         yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."

@@ -1,8 +1,8 @@
-"""RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe, collisions, combinations, sun
-against rain.
+"""RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe,
+collisions, combinations, sun against rain.
 
-Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if solutions belong to
-no run.
+Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if
+solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ from safevar_sumo.study import SAFETY_DEGREE, tables_of
 
 ANY = "any"
 WEATHER_PARAMETERS = (*REACTION_PARAMETERS, "brake_place")
-"""Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees the pedestrian."""
+"""Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees
+the pedestrian.
+"""
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
 SAFETY_SCALES = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
-"""For each quantity of `rq33_safety` with a percentage: the metric whose value for the original vehicle is 100 %."""
+"""For each quantity of `rq33_safety` with a percentage: the metric whose value for the original
+vehicle is 100 %.
+"""
 
 
 def critical_solutions(case: Case) -> pd.DataFrame:
@@ -42,13 +46,15 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     """
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
-        raise UnanswerableError(case.name, "lacks the original vehicle's safety degree", "results that have it")
+        raise UnanswerableError(
+            case.name, "lacks the original vehicle's safety degree", "results that have it"
+        )
     return solutions[solutions[SAFETY_DEGREE] < case.original_degrees(solutions)]
 
 
 def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
-    """Changes of the vehicle's n characteristics in M solutions, each in its unit: filtered minus original value, the
-    paper's v'' - v; shape (M, n).
+    """Changes of the vehicle's n characteristics in M solutions, each in its unit: filtered minus
+    original value, the paper's v'' - v; shape (M, n).
     """
     vehicle = case.characteristics.vehicle
     return solutions[list(vehicle.names)].to_numpy(dtype=float) - vehicle.original
@@ -61,16 +67,22 @@ def change_numbers(case: Case) -> list[str]:
 
 def count_changes(case: Case) -> npt.NDArray[np.str_]:
     """The number j of changed characteristics of each critical solution, "1".."n"."""
-    return np.asarray(np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str))
+    return np.asarray(
+        np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+    )
 
 
 def _means_by_change_count(
-    case: Case, labels: Sequence[str], name: str, values: Iterable[tuple[tuple[str, ...], FloatArray]]
+    case: Case,
+    labels: Sequence[str],
+    name: str,
+    values: Iterable[tuple[tuple[str, ...], FloatArray]],
 ) -> pd.DataFrame:
     """Mean values of the critical solutions with j characteristics changed, for each key and j.
 
-    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: the `labels` of
-    the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of values).
+    `values` holds keys, each with one value per critical solution; NaN does not count. Columns: the
+    `labels` of the keys, j ("1".."n", "any"), `name` (the mean, NaN without values), n (number of
+    values).
     """
     change_counts = count_changes(case)
     rows = []
@@ -81,7 +93,9 @@ def _means_by_change_count(
 
 
 def rq31(case: Case) -> pd.DataFrame:
-    """Number of critical solutions of each run with exactly j characteristics changed; columns run, j, count."""
+    """Number of critical solutions of each run with exactly j characteristics changed; columns run,
+    j, count.
+    """
     solutions = critical_solutions(case)
     runs = case.runs_of(NSGA2)
     counts = solutions.groupby([solutions["run"], count_changes(case)]).size()
@@ -90,15 +104,20 @@ def rq31(case: Case) -> pd.DataFrame:
 
 
 def rq32(case: Case) -> pd.DataFrame:
-    """For each characteristic and j: the share of the critical solutions with j changes that change this
-    characteristic.
+    """For each characteristic and j: the share of the critical solutions with j changes that change
+    this characteristic.
 
-    Columns characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank (only for
-    j = "any"; ties share the better rank and the next one is skipped).
+    Columns characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank
+    (only for j = "any"; ties share the better rank and the next one is skipped).
     """
     shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
-    values = {(name,): column for name, column in zip(case.characteristics.vehicle.names, shares.T, strict=True)}
-    frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(columns="n")
+    values = {
+        (name,): column
+        for name, column in zip(case.characteristics.vehicle.names, shares.T, strict=True)
+    }
+    frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(
+        columns="n"
+    )
     frame["percent"] *= 100
     ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
     return frame.assign(rank=ranks.astype("Int64"))
@@ -107,9 +126,9 @@ def rq32(case: Case) -> pd.DataFrame:
 def rq33(case: Case) -> pd.DataFrame:
     """Size of increases and of decreases in the critical solutions with j characteristics changed.
 
-    Columns characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean change
-    relative to the original value, without sign), delta (mean signed change in the characteristic's unit), n (number of
-    changes); pc and delta are undefined where n is 0.
+    Columns characteristic, direction, j ("1".."n", "any"), pc (the paper's PC, a fraction: mean
+    change relative to the original value, without sign), delta (mean signed change in the
+    characteristic's unit), n (number of changes); pc and delta are undefined where n is 0.
     """
     changes = changes_of(case, critical_solutions(case))
     vehicle = case.characteristics.vehicle
@@ -125,22 +144,26 @@ def rq33(case: Case) -> pd.DataFrame:
 
 
 def rq33_safety(case: Case) -> pd.DataFrame:
-    """Effect on safety of the critical solutions with j characteristics changed: the footer of RQ3.3's table.
+    """Effect on safety of the critical solutions with j characteristics changed: the footer of
+    RQ3.3's table.
 
-    Columns quantity, j, value, percent (of the original's value), n (number of solutions in the mean); value
-    is undefined where n is 0. Quantities:
+    Columns quantity, j, value, percent (of the original's value), n (number of solutions in the
+    mean); value is undefined where n is 0. Quantities:
 
     - avgSD_mD: mean reduction of the distance over solutions without collision [m];
     - avgSD_cS: mean collision speed over collisions [m/s]; it has no percent;
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
 
-    In a study that searches its scenario only the original's safety degree is known in the encounter of a solution,
-    so that TET, TIT and aveDece are undefined; the original's value is the mean over these encounters.
+    In a study that searches its scenario only the original's safety degree is known in the
+    encounter of a solution, so that TET, TIT and aveDece are undefined; the original's value is the
+    mean over these encounters.
     """
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
-    safety_degree, tet, tit, deceleration = solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
+    safety_degree, tet, tit, deceleration = (
+        solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
+    )
     degrees = case.original_degrees(solutions)
     original = case.original
     if case.study.scenario.search:
@@ -159,8 +182,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
 
 
 def count_collisions(case: Case) -> pd.DataFrame:
-    """Number of collisions among each algorithm's solutions; columns algorithm, solutions, collisions, share
-    [fraction].
+    """Number of collisions among each algorithm's solutions; columns algorithm, solutions,
+    collisions, share [fraction].
 
     Raises
     ------
@@ -169,32 +192,43 @@ def count_collisions(case: Case) -> pd.DataFrame:
     """
     case.require_solutions()
     collisions = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
-    counts = collisions.agg(solutions="size", collisions="sum").reindex(list(case.algorithms), fill_value=0)
+    counts = collisions.agg(solutions="size", collisions="sum").reindex(
+        list(case.algorithms), fill_value=0
+    )
     shares = counts.assign(share=counts["collisions"] / counts["solutions"])
     return pd.DataFrame(shares.rename_axis("algorithm").reset_index())
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:
-    """The most frequent combinations among the critical solutions with exactly four characteristics changed.
+    """The most frequent combinations among the critical solutions with exactly four characteristics
+    changed.
 
-    Columns rank (ties share the better one), characteristics (a list), percent (of the solutions with exactly
-    four changes); no row where there is no such solution. Of combinations that are equally frequent, those with the
-    earlier characteristics in the study come first.
+    Columns rank (ties share the better one), characteristics (a list), percent (of the solutions
+    with exactly four changes); no row where there is no such solution. Of combinations that are
+    equally frequent, those with the earlier characteristics in the study come first.
     """
     is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
-    most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[:COMBINATIONS_SHOWN]
+    most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[
+        :COMBINATIONS_SHOWN
+    ]
     rows = []
     for indices, number in most_frequent:
         rank = 1 + sum(other > number for other in counts.values())
-        rows.append((rank, [case.characteristics.vehicle.names[i] for i in indices], 100 * number / len(masks)))
+        rows.append(
+            (
+                rank,
+                [case.characteristics.vehicle.names[i] for i in indices],
+                100 * number / len(masks),
+            )
+        )
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])
 
 
 def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
-    """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather first (by friction,
-    visibility, delays).
+    """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather
+    first (by friction, visibility, delays).
 
     The reaction's parameters are the `WEATHER_PARAMETERS`.
 
@@ -212,7 +246,11 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
         problem = "two cases are needed that differ in the weather alone"
         if len(cases) == 2:
             differences = ", ".join(_differences(*cases))
-            problem += f"; these two {f'also differ in {differences}' if differences else 'have equally clear weather'}"
+            problem += (
+                f"; these two also differ in {differences}"
+                if differences
+                else "; these two have equally clear weather"
+            )
         raise UnanswerableError(
             ", ".join(case.name for case in cases), problem, "results such as those of sun and rain"
         )
@@ -220,12 +258,13 @@ def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
 
 
 def compare_weathers(*cases: Case) -> pd.DataFrame:
-    """The weathers of the pairs of `find_weather_pairs`, characteristic by characteristic, over the critical solutions.
+    """The weathers of the pairs of `find_weather_pairs`, characteristic by characteristic, over the
+    critical solutions.
 
-    The column setting names the clearer weather's case. Columns without the suffix "_other" belong to this case.
-    Columns: setting, other, characteristic; percent, percent_other (of the critical solutions that change it);
-    difference (percent_other - percent); rank, rank_other; increase, increase_other, decrease, decrease_other (mean
-    signed change in the characteristic's unit).
+    The column setting names the clearer weather's case. Columns without the suffix "_other" belong
+    to this case. Columns: setting, other, characteristic; percent, percent_other (of the critical
+    solutions that change it); difference (percent_other - percent); rank, rank_other; increase,
+    increase_other, decrease, decrease_other (mean signed change in the characteristic's unit).
     """
     tables = [
         _overall_changes(clearer)
@@ -238,8 +277,8 @@ def compare_weathers(*cases: Case) -> pd.DataFrame:
 
 
 def _overall_changes(case: Case) -> pd.DataFrame:
-    """How often and how far the critical solutions change each characteristic; columns characteristic, percent, rank,
-    increase, decrease.
+    """How often and how far the critical solutions change each characteristic; columns
+    characteristic, percent, rank, increase, decrease.
     """
     shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
     deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
@@ -248,15 +287,26 @@ def _overall_changes(case: Case) -> pd.DataFrame:
 
 def _clearness(case: Case) -> tuple[float, float, float]:
     weather = case.weather
-    reaction_delays = [float(case.study.ads.parameters.get(name, 0.0)) for name in REACTION_PARAMETERS]
-    return weather.road_friction, weather.visibility, -weather.recognition_delay - sum(reaction_delays)
+    reaction_delays = [
+        float(case.study.ads.parameters.get(name, 0.0)) for name in REACTION_PARAMETERS
+    ]
+    return (
+        weather.road_friction,
+        weather.visibility,
+        -weather.recognition_delay - sum(reaction_delays),
+    )
 
 
 def _differences(*pair: Case) -> list[str]:
-    """Keys on which a simulation depends and in which two studies differ, without those of the weather and of the ADS's
-    reaction to it.
+    """Keys on which a simulation depends and in which two studies differ, without those of the
+    weather and of the ADS's reaction to it.
     """
     first, second = (evaluation_keys(tables_of(case.study)) for case in pair)
-    ignored = {"name", "weather", "search", *(f"ads.parameters.{name}" for name in WEATHER_PARAMETERS)}
+    ignored = {
+        "name",
+        "weather",
+        "search",
+        *(f"ads.parameters.{name}" for name in WEATHER_PARAMETERS),
+    }
     differences = (key for key, _, _ in changed_values(first, second))
     return [key for key in differences if not {key, key.partition(".")[0]} & ignored]

@@ -1,14 +1,16 @@
-"""RQ1 and RQ2: algorithms against the original vehicle and against each other, over pooled solutions and over runs.
+"""RQ1 and RQ2: algorithms against the original vehicle and against each other, over pooled
+solutions and over runs.
 
-The paper pools the solutions of all runs and compares them with a second sample: the original's single value, repeated
-once for each solution. Solutions of one run resemble each other, and a repeated value is no sample: p-values become too
-small. Over runs, each run contributes one value, and Holm's method corrects for the number of tests of the question:
-those of RQ1 and those of RQ2 are a family each.
+The paper pools the solutions of all runs and compares them with a second sample: the original's
+single value, repeated once for each solution. Solutions of one run resemble each other, and a
+repeated value is no sample: p-values become too small. Over runs, each run contributes one value,
+and Holm's method corrects for the number of tests of the question: those of RQ1 and those of RQ2
+are a family each.
 
-In the frames, `method` holds the name of the test, `enough_runs` whether a test with so many runs can be significant,
-and `significant` whether it is, undefined where nothing was tested; undefined values are NaN. Functions of a case
-raise `UnanswerableError` if no run is finished, if an algorithm that they compare is missing, and over runs if the
-solutions belong to no run.
+In the frames, `method` holds the name of the test, `enough_runs` whether a test with so many runs
+can be significant, and `significant` whether it is, undefined where nothing was tested; undefined
+values are NaN. Functions of a case raise `UnanswerableError` if no run is finished, if an algorithm
+that they compare is missing, and over runs if the solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -25,7 +27,13 @@ import pandas as pd
 from msgspec import structs
 
 from safevar_sumo.metrics import Measure
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions, solutions_for_metric
+from safevar_sumo.questions.case import (
+    NSGA2,
+    Case,
+    UnanswerableError,
+    are_collisions,
+    solutions_for_metric,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     INDICATOR_TITLES,
     MORE_IS_BETTER,
@@ -60,8 +68,9 @@ NOTHING: Samples = MappingProxyType({})
 
 
 class Choices(NamedTuple):
-    """What a reader chooses: the algorithm that is compared with all others, the level of significance, and, by a
-    case's name, the minimal causes of its runs, if they were counted: columns algorithm, run, causes.
+    """What a reader chooses: the algorithm that is compared with all others, the level of
+    significance, and, by a case's name, the minimal causes of its runs, if they were counted:
+    columns algorithm, run, causes.
     """
 
     algorithm: str = ""
@@ -73,22 +82,24 @@ DEFAULT = Choices()
 
 
 def rq1(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """Every algorithm's solutions against the original's value, repeated once for each solution, metric by metric.
+    """Every algorithm's solutions against the original's value, repeated once for each solution,
+    metric by metric.
 
-    `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are more unsafe; `mean` is
-    the mean over the algorithm's solutions, `original` the original vehicle's value.
+    `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are
+    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original
+    vehicle's value.
     """
     return _with_significance(pd.DataFrame(_test_original(case, choices)), choices)
 
 
 def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then its pooled
-    solutions' metrics.
+    """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then
+    its pooled solutions' metrics.
 
-    `effect_size` is A12, oriented so that higher values mean that the algorithm is better: a better front, more unsafe
-    solutions. `n1` counts the algorithm's values, `n2` the baseline's; `evaluations` and `baseline_evaluations` are
-    mean numbers of settings that a run simulated. Indicators and evaluations of imported solutions, which belong to no
-    run, are undefined.
+    `effect_size` is A12, oriented so that higher values mean that the algorithm is better: a better
+    front, more unsafe solutions. `n1` counts the algorithm's values, `n2` the baseline's;
+    `evaluations` and `baseline_evaluations` are mean numbers of settings that a run simulated.
+    Indicators and evaluations of imported solutions, which belong to no run, are undefined.
     """
     frame = pd.DataFrame(_test_opponents(case, choices))
     simulated = pd.Series(dtype=float)
@@ -100,23 +111,24 @@ def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's signed-rank test.
+    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's
+    signed-rank test.
 
-    `effect_size` is the share of runs whose mean is safer than the original's value, plus half the share of equal ones
-    (A12 against one value): below 0.5 the runs are less safe. `mean` is the mean of the run means. `p_holm` is
-    `p_value` corrected by Holm's method for all tests of RQ1 of this case, and `enough_runs` says whether it can be
-    significant.
+    `effect_size` is the share of runs whose mean is safer than the original's value, plus half the
+    share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the
+    mean of the run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 of
+    this case, and `enough_runs` says whether it can be significant.
     """
     tests = compare_over_runs(case, choices)
     return tests[tests.index == "RQ1"]
 
 
 def rq2_runs(case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING) -> pd.DataFrame:
-    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators, metrics' means
-    over solutions and, if they were counted, distinct minimal causes.
+    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators,
+    metrics' means over solutions and, if they were counted, distinct minimal causes.
 
-    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` and `enough_runs` are as in
-    `rq1_runs`, for all tests of RQ2.
+    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` and `enough_runs`
+    are as in `rq1_runs`, for all tests of RQ2.
     """
     tests = compare_over_runs(case, choices, further)
     opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
@@ -133,19 +145,25 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         If there are no evaluations.
     """
     common = replace(case, solutions=nondominated_evaluations(case))
-    best = valid_evaluations(case, case.evaluations).groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
+    best = (
+        valid_evaluations(case, case.evaluations).groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
+    )
     further = {(name, BEST): best[name] for name in best.index.unique("algorithm")}
     # The causes were counted among the solutions that the algorithms returned.
     return rq2_runs(common, choices._replace(causes={}), further)
 
 
 def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size, significant, and a12, the
-    effect size with marks.
+    """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size,
+    significant, and a12, the effect size with marks.
     """
     tests = rq2_runs(case, choices)
     texts = [
-        f"{effect:.2f}{'*' if significant else ''} {MARKS[magnitude]}".strip() if magnitude in MARKS else "-"
+        (
+            f"{effect:.2f}{'*' if significant else ''} {MARKS[magnitude]}".strip()
+            if magnitude in MARKS
+            else "-"
+        )
         for effect, significant, magnitude in zip(
             tests["effect_size"], tests["significant"], tests["magnitude"], strict=True
         )
@@ -154,9 +172,11 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return tests[columns].assign(a12=texts)
 
 
-def compare_over_runs(case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING) -> pd.DataFrame:
-    """Every test of RQ1 and, if it has an answer, of RQ2 over runs, also of `further` samples; the index is the
-    question, RQ1 or RQ2.
+def compare_over_runs(
+    case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING
+) -> pd.DataFrame:
+    """Every test of RQ1 and, if it has an answer, of RQ2 over runs, also of `further` samples; the
+    index is the question, RQ1 or RQ2.
     """
     rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
@@ -174,8 +194,9 @@ def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFr
 
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
-    """Tests with the column `significant`: where p-values are corrected, the corrected one counts; where solutions of
-    runs are pooled, there have to be enough runs for a test. Over runs, effects have intervals.
+    """Tests with the column `significant`: where p-values are corrected, the corrected one counts;
+    where solutions of runs are pooled, there have to be enough runs for a test. Over runs, effects
+    have intervals.
     """
     p_values = tests["p_holm" if "p_holm" in tests else "p_value"]
     is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype("boolean")
@@ -192,8 +213,8 @@ def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
 
 
 def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """The median over the runs of each algorithm, of every indicator and metric; columns algorithm, metric, runs,
-    median, median_low, median_high.
+    """The median over the runs of each algorithm, of every indicator and metric; columns algorithm,
+    metric, runs, median, median_low, median_high.
     """
     case.require_solutions()
     samples = _samples(case, choices, over_runs=True)
@@ -205,17 +226,24 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """How many evaluations a run needs to find a collision, in an encounter in which the original vehicle is safe; a
-    run without any has needed more than it requested.
+    """How many evaluations a run needs to find a collision, in an encounter in which the original
+    vehicle is safe; a run without any has needed more than it requested.
 
-    Columns algorithm, runs, collided (runs with a collision), median with its interval, and against the
-    algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the other algorithms.
+    Columns algorithm, runs, collided (runs with a collision), median with its interval, and against
+    the algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the
+    other algorithms.
     """
     ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
-    collisions = case.evaluations[are_collisions(case.evaluations) & case.scoring.feasible_rows(case.evaluations)]
+    collisions = case.evaluations[
+        are_collisions(case.evaluations) & case.scoring.feasible_rows(case.evaluations)
+    ]
     first = collisions.groupby(["algorithm", "run"])["evaluation"].min().reindex(ends.index) + 1
-    runs = pd.DataFrame({"time": first.fillna(ends), "found": first.notna()}).groupby(level="algorithm", sort=False)
-    samples = {str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs}
+    runs = pd.DataFrame({"time": first.fillna(ends), "found": first.notna()}).groupby(
+        level="algorithm", sort=False
+    )
+    samples = {
+        str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs
+    }
     reference = choices.algorithm or (NSGA2 if NSGA2 in samples else next(iter(samples)))
     rows = []
     for algorithm, (times, found) in samples.items():
@@ -237,12 +265,15 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
         If they were not counted.
     """
     if case.name not in choices.causes:
-        raise UnanswerableError(case.name, "minimal causes are simulated only if they are asked for", "causes")
+        raise UnanswerableError(
+            case.name, "minimal causes are simulated only if they are asked for", "causes"
+        )
     return choices.causes[case.name]
 
 
 def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
-    """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results, and the others.
+    """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results,
+    and the others.
 
     Raises
     ------
@@ -255,7 +286,9 @@ def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
     others = [name for name in case.algorithms if name != first]
     if not others:
         raise UnanswerableError(
-            case.name, f"only {first} has finished runs", "results of another algorithm to compare with, such as rs"
+            case.name,
+            f"only {first} has finished runs",
+            "results of another algorithm to compare with, such as rs",
         )
     return first, others
 
@@ -268,8 +301,14 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
         values = _values(case, algorithm, metric, over_runs)
         originals = _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.scenario.search else case.original[metric.name]
-        test = signed_rank_test(values - originals) if over_runs else compare_samples(values, originals.dropna())
-        if metric.more_is_unsafe:  # so that below 0.5 the solutions are more unsafe than the original
+        test = (
+            signed_rank_test(values - originals)
+            if over_runs
+            else compare_samples(values, originals.dropna())
+        )
+        if (
+            metric.more_is_unsafe
+        ):  # so that below 0.5 the solutions are more unsafe than the original
             test = test.reversed()
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
@@ -285,8 +324,11 @@ def _test_opponents(
     """A row for each baseline and metric, also of `further` samples."""
     first, others = opponents_of(case, choices.algorithm)
     samples = {**_samples(case, choices, over_runs), **further}
-    # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more causes.
-    directions = MORE_IS_BETTER | {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
+    # causes.
+    directions = MORE_IS_BETTER | {
+        metric.name: metric.more_is_unsafe for metric in case.scoring.metrics
+    }
     directions |= {name: better for name, better in BETTER.items() if (first, name) in samples}
     rows = []
     for baseline, (metric, more_is_better) in product(others, directions.items()):
@@ -306,8 +348,8 @@ def _finished_runs(case: Case, algorithm: str) -> int:
 
 
 def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
-    """The values of every metric and, unless the solutions belong to no run, of every indicator; over runs, of the
-    minimal causes.
+    """The values of every metric and, unless the solutions belong to no run, of every indicator;
+    over runs, of the minimal causes.
     """
     samples = {
         (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
@@ -315,16 +357,24 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
     }
     if case.has_runs and len(case.solutions):
         for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
-            samples |= {(str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER}
+            samples |= {
+                (str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER
+            }
     if over_runs and case.name in choices.causes:
         counts = choices.causes[case.name].groupby("algorithm")
-        samples |= {(str(algorithm), CAUSES): rows.set_index("run")[CAUSES] for algorithm, rows in counts}
+        samples |= {
+            (str(algorithm), CAUSES): rows.set_index("run")[CAUSES] for algorithm, rows in counts
+        }
     return samples
 
 
 def _values(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
-    """A metric's defined values over the solutions that count for it; over runs, the mean of each run."""
-    solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(subset=metric.name)
+    """A metric's defined values over the solutions that count for it; over runs, the mean of each
+    run.
+    """
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(
+        subset=metric.name
+    )
     values = solutions[metric.name].astype(float)
     if not over_runs:
         return values
@@ -333,8 +383,8 @@ def _values(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.
 
 
 def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
-    """The original vehicle's metric beside each of `_values`; in a study that searches its scenario, the safety degree
-    in the same encounters, and undefined for other metrics.
+    """The original vehicle's metric beside each of `_values`; in a study that searches its
+    scenario, the safety degree in the same encounters, and undefined for other metrics.
     """
     values = _values(case, algorithm, metric, over_runs)
     if not case.study.scenario.search:

@@ -1,4 +1,6 @@
-"""All figures of results by name: how algorithms compare (RQ1, RQ2), and what critical solutions change (RQ3)."""
+"""All figures of results by name: how algorithms compare (RQ1, RQ2), and what critical solutions
+change (RQ3).
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,13 @@ from safevar_sumo.questions.figures import (
     new_panels,
     save,
 )
-from safevar_sumo.questions.research_questions.changes import ANY, changes_of, critical_solutions, rq31, rq32
+from safevar_sumo.questions.research_questions.changes import (
+    ANY,
+    changes_of,
+    critical_solutions,
+    rq31,
+    rq32,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     REFERENCE_COORDINATE,
     compute_convergence,
@@ -43,7 +51,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own marker."""
+"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own
+marker.
+"""
 MARKERS = ("o", "X", "^", "s", "D", "v")
 OBJECTIVE_TITLES = {
     F_SAFE.name: "f_safe: safety degree [m, -m/s]",
@@ -57,9 +67,11 @@ BIN_COUNT = 24
 
 
 def draw_pareto_fronts(case: Case) -> Figure:
-    """The non-dominated solutions of all runs of each algorithm together, for every pair of objectives.
+    """The non-dominated solutions of all runs of each algorithm together, for every pair of
+    objectives.
 
-    Each panel also shows the original vehicle; solutions on the dashed line or to its left are collisions.
+    Each panel also shows the original vehicle; solutions on the dashed line or to its left are
+    collisions.
 
     Raises
     ------
@@ -74,31 +86,45 @@ def draw_pareto_fronts(case: Case) -> Figure:
         if len(points := points_of(case, case.solutions_of(algorithm)))
     }
     labels = [
-        OBJECTIVE_TITLES.get(objective.name) or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
+        OBJECTIVE_TITLES.get(objective.name)
+        or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
         for objective in objectives
     ]
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
     figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
-    known_values = {F_DIFF.name: 0.0, F_NUM_DIFF.name: 0.0, F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan)}
-    original = [{**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives]
+    known_values = {
+        F_DIFF.name: 0.0,
+        F_NUM_DIFF.name: 0.0,
+        F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan),
+    }
+    original = [
+        {**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives
+    ]
     for axis, pair in zip(axes, pairs, strict=True):
-        for (algorithm, points), colour, marker in zip(fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+        for (algorithm, points), colour, marker in zip(
+            fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False
+        ):
             label = f"{escape_dollars(case.title_of(algorithm))} ({len(points)})"
             x, y = points[:, pair].T
-            axis.scatter(x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label)
+            axis.scatter(
+                x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label
+            )
         x, y = (original[i] for i in pair)
         axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
         if objectives[pair[0]] == F_SAFE:
-            axis.axvline(0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less")
+            axis.axvline(
+                0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less"
+            )
         axis.set(xlabel=labels[pair[0]], ylabel=labels[pair[1]])
     _add_legend_below(figure, axes[0])
     return figure
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of all settings that a run has evaluated so far, over the number of evaluations, as median and
-    quartiles over the runs. A line ends where its algorithm does; a mark there is the median of what the runs return.
+    """The hypervolume of all settings that a run has evaluated so far, over the number of
+    evaluations, as median and quartiles over the runs. A line ends where its algorithm does; a mark
+    there is the median of what the runs return.
     """
     import seaborn as sns
 
@@ -125,7 +151,12 @@ def draw_convergence(case: Case) -> Figure:
         f"mark: of what a run returns; reference point {REFERENCE_COORDINATE:g})"
     )
     ends = growth.groupby("algorithm", sort=False)["evaluations"].max()
-    returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median().reindex(ends.index)
+    returned = (
+        compute_indicators(case)["hypervolume"]
+        .groupby(level="algorithm")
+        .median()
+        .reindex(ends.index)
+    )
     axis.scatter(ends, returned, color=COLOURS[: len(ends)], edgecolor="black", zorder=3)
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
@@ -135,13 +166,18 @@ def draw_convergence(case: Case) -> Figure:
 def _add_legend_below(figure: Figure, axis: Axes) -> None:
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=min(len(labels), 3), frameon=False, fontsize=FONT_SIZE
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(len(labels), 3),
+        frameon=False,
+        fontsize=FONT_SIZE,
     )
 
 
 def draw_change_counts(cases: Sequence[Case]) -> Figure:
-    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots over the runs; a panel
-    per case that has an answer.
+    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots
+    over the runs; a panel per case that has an answer.
 
     Raises
     ------
@@ -158,27 +194,39 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     if not counts_by_case:
         raise errors[0]
     title = "number of changed characteristics"
-    figure, axes = new_panels(title, len(counts_by_case), 3, (3.9, 3.3), min_width=6.4, title_height=0.5)
+    figure, axes = new_panels(
+        title, len(counts_by_case), 3, (3.9, 3.3), min_width=6.4, title_height=0.5
+    )
     for axis, (name, counts) in zip(axes, counts_by_case.items(), strict=True):
         numbers, samples = zip(*counts.groupby("j", sort=False)["count"], strict=True)
-        axis.boxplot(samples, tick_labels=numbers, widths=0.8, patch_artist=True, boxprops={"facecolor": SKY_BLUE})
+        axis.boxplot(
+            samples,
+            tick_labels=numbers,
+            widths=0.8,
+            patch_artist=True,
+            boxprops={"facecolor": SKY_BLUE},
+        )
         runs = counts["run"].nunique()
-        axis.set(xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)")
+        axis.set(
+            xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)"
+        )
         axis.set_title(escape_dollars(name), fontsize=FONT_SIZE)
         axis.locator_params(axis="y", integer=True, min_n_ticks=1)
     return figure
 
 
 def draw_changed_characteristics(case: Case) -> Figure:
-    """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which each characteristic
-    is changed.
+    """RQ3.2 as a heat map: the share of critical solutions with j changed characteristics in which
+    each characteristic is changed.
     """
     import seaborn as sns
 
     _critical_changes(case)  # raises if there are none
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
-    table = shares.pivot(index="characteristic", columns="j", values="percent").loc[order, list(shares["j"].unique())]
+    table = shares.pivot(index="characteristic", columns="j", values="percent").loc[
+        order, list(shares["j"].unique())
+    ]
     title = f"{case.name}: characteristics changed in critical solutions"
     figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table)))
     sns.heatmap(
@@ -212,7 +260,13 @@ def draw_change_sizes(case: Case) -> Figure:
         high = characteristic.upper - characteristic.original
         increases = changes[changes > 0]
         decreases = changes[changes < 0]
-        axis.hist([increases, decreases], bins=BIN_COUNT, range=(low, high), color=[VERMILION, BLUE], stacked=True)
+        axis.hist(
+            [increases, decreases],
+            bins=BIN_COUNT,
+            range=(low, high),
+            color=[VERMILION, BLUE],
+            stacked=True,
+        )
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlim(low, high)
         axis.set_title(
@@ -232,11 +286,15 @@ def draw_change_sizes(case: Case) -> Figure:
 
 
 def _critical_changes(case: Case) -> FloatArray:
-    """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are none."""
+    """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are
+    none.
+    """
     changes = changes_of(case, critical_solutions(case))
     if not len(changes):
         raise UnanswerableError(
-            case.name, "has no critical solution", "results with solutions that are more unsafe than the original"
+            case.name,
+            "has no critical solution",
+            "results with solutions that are more unsafe than the original",
         )
     return changes
 
@@ -292,5 +350,7 @@ def save_figures(cases: Sequence[Case], directory: Path) -> None:
     figures = draw_figures(cases)
     make_directory(directory)
     for (name, figure), ending in product(figures.items(), ("png", "pdf")):
-        file_name = re.sub(r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name).strip("-")
+        file_name = re.sub(
+            r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name
+        ).strip("-")
         save(figure, directory / f"{file_name}.{ending}", "figures")

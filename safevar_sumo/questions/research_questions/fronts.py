@@ -1,6 +1,6 @@
-"""The quality of the fronts that runs return (docs/method.md, section 7): IGD+ and hypervolume on normalised
-objectives; IGD, as published, on objectives in their units; and the number of evaluations. Of all evaluations: the
-non-dominated ones, and the growth of their hypervolume.
+"""The quality of the fronts that runs return (docs/method.md, section 7): IGD+ and hypervolume on
+normalised objectives; IGD, as published, on objectives in their units; and the number of
+evaluations. Of all evaluations: the non-dominated ones, and the growth of their hypervolume.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from safevar_sumo.records import FloatArray
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
 REFERENCE_COORDINATE = 1.1
-"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth beyond the nadir."""
+"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth
+beyond the nadir.
+"""
 USUAL_SHARE = 0.9
 """Share of its budget from which on nobody asks why an algorithm simulates less."""
 CURVE_POINTS = 50
@@ -35,7 +37,8 @@ def hypervolume(front: FloatArray) -> float:
 
 
 def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
-    """Points on the scale from the best (0) to the worst value (1) of each objective in a reference front.
+    """Points on the scale from the best (0) to the worst value (1) of each objective in a reference
+    front.
 
     Where the best value is also the worst, an objective keeps its unit.
     """
@@ -45,9 +48,14 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better, shape (rows, objectives); NaN where undefined."""
+    """The objectives' values, smaller being better, shape (rows, objectives); NaN where
+    undefined.
+    """
     signs = [objective.sign for objective in case.scoring.objectives]
-    return frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float) * signs
+    return (
+        frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float)
+        * signs
+    )
 
 
 def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
@@ -66,16 +74,19 @@ def reference_front(case: Case) -> FloatArray:
     """
     points = points_of(case, case.solutions)
     if not len(points):
-        raise UnanswerableError(case.name, "has no solution", "results with at least one finished run")
+        raise UnanswerableError(
+            case.name, "has no solution", "results with at least one finished run"
+        )
     return nondominated_points(points)
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD+, hypervolume and IGD of every finished run that has solutions; index algorithm and run, a column for each
-    indicator.
+    """IGD+, hypervolume and IGD of every finished run that has solutions; index algorithm and run,
+    a column for each indicator.
 
-    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest point, in the
-    objectives' units; IGD+ counts only the objectives in which this point is worse, and is normalised.
+    IGD is the mean Euclidean distance from each point of the reference front to the run's nearest
+    point, in the objectives' units; IGD+ counts only the objectives in which this point is worse,
+    and is normalised.
 
     Raises
     ------
@@ -96,26 +107,29 @@ def compute_indicators(case: Case) -> pd.DataFrame:
 
 
 def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
-    """The finished runs that have rows, each with its rows, in the study's order of algorithms; raises
-    UnanswerableError if there are none.
+    """The finished runs that have rows, each with its rows, in the study's order of algorithms;
+    raises UnanswerableError if there are none.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
     if not groups.keys() & set(runs):
-        raise UnanswerableError(case.name, "has no evaluations", "results with the journals of their runs")
+        raise UnanswerableError(
+            case.name, "has no evaluations", "results with the journals of their runs"
+        )
     return [(run, groups[run]) for run in runs if run in groups]
 
 
 def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
-    """The evaluations that a search may return: all objectives are defined, and the original vehicle is safe in the
-    same encounter.
+    """The evaluations that a search may return: all objectives are defined, and the original
+    vehicle is safe in the same encounter.
     """
     is_defined = np.isfinite(minimised_values(case, frame)).all(axis=1)
     return pd.DataFrame(frame[is_defined & case.scoring.feasible_rows(frame)])
 
 
 def nondominated_evaluations(case: Case) -> pd.DataFrame:
-    """The evaluations of each finished run that no other one of the run dominates: what random search returns.
+    """The evaluations of each finished run that no other one of the run dominates: what random
+    search returns.
 
     Raises
     ------
@@ -124,14 +138,16 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
     """
     runs = [valid_evaluations(case, rows) for _, rows in _frames_of_runs(case, case.evaluations)]
     fronts: list[pd.DataFrame] = [
-        rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)] for rows in runs if len(rows)
+        rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)]
+        for rows in runs
+        if len(rows)
     ]
     return pd.concat([case.evaluations[:0], *fronts], ignore_index=True)
 
 
 def describe_rules(case: Case) -> str:
-    """Which algorithms return other settings than `nondominated_evaluations`, in a sentence; "" if none does, or if the
-    evaluations are unknown.
+    """Which algorithms return other settings than `nondominated_evaluations`, in a sentence; "" if
+    none does, or if the evaluations are unknown.
     """
     if case.evaluations.empty:
         return ""
@@ -142,17 +158,18 @@ def describe_rules(case: Case) -> str:
     if not len(others):
         return ""
     return (
-        f"algorithms return solutions by different rules: those of {', '.join(map(case.title_of, others))} are not all "
-        "settings that nothing in the run dominates. Means over solutions depend on the rule; rq2-common applies one "
-        "rule to all."
+        "algorithms return solutions by different rules: those of"
+        f" {', '.join(map(case.title_of, others))} are not all settings that nothing in the run"
+        " dominates. Means over solutions depend on the rule; rq2-common applies one rule to all."
     )
 
 
 def count_evaluations(case: Case) -> pd.DataFrame:
     """The evaluations of every finished run; columns algorithm, run, requested, simulated, budget.
 
-    Equal settings are simulated once, so `simulated` counts different settings. A run has requested its whole budget if
-    a new setting is in its last generation; else it ended with its last new setting.
+    Equal settings are simulated once, so `simulated` counts different settings. A run has requested
+    its whole budget if a new setting is in its last generation; else it ended with its last new
+    setting.
 
     Raises
     ------
@@ -169,13 +186,15 @@ def count_evaluations(case: Case) -> pd.DataFrame:
 
 
 def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
-    """How many settings a run of each algorithm simulates, the mean of `count_evaluations`, and why fewer than the
-    budget.
+    """How many settings a run of each algorithm simulates, the mean of `count_evaluations`, and why
+    fewer than the budget.
     """
     texts = []
     for algorithm, rows in counts.groupby("algorithm", sort=False):
         requested, simulated, budget = rows[["requested", "simulated", "budget"]].mean().round()
-        end = "it stops by its own rule" if algorithm in case.stop_by_themselves else "it ended early"
+        end = (
+            "it stops by its own rule" if algorithm in case.stop_by_themselves else "it ended early"
+        )
         reasons = [end] if requested < budget else []
         reasons += ["equal settings are simulated once"] if simulated < requested else []
         words = f" ({' and '.join(reasons)})" if reasons else ""
@@ -184,27 +203,32 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
 
 
 def few_evaluations(case: Case) -> str:
-    """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget, without those that say that
-    they stop by themselves; "" without any.
+    """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget, without
+    those that say that they stop by themselves; "" without any.
     """
     if not case.has_runs or case.evaluations.empty or not case.finished_runs:
         return ""
     counts = count_evaluations(case)
     sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform("sum")
-    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin([*case.stop_by_themselves])
+    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin(
+        [*case.stop_by_themselves]
+    )
     if not is_few.any():
         return ""
     share = f"{USUAL_SHARE:.0%}"
     texts = describe_evaluations(case, counts[is_few])
-    return f"{case.name}: less than {share} of a run's evaluations are simulated: {texts}. Are the options as meant?"
+    return (
+        f"{case.name}: less than {share} of a run's evaluations are simulated: {texts}. Are the"
+        " options as meant?"
+    )
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of all that each run has evaluated after a number of evaluations; columns algorithm, run,
-    evaluations, hypervolume.
+    """The hypervolume of all that each run has evaluated after a number of evaluations; columns
+    algorithm, run, evaluations, hypervolume.
 
-    Objectives are normalised as in `compute_indicators`. The numbers end with the longest run of the algorithm. The
-    hypervolume is 0 as long as no evaluation dominates the reference point.
+    Objectives are normalised as in `compute_indicators`. The numbers end with the longest run of
+    the algorithm. The hypervolume is 0 as long as no evaluation dominates the reference point.
 
     Raises
     ------
@@ -226,15 +250,24 @@ def compute_convergence(case: Case) -> pd.DataFrame:
             new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
             volumes.append(hypervolume(front))
-        columns = {"algorithm": algorithm, "run": run, "evaluations": counts_of_run[1:], "hypervolume": volumes}
+        columns = {
+            "algorithm": algorithm,
+            "run": run,
+            "evaluations": counts_of_run[1:],
+            "hypervolume": volumes,
+        }
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
 
 def summarise_convergence(case: Case) -> pd.DataFrame:
-    """`compute_convergence` over the runs: the median, and the quartiles as low and high; columns algorithm,
-    evaluations, hypervolume, low, high.
+    """`compute_convergence` over the runs: the median, and the quartiles as low and high; columns
+    algorithm, evaluations, hypervolume, low, high.
     """
-    growth = compute_convergence(case).groupby(["algorithm", "evaluations"], sort=False)["hypervolume"]
+    growth = compute_convergence(case).groupby(["algorithm", "evaluations"], sort=False)[
+        "hypervolume"
+    ]
     names = {"hypervolume": 0.5, "low": 0.25, "high": 0.75}
-    return pd.DataFrame({name: growth.quantile(share) for name, share in names.items()}).reset_index()
+    return pd.DataFrame(
+        {name: growth.quantile(share) for name, share in names.items()}
+    ).reset_index()

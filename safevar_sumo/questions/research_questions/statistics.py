@@ -1,5 +1,6 @@
-"""Statistics of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed ranks, the log-rank
-test, effect sizes, medians, their intervals, and Holm's correction for many tests.
+"""Statistics of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed
+ranks, the log-rank test, effect sizes, medians, their intervals, and Holm's correction for many
+tests.
 """
 
 from __future__ import annotations
@@ -18,34 +19,42 @@ from numpy.typing import ArrayLike
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
-"""By default, a p-value below this level is significant, and intervals have the confidence 1 - ALPHA."""
+"""By default, a p-value below this level is significant, and intervals have the confidence 1 -
+ALPHA.
+"""
 EXACT_SAMPLE_SIZE = 8
-"""Without ties, the p-value of U is exact if one sample has at most this many values; otherwise it is a normal
-approximation."""
+"""Without ties, the p-value of U is exact if one sample has at most this many values; otherwise it
+is a normal approximation.
+"""
 MAX_EXACT_RUNS = 50
 """Without ties and differences of zero, the signed-rank test is exact for up to this many runs."""
 EXACT_TEST = "Mann-Whitney U, two-sided, exact"
-ASYMPTOTIC_TEST = "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
+ASYMPTOTIC_TEST = (
+    "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
+)
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
-ASYMPTOTIC_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+ASYMPTOTIC_SIGNED_TEST = (
+    "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+)
 Interval = tuple[float, float]
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
 
 
 def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
-    """Smallest number of runs of every algorithm with which a test of RQ1 or RQ2 can be significant, after Holm's
-    correction for so many tests.
+    """Smallest number of runs of every algorithm with which a test of RQ1 or RQ2 can be
+    significant, after Holm's correction for so many tests.
     """
     return next(n for n in count(1) if can_be_significant(question, n, n, alpha, tests))
 
 
 def can_be_significant(question: str, m: int, n: int, alpha: float = ALPHA, tests: int = 1) -> bool:
-    """Whether a test of m runs, of RQ2 against n runs of another algorithm, can be significant after Holm's correction
-    for so many tests.
+    """Whether a test of m runs, of RQ2 against n runs of another algorithm, can be significant
+    after Holm's correction for so many tests.
 
-    The smallest two-sided p-value is 2 / 2^m by the exact distribution of RQ1's signed-rank test, and 2 / C(m + n, n)
-    by that of RQ2's U test. Holm multiplies the smallest one of a family by the number of its tests.
+    The smallest two-sided p-value is 2 / 2^m by the exact distribution of RQ1's signed-rank test,
+    and 2 / C(m + n, n) by that of RQ2's U test. Holm multiplies the smallest one of a family by the
+    number of its tests.
     """
     orders = 2**m if question == "RQ1" else math.comb(m + n, n)
     return 2 * max(tests, 1) / orders < alpha
@@ -54,8 +63,8 @@ def can_be_significant(question: str, m: int, n: int, alpha: float = ALPHA, test
 class TwoSampleTest(NamedTuple):
     """Comparison of two samples X and Y; NaN and None where a sample is empty.
 
-    `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples' sizes, `method` the name
-    of the test.
+    `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples'
+    sizes, `method` the name of the test.
     """
 
     p_value: float
@@ -76,7 +85,9 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     second = np.asarray(y, dtype=float)
     if not first.size or not second.size:
         return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
-    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values([*first, *second])
+    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values(
+        [*first, *second]
+    )
     name, method = (EXACT_TEST, "exact") if is_exact else (ASYMPTOTIC_TEST, "asymptotic")
     test = scipy.stats.mannwhitneyu(first, second, method=method, nan_policy="raise")
     a12 = float(test.statistic) / (first.size * second.size)
@@ -95,8 +106,8 @@ def magnitude_of(effect_size: float) -> str:
 
 
 def signed_rank_test(sample: ArrayLike) -> TwoSampleTest:
-    """Compare independent differences, shape (N,), with 0 by Wilcoxon's test; the effect size is the share of greater
-    ones.
+    """Compare independent differences, shape (N,), with 0 by Wilcoxon's test; the effect size is
+    the share of greater ones.
 
     The test drops differences of 0 (as Wilcoxon did); the effect size counts them by half.
     """
@@ -106,14 +117,20 @@ def signed_rank_test(sample: ArrayLike) -> TwoSampleTest:
     if not differences.any():
         return TwoSampleTest(1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST)
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
-    is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values([0.0, *np.abs(differences)])
+    is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values(
+        [0.0, *np.abs(differences)]
+    )
     name, method = (EXACT_SIGNED_TEST, "exact") if is_exact else (ASYMPTOTIC_SIGNED_TEST, "approx")
     test = scipy.stats.wilcoxon(differences, correction=not is_exact, method=method)
-    return TwoSampleTest(float(test.pvalue), effect, magnitude_of(effect), differences.size, 1, name)
+    return TwoSampleTest(
+        float(test.pvalue), effect, magnitude_of(effect), differences.size, 1, name
+    )
 
 
 def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
-    """Correct p-values by Holm's step-down method (Holm 1979); NaN stays NaN and does not count as a test."""
+    """Correct p-values by Holm's step-down method (Holm 1979); NaN stays NaN and does not count as
+    a test.
+    """
     values = pd.Series(list(p_values), dtype=float)
     ascending = values.dropna().sort_values()
     corrected = (ascending * np.arange(len(ascending), 0, -1)).clip(upper=1.0).cummax()
@@ -121,40 +138,51 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
 
 
 def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) -> Interval:
-    """The interval of an effect size of m against n values, or without n against one, at the confidence 1 - alpha.
+    """The interval of an effect size of m against n values, or without n against one, at the
+    confidence 1 - alpha.
 
-    It holds the values that differ from the effect by at most as many standard errors, as these values have them, as
-    the normal distribution allows: Newcombe's (2006, method 5) and, against one value, Wilson's of a share. Unlike the
-    bootstrap's it has a width where all values of one sample are greater. NaN for an undefined effect.
+    It holds the values that differ from the effect by at most as many standard errors, as these
+    values have them, as the normal distribution allows: Newcombe's (2006, method 5) and, against
+    one value, Wilson's of a share. Unlike the bootstrap's it has a width where all values of one
+    sample are greater. NaN for an undefined effect.
     """
     limit = float(scipy.stats.norm.isf(alpha / 2)) ** 2
 
     def excess(value: float) -> float:
         variance = value * (1 - value) / m
         if n is not None:
-            variance *= (1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))) / n
+            variance *= (
+                1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))
+            ) / n
         return (effect - value) ** 2 - limit * variance
 
     if math.isnan(effect):
         return math.nan, math.nan
     # From beside the effect, where the excess is below 0, whatever the effect.
     starts = {end: effect + 1e-9 * (end - effect) for end in (0.0, 1.0)}
-    low, high = (end if effect == end else scipy.optimize.brentq(excess, start, end) for end, start in starts.items())
+    low, high = (
+        end if effect == end else scipy.optimize.brentq(excess, start, end)
+        for end, start in starts.items()
+    )
     return low, high
 
 
 def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
-    """The interval of a median, at a confidence of at least 1 - alpha, between two order statistics; NaN if there are
-    too few values.
+    """The interval of a median, at a confidence of at least 1 - alpha, between two order
+    statistics; NaN if there are too few values.
     """
     ordered = np.sort(np.asarray(values, dtype=float))
-    rank = int(scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5))  # the first whose probability is not too small
+    rank = int(
+        scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5)
+    )  # the first whose probability is not too small
     return (ordered[rank - 1], ordered[-rank]) if rank else (math.nan, math.nan)
 
 
-def survival_median(times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA) -> tuple[float, Interval]:
-    """The median time to an event, of which some are censored, by Kaplan and Meier, and its interval by Brookmeyer and
-    Crowley (log-log); NaN where half of the runs do not reach it.
+def survival_median(
+    times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA
+) -> tuple[float, Interval]:
+    """The median time to an event, of which some are censored, by Kaplan and Meier, and its
+    interval by Brookmeyer and Crowley (log-log); NaN where half of the runs do not reach it.
     """
     curve = scipy.stats.ecdf(_censored(times, has_ended)).sf
     with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
@@ -168,8 +196,8 @@ def survival_median(times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA
 
 
 def log_rank_test(first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, ArrayLike]) -> float:
-    """The p-value of the log-rank test of two samples, each of times and of whether they have ended; NaN where it is
-    undefined, as without an event.
+    """The p-value of the log-rank test of two samples, each of times and of whether they have
+    ended; NaN where it is undefined, as without an event.
     """
     if not (np.any(first[1]) or np.any(second[1])):
         return math.nan
@@ -178,4 +206,6 @@ def log_rank_test(first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, A
 
 
 def _censored(times: ArrayLike, has_ended: ArrayLike) -> scipy.stats.CensoredData:
-    return scipy.stats.CensoredData.right_censored(np.asarray(times, dtype=float), ~np.asarray(has_ended, dtype=bool))
+    return scipy.stats.CensoredData.right_censored(
+        np.asarray(times, dtype=float), ~np.asarray(has_ended, dtype=bool)
+    )

@@ -1,5 +1,5 @@
-"""The tables of the research questions by name: what computes them; titles, columns, and how readers see them are in
-tables.toml beside this module.
+"""The tables of the research questions by name: what computes them; titles, columns, and how
+readers see them are in tables.toml beside this module.
 """
 
 from __future__ import annotations
@@ -11,17 +11,25 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Column, Wide, with_interval
 from safevar_sumo.questions.research_questions import changes, comparisons
-from safevar_sumo.questions.research_questions.fronts import count_evaluations, summarise_convergence
+from safevar_sumo.questions.research_questions.fronts import (
+    count_evaluations,
+    summarise_convergence,
+)
 from safevar_sumo.shipped import shipped_table
 
 WEATHER, CAUSES = "weather", "causes"
-CHOSEN = (*("rq1-runs", "rq2-runs", "rq2-common", "medians", "first-collision"), *(CAUSES, "rq1", "rq2", "a12"))
+CHOSEN = (
+    *("rq1-runs", "rq2-runs", "rq2-common", "medians", "first-collision"),
+    *(CAUSES, "rq1", "rq2", "a12"),
+)
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
 
 class PaperTable(NamedTuple):
-    """A table: its title, the function of a case (of the weather: of all cases) that computes it, and its columns."""
+    """A table: its title, the function of a case (of the weather: of all cases) that computes it,
+    and its columns.
+    """
 
     title: str
     compute: Compute
@@ -39,7 +47,9 @@ class PaperTable(NamedTuple):
             has_interval = facts.pop("interval", False)
             column = Column(**{"unit": "", **facts})
             columns |= with_interval(key, column) if has_interval else {key: column}
-        return cls(table["title"], compute, columns, Wide(**table["wide"]) if "wide" in table else None)
+        return cls(
+            table["title"], compute, columns, Wide(**table["wide"]) if "wide" in table else None
+        )
 
 
 DATA = shipped_table("questions/research_questions/tables.toml")
@@ -65,5 +75,7 @@ FUNCTIONS: Mapping[str, Compute] = {
 }
 OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 POOLED = ("rq1", "rq2", "collisions")
-"""The tables that answer the questions about results with runs, and about imported solutions, which have none."""
+"""The tables that answer the questions about results with runs, and about imported solutions, which
+have none.
+"""
 TABLES = {name: PaperTable.of(name, compute) for name, compute in FUNCTIONS.items()}

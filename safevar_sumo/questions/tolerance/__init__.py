@@ -29,8 +29,20 @@ from safevar_sumo.questions.tolerance.left_out import Contacts, contacts_left_ou
 from safevar_sumo.questions.tolerance.levels import LevelSearch
 from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
-from safevar_sumo.questions.tolerance.rows import CHARACTERISTIC, LIMITS, UNCERTAINTY, limit_rows, uncertainty_rows
-from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, WHOLE_POINT_LOSS, OneAtATimeScan, scan
+from safevar_sumo.questions.tolerance.rows import (
+    CHARACTERISTIC,
+    LIMITS,
+    UNCERTAINTY,
+    limit_rows,
+    uncertainty_rows,
+)
+from safevar_sumo.questions.tolerance.scans import (
+    SCAN_STAGE,
+    SCAN_VALUES,
+    WHOLE_POINT_LOSS,
+    OneAtATimeScan,
+    scan,
+)
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.questions.tolerance.trial import TRIAL_STAGE
@@ -49,13 +61,16 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 LIMITS_TITLE = (
-    "Limits, rounded to the safe side; a car beyond one has the others at theirs unless a sentence says which"
+    "Limits, rounded to the safe side; a car beyond one has the others at theirs unless a sentence"
+    " says which"
 )
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
     "low": Column(
-        "", "first simulated value that is so, all others as in the original, with the study's own fit", ".6g"
+        "",
+        "first simulated value that is so, all others as in the original, with the study's own fit",
+        ".6g",
     ),
     "high": Column("", "last one", ".6g"),
     "degree_low": Column("m", "safety degree at the first value; in -m/s on a collision", ".2f"),
@@ -63,8 +78,13 @@ INTERVALS: Columns = {
 }
 FITS: Columns = {
     "fit": Column("-", "number of the fit among the sets of [spread]; 0 is the study's own", "d"),
-    "specified": "whether the specified limits hold with it; left out: the original is unsafe or keeps too little",
-    "corners": Column("", "what the worst corner of the limits together keeps [m], or has of a metric", ".2f"),
+    "specified": (
+        "whether the specified limits hold with it; left out: the original is unsafe or keeps too"
+        " little"
+    ),
+    "corners": Column(
+        "", "what the worst corner of the limits together keeps [m], or has of a metric", ".2f"
+    ),
 }
 POINTS: Columns = {
     **CHARACTERISTIC,
@@ -82,7 +102,9 @@ MAX_REFUTED = 4
 NEAREST: Columns = {
     **CHARACTERISTIC,
     "limit": Column("", "the specified value", ".10g"),
-    "nearest": Column("", "the nearest value with which limits together exist, the others as specified", ".10g"),
+    "nearest": Column(
+        "", "the nearest value with which limits together exist, the others as specified", ".10g"
+    ),
 }
 
 
@@ -113,50 +135,60 @@ def tolerance(
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
-    The limits hold in every fit of the vehicle, within a scope that is stated. The limits together hold none of the
-    unsafe solutions of results. In a study that searches its scenario they hold in all encounters in which the original
-    vehicle is safe.
+    The limits hold in every fit of the vehicle, within a scope that is stated. The limits together
+    hold none of the unsafe solutions of results. In a study that searches its scenario they hold in
+    all encounters in which the original vehicle is safe.
 
     Parameters
     ----------
     limits
-        A limit in the characteristic's unit, such as "treadDepth >= 3", beside those of [limits] in the study; may be
-        repeated. All others get the largest box that is safe then; exit code 3 if a limit is not kept or the
-        original itself is unsafe.
+        A limit in the characteristic's unit, such as "treadDepth >= 3", beside those of [limits] in
+        the study; may be repeated. All others get the largest box that is safe then; exit code 3 if
+        a limit is not kept or the original itself is unsafe.
     characteristics
-        Only these characteristics, separated by commas; all others keep their values. By default all.
+        Only these characteristics, separated by commas; all others keep their values. By default
+        all.
     margin
-        Distance to keep from a collision with the study's own fit [m], between bumpers; by default the model's error
-        that the study states, else 0.3 m, and 0.1 m in a study that searches its scenario, whose originals keep more.
+        Distance to keep from a collision with the study's own fit [m], between bumpers; by default
+        the model's error that the study states, else 0.3 m, and 0.1 m in a study that searches its
+        scenario, whose originals keep more.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) in which the limits hold,
-        by default all; 0 for the study's own alone.
+        Number of vehicle models that fit the published data about as well (sets of [spread]) in
+        which the limits hold, by default all; 0 for the study's own alone.
     attack
-        Number of simulations that search for a counterexample to the limits together, over all fits, at least 1,000; 0
-        leaves this search out, and then no limit is called kept. With fewer than by default the answer is rough.
+        Number of simulations that search for a counterexample to the limits together, over all
+        fits, at least 1,000; 0 leaves this search out, and then no limit is called kept. With fewer
+        than by default the answer is rough.
     by
-        A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits alone that hold up
-        to each, and up to which value the specified limits hold.
+        A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits
+        alone that hold up to each, and up to which value the specified limits hold.
     together
-        Joint limits, which hold all at the same time; they are always sought without `by`, and never beside it.
+        Joint limits, which hold all at the same time; they are always sought without `by`, and
+        never beside it.
     """
     study = evaluator.study
     members = evaluator.characteristics
     parameter = None if by is None else Parameter.parse(by, study)
     check_by(by, unsafe, together)
-    evaluator.plan(SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TRIAL_STAGE, *([WIDER_STAGE] if study.wider else []))
+    evaluator.plan(
+        SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TRIAL_STAGE, *([WIDER_STAGE] if study.wider else [])
+    )
     columns = _columns_of(members.vehicle.names, characteristics)
     specified = _limits_of(study, limits, columns)
     original = evaluator.evaluate_original()
     criterion = limit_criterion(evaluator, subject, unsafe, margin, original)
     if parameter is not None:
         solutions = _unsafe_solutions(subject, range(len(members)), criterion)
-        is_alone = np.count_nonzero((solutions != members.original) & members.of_vehicle, axis=1) == 1
+        is_alone = (
+            np.count_nonzero((solutions != members.original) & members.of_vehicle, axis=1) == 1
+        )
         search = LevelSearch(evaluator, parameter, criterion, columns, specified, fits, attack)
         return answer_by(search, solutions[is_alone])
-    is_sought = not is_rated(study)  # a box of a rated study would take thousands of whole test matrices
+    is_sought = not is_rated(
+        study
+    )  # a box of a rated study would take thousands of whole test matrices
     if is_sought:
         _check_drawable(evaluator)
     is_safe = not criterion.of(original)[0]
@@ -165,20 +197,33 @@ def tolerance(
     within = None if is_scanned else [(members.original[column],) * 2 for column in columns]
     with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(columns)):
         scans = scan(evaluator, columns, criterion, within, None if is_scanned else 1)
-    models = models_of(evaluator, criterion, fits) if is_sought and is_safe else Models.own_alone(evaluator, criterion)
+    models = (
+        models_of(evaluator, criterion, fits)
+        if is_sought and is_safe
+        else Models.own_alone(evaluator, criterion)
+    )
     judges = _denser(models, attack) if is_sought else models.members
     search_alone = AloneSearch(scans, columns, judges)
-    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))):
+    with evaluator.stage(
+        ALONE_STAGE, len(judges) * VALUES * len(columns) * (1 + len(evaluator.critical_encounters))
+    ):
         search_alone.run(attack)
     found_together: LimitsTogether | None = None
     if is_sought and is_safe:
         all_columns = [*columns, *np.flatnonzero(~members.of_vehicle).tolist()]
-        everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
-        known = [_unsafe_solutions(subject, all_columns, criterion), _unsafe_alone(evaluator, criterion, scans)]
+        everywhere = {
+            item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
+        }
+        known = [
+            _unsafe_solutions(subject, all_columns, criterion),
+            _unsafe_alone(evaluator, criterion, scans),
+        ]
         all_limits = {**specified, **everywhere}
         for _ in range(MAX_REFUTED):
             unsafe_settings = np.concatenate([*known, search_alone.failures])
-            found_together = find_limits_together(models, all_columns, all_limits, scans, unsafe_settings, attack)
+            found_together = find_limits_together(
+                models, all_columns, all_limits, scans, unsafe_settings, attack
+            )
             search_alone.meet(found_together.searched, found_together.failures_alone)
             if not _is_refuted(found_together, search_alone.failures):
                 break
@@ -187,32 +232,59 @@ def tolerance(
     contacts = None
     if found_together is not None and attack and len(members.scenario):
         contacts = contacts_left_out(models.members, [found_together.box or found_together.promise])
-    found = limit_rows(alone, found_together, specified, models.members, scope_of(study, between=attack > 0))
+    found = limit_rows(
+        alone, found_together, specified, models.members, scope_of(study, between=attack > 0)
+    )
     if not attack:
         found = found.without_kept()
     tables = {
         "limits": tabulate(LIMITS_TITLE, LIMITS, found.rows),
-        "intervals": tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans)),
+        "intervals": tabulate(
+            "Each alone, all others as in the original", INTERVALS, _intervals(scans)
+        ),
     }
     domains = [(one.characteristic.lower, one.characteristic.upper) for one in scans]
     tables["limits"].attrs["bars"] = bars_of(tables["limits"], domains)
     if moved := uncertainty_rows(alone):
-        tables["uncertainty"] = tabulate("Limits alone: with one fit and with all", UNCERTAINTY, moved)
+        tables["uncertainty"] = tabulate(
+            "Limits alone: with one fit and with all", UNCERTAINTY, moved
+        )
     if found_together is not None and len(models.members) + len(models.left_out) > 1:
-        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, _fit_rows(models, found_together))
+        tables["fits"] = tabulate(
+            "The limits in each fit of the vehicle", FITS, _fit_rows(models, found_together)
+        )
     if is_rated(study):
         tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
-    nearest = nearest_limits(models, specified) if found.broken and found_together is not None else []
+    nearest = (
+        nearest_limits(models, specified) if found.broken and found_together is not None else []
+    )
     if nearest:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
-    wider = wider_rows(evaluator, specified, found_together, unsafe, margin, fits, attack) if is_safe else []
+    wider = (
+        wider_rows(evaluator, specified, found_together, unsafe, margin, fits, attack)
+        if is_safe
+        else []
+    )
     if wider:
         tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
-    refusal = "" if is_safe else f"the original itself {criterion.breach_in_words(original)}: no limit can be kept"
+    refusal = (
+        ""
+        if is_safe
+        else f"the original itself {criterion.breach_in_words(original)}: no limit can be kept"
+    )
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in found.broken)
     is_kept = None if not failures and not attack else not failures
     sentences = verdict_sentences(
-        models, alone, found_together, specified, found.broken, attack, nearest, wider, refusal, contacts
+        models,
+        alone,
+        found_together,
+        specified,
+        found.broken,
+        attack,
+        nearest,
+        wider,
+        refusal,
+        contacts,
     )
     return Answer(
         question="tolerance",
@@ -252,8 +324,15 @@ def _check_drawable(evaluator: Evaluator) -> None:
     """Refuse a study of which hardly any setting is feasible, before the long scans."""
     members = evaluator.characteristics
     region = evaluator.region
-    if not len(Box(region, members.lower, members.upper).draw(1, np.random.default_rng(evaluator.study.search.seed))):
-        problem = f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no box to test: "
+    if not len(
+        Box(region, members.lower, members.upper).draw(
+            1, np.random.default_rng(evaluator.study.search.seed)
+        )
+    ):
+        problem = (
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
+            " box to test: "
+        )
         legal = "characteristics that the constraints do not tie to each other"
         raise InputError(evaluator.study.source, f"{problem}{region}", legal)
 
@@ -285,20 +364,35 @@ def _limits_of(study: Study, texts: Sequence[str], columns: Sequence[int]) -> di
     with about("limits"):
         for name in limits_of(texts, rows):
             check_name("", f"{name} does not vary with these --characteristics", name, varied)
-        return {name: limit for name, limit in limits_of(texts, rows, study.limits).items() if name in varied}
+        return {
+            name: limit
+            for name, limit in limits_of(texts, rows, study.limits).items()
+            if name in varied
+        }
 
 
-def _unsafe_alone(evaluator: Evaluator, unsafe: Unsafe, scans: Sequence[OneAtATimeScan]) -> FloatArray:
+def _unsafe_alone(
+    evaluator: Evaluator, unsafe: Unsafe, scans: Sequence[OneAtATimeScan]
+) -> FloatArray:
     """The ends of the unsafe intervals as settings, shape (K, n), each in its worst encounter."""
     characteristics = evaluator.characteristics
-    ends = [(one.characteristic.name, end) for one in scans for interval in one.of_state("unsafe") for end in interval]
+    ends = [
+        (one.characteristic.name, end)
+        for one in scans
+        for interval in one.of_state("unsafe")
+        for end in interval
+    ]
     settings = [characteristics.setting({name: end}) for name, end in ends]
     ends_of_intervals = np.array(settings).reshape(-1, len(characteristics))
-    return evaluator.evaluate_over_encounters(ends_of_intervals, unsafe, "ends of what is unsafe alone").settings
+    return evaluator.evaluate_over_encounters(
+        ends_of_intervals, unsafe, "ends of what is unsafe alone"
+    ).settings
 
 
 def _unsafe_solutions(subject: Study | Case, columns: Sequence[int], unsafe: Unsafe) -> FloatArray:
-    """The distinct unsafe solutions of results that change no other characteristics than `columns`, shape (K, n)."""
+    """The distinct unsafe solutions of results that change no other characteristics than `columns`,
+    shape (K, n).
+    """
     if isinstance(subject, Study):
         return np.zeros((0, len(CharacteristicSet.of(subject))))
     names = list(subject.characteristics.names)
@@ -314,7 +408,9 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
     for one in scans:
         degrees = {f"degree_{end}": one.intervals[end].map(one.degree) for end in ("low", "high")}
         frames.append(
-            one.intervals.assign(characteristic=one.characteristic.name, unit=one.characteristic.unit, **degrees)
+            one.intervals.assign(
+                characteristic=one.characteristic.name, unit=one.characteristic.unit, **degrees
+            )
         )
     return pd.concat(frames, ignore_index=True)[[*INTERVALS]]
 
@@ -323,7 +419,9 @@ def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]
     """A row of `FITS` for each fit."""
     states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
     states |= dict.fromkeys(models.left_out, "left out")
-    return [(fit, state, together.corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
+    return [
+        (fit, state, together.corners.get(fit, np.nan)) for fit, state in sorted(states.items())
+    ]
 
 
 def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:
@@ -345,13 +443,17 @@ def _draw(answer: Answer, scans: Sequence[OneAtATimeScan]) -> Figure:
     from safevar_sumo.questions.figures import DEGREE_LABEL, FONT_SIZE, new_panels
 
     column = RATING_POINTS.name if is_rated(answer.study) else SAFETY_DEGREE
-    title = f"{answer.study.name}: one characteristic at a time (unsafe: {answer.numbers['unsafe']})"
+    title = (
+        f"{answer.study.name}: one characteristic at a time (unsafe: {answer.numbers['unsafe']})"
+    )
     figure, axes = new_panels(title, len(scans), 4, (2.3, 1.75), min_width=4.6, title_height=1.1)
     for axis, one, row in zip(axes, scans, answer.tables["limits"].to_dict("records"), strict=True):
         if axis is not axes[0]:
             axis.sharey(axes[0])  # so that steep profiles stand out
         _draw_profile(axis, one, row, column)
-    figure.supylabel(DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT_SIZE)
+    figure.supylabel(
+        DEGREE_LABEL if column == SAFETY_DEGREE else RATING_POINTS.title, fontsize=FONT_SIZE
+    )
     dashed = "; below a dashed line: collisions" if column == SAFETY_DEGREE else ""
     ranges = "light: limits of all together;\nbar below: limits alone"
     marks = f"dot: the original vehicle; hatched: unsafe; {ranges}; line: specified"
@@ -360,17 +462,35 @@ def _draw(answer: Answer, scans: Sequence[OneAtATimeScan]) -> Figure:
 
 
 def _draw_profile(axis: Axes, one: OneAtATimeScan, row: Mapping[Any, Any], column: str) -> None:
-    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, SKY_BLUE, VERMILION, as_formula, escape_dollars
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        FONT_SIZE,
+        SKY_BLUE,
+        VERMILION,
+        as_formula,
+        escape_dollars,
+    )
 
     item = one.characteristic
     profile = one.profile.set_index("value")[column]
     axis.plot(profile, color=BLUE, linewidth=1.2)
     for low, high in one.of_state("unsafe"):
-        axis.axvspan(low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0)
+        axis.axvspan(
+            low, high, facecolor=VERMILION, alpha=0.35, hatch="////", edgecolor="white", linewidth=0
+        )
     if not pd.isna(row["together_low"]):
-        axis.axvspan(row["together_low"], row["together_high"], facecolor=SKY_BLUE, alpha=0.25, linewidth=0)
+        axis.axvspan(
+            row["together_low"], row["together_high"], facecolor=SKY_BLUE, alpha=0.25, linewidth=0
+        )
     ends_alone = (row["alone_low"], row["alone_high"])
-    axis.plot(ends_alone, (0.03, 0.03), transform=axis.get_xaxis_transform(), color=BLUE, linewidth=4, alpha=0.5)
+    axis.plot(
+        ends_alone,
+        (0.03, 0.03),
+        transform=axis.get_xaxis_transform(),
+        color=BLUE,
+        linewidth=4,
+        alpha=0.5,
+    )
     for value in (row["specified_low"], row["specified_high"]):
         if not pd.isna(value):
             axis.axvline(value, color=VERMILION, linewidth=1.5)

@@ -1,4 +1,6 @@
-"""Limits of each characteristic alone that hold in all fits, between the points of a matrix and in all encounters."""
+"""Limits of each characteristic alone that hold in all fits, between the points of a matrix and in
+all encounters.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,18 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import Characteristic
 
 VALUES = 17
-"""Number of values of what is safe alone in the study's own fit that are simulated in each model."""
+"""Number of values of what is safe alone in the study's own fit that are simulated in each model.
+"""
 ATTACKS, ATTACK_SHARE, GENERATIONS = 20, 0.1, 5
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of `--attack` of each, though
-never less than `LEAST_SIMULATIONS`, and its number of generations, the first at the limit itself.
+"""Largest number of attacks on a limit, in a study that searches its scenario; the share of
+`--attack` of each, though never less than `LEAST_SIMULATIONS`, and its number of generations, the
+first at the limit itself.
 """
 ALONE_STAGE = "limits alone with each fit"
 Beyond = tuple[FloatArray, Model] | None
-"""A setting just beyond a limit, and the model in which it is unsafe; None where nothing is known to be."""
+"""A setting just beyond a limit, and the model in which it is unsafe; None where nothing is known
+to be.
+"""
 
 
 class AloneLimit(NamedTuple):
@@ -35,7 +41,8 @@ class AloneLimit(NamedTuple):
     Attributes
     ----------
     safe
-        The safe interval around the original, rounded inwards; ends of the domain stay. None if the original is unsafe.
+        The safe interval around the original, rounded inwards; ends of the domain stay. None if the
+        original is unsafe.
     beyond
         What is just beyond each end.
     """
@@ -51,7 +58,9 @@ class AloneLimit(NamedTuple):
     @property
     def of_own_fit(self) -> Interval | None:
         """What is safe in the scan with the study's own fit, rounded inwards."""
-        return None if self.scan.safe is None else self.characteristic.rounded_inwards(self.scan.safe)
+        return (
+            None if self.scan.safe is None else self.characteristic.rounded_inwards(self.scan.safe)
+        )
 
     @property
     def nearest_failure(self) -> Beyond:
@@ -92,12 +101,16 @@ class _Ends:
 
 
 class AloneSearch:
-    """The search for limits alone that hold in all models, each at some `values`, from scans with the study's own fit,
-    the first model.
+    """The search for limits alone that hold in all models, each at some `values`, from scans with
+    the study's own fit, the first model.
     """
 
     def __init__(
-        self, scans: Sequence[OneAtATimeScan], columns: Sequence[int], models: Sequence[Model], values: int = VALUES
+        self,
+        scans: Sequence[OneAtATimeScan],
+        columns: Sequence[int],
+        models: Sequence[Model],
+        values: int = VALUES,
     ) -> None:
         self.scans = scans
         self.models = models
@@ -107,16 +120,21 @@ class AloneSearch:
             self.ends = [_Ends(scan, column) for scan, column in zip(scans, columns, strict=True)]
             _find_beyond(self.ends, models[0])
 
-    def run(self, budget: int, further: Sequence[Model] = (), attacked: Models | None = None) -> None:
-        """Try values in all models, in the encounters that the scans met and in those of an attack on the limits; the
-        ends alone in `further` models, which have other points between those of a matrix. The attack may be in models
-        with more encounters.
+    def run(
+        self, budget: int, further: Sequence[Model] = (), attacked: Models | None = None
+    ) -> None:
+        """Try values in all models, in the encounters that the scans met and in those of an attack
+        on the limits; the ends alone in `further` models, which have other points between those of
+        a matrix. The attack may be in models with more encounters.
         """
         evaluator = self.models[0].evaluator
-        encounters = np.concatenate([[evaluator.characteristics.original], evaluator.critical_encounters])
+        encounters = np.concatenate(
+            [[evaluator.characteristics.original], evaluator.critical_encounters]
+        )
         for model in self.models if self.ends else ():
             _move_before(self.ends, model, encounters, self.values)
-        # The ends as they are printed, until all are safe in all models: where one moves, it is new to the others.
+        # The ends as they are printed, until all are safe in all models: where one moves, it is new
+        # to the others.
         all_models = [*self.models, *further] if self.ends else []
         while any([_move_before(self.ends, model, encounters, 2) for model in all_models]):
             pass
@@ -125,7 +143,9 @@ class AloneSearch:
             _attack_alone(self.ends, models, budget_alone(budget))
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
-        """Move the limits before failures that another search met, each of one characteristic, shape (K, n)."""
+        """Move the limits before failures that another search met, each of one characteristic,
+        shape (K, n).
+        """
         for model in models if len(failures) and self.ends else ():
             _move(self.ends, model, [_alone_in(each, failures, model) for each in self.ends])
 
@@ -136,7 +156,9 @@ class AloneSearch:
         return np.array(rows).reshape(-1, len(self.models[0].evaluator.characteristics))
 
     def limits(self) -> list[AloneLimit]:
-        return [each.limit() for each in self.ends] or [AloneLimit(scan, None) for scan in self.scans]
+        return [each.limit() for each in self.ends] or [
+            AloneLimit(scan, None) for scan in self.scans
+        ]
 
 
 def budget_alone(budget: int) -> int:
@@ -145,27 +167,35 @@ def budget_alone(budget: int) -> int:
 
 
 def _find_beyond(ends: Sequence[_Ends], own: Model) -> None:
-    """Find what is just beyond the ends of scans: their first unsafe values, each in its worst encounter."""
+    """Find what is just beyond the ends of scans: their first unsafe values, each in its worst
+    encounter.
+    """
     members = own.evaluator.characteristics
     places = [(each, side, each.first_unsafe(side)) for each in ends for side in (0, 1)]
     found = [(each, side, value) for each, side, value in places if value is not None]
     settings = np.array([members.setting({each.item.name: value}) for each, _, value in found])
-    worst = own.evaluator.evaluate_over_encounters(settings.reshape(-1, len(members)), own.unsafe, ALONE_STAGE)
+    worst = own.evaluator.evaluate_over_encounters(
+        settings.reshape(-1, len(members)), own.unsafe, ALONE_STAGE
+    )
     for (each, side, _), setting in zip(found, worst.settings, strict=True):
         each.beyond[side] = setting, own
 
 
 def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, number: int) -> bool:
-    """Move ends before the failures at some values between them, the ends among them, in each of some encounters;
-    whether one has moved.
+    """Move ends before the failures at some values between them, the ends among them, in each of
+    some encounters; whether one has moved.
     """
     settings = [_settings_within(each, encounters, number) for each in ends]
-    lefts = np.split(model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1])
+    lefts = np.split(
+        model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1]
+    )
     return _move(ends, model, [rows[left < 0] for rows, left in zip(settings, lefts, strict=True)])
 
 
 def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatArray:
-    """Settings at values between the ends as they are printed, in each of some encounters, shape (K, n)."""
+    """Settings at values between the ends as they are printed, in each of some encounters, shape
+    (K, n).
+    """
     low, high = ends.limit().safe or ends.ends
     values = np.linspace(low, high, number)
     settings = np.repeat(encounters, len(values), axis=0)
@@ -174,15 +204,19 @@ def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatA
 
 
 def _alone_in(ends: _Ends, failures: FloatArray, model: Model) -> FloatArray:
-    """Those of some settings that change this characteristic, within its ends, and are unsafe in a model."""
+    """Those of some settings that change this characteristic, within its ends, and are unsafe in a
+    model.
+    """
     values = failures[:, ends.column]
-    inside = failures[(values != ends.item.original) & (values >= ends.ends[0]) & (values <= ends.ends[1])]
+    inside = failures[
+        (values != ends.item.original) & (values >= ends.ends[0]) & (values <= ends.ends[1])
+    ]
     return np.asarray(inside[model.are_unsafe(inside, ALONE_STAGE)]) if len(inside) else inside
 
 
 def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -> bool:
-    """Move all ends before their failures in a model at once; those that are outside then do not matter. Whether any
-    end has moved.
+    """Move all ends before their failures in a model at once; those that are outside then do not
+    matter. Whether any end has moved.
     """
     has_moved = False
     while moves := {
@@ -232,7 +266,11 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
             known.append(np.array_split(at_limit, len(models)))
         found = attack_all(boxes, judges, known, budget, rngs, size)
         for judge, model in enumerate(models):
-            _move(waiting, model, [one.settings[(one.left < 0) & (one.judges == judge)] for one in found])
+            _move(
+                waiting,
+                model,
+                [one.settings[(one.left < 0) & (one.judges == judge)] for one in found],
+            )
         waiting = [each for each, one in zip(waiting, found, strict=True) if (one.left < 0).any()]
         if not waiting:
             return

@@ -1,4 +1,6 @@
-"""Values of a searched parameter or of an axis, such as speeds, up to which limits are asked; the study between two."""
+"""Values of a searched parameter or of an axis, such as speeds, up to which limits are asked; the
+study between two.
+"""
 
 from __future__ import annotations
 
@@ -45,27 +47,41 @@ class Parameter(NamedTuple):
         Raises
         ------
         InputError
-            If the study is rated, or does not vary this parameter, or a value is no number or outside what it covers.
+            If the study is rated, or does not vary this parameter, or a value is no number or
+            outside what it covers.
         """
         if is_rated(study):
             legal = "a study that is not rated"
-            raise InputError("by", f"{text!r}: study {study.name!r} is rated, at the points of its protocol", legal)
+            raise InputError(
+                "by",
+                f"{text!r}: study {study.name!r} is rated, at the points of its protocol",
+                legal,
+            )
         if study.matrix is not None and study.matrix.point:
-            raise InputError("by", f"{text!r} beside a point, which has one value", "the option without a point")
+            raise InputError(
+                "by", f"{text!r} beside a point, which has one value", "the option without a point"
+            )
         name, _, listed = (part.strip() for part in text.partition("="))
         if not (name and listed):
             raise InputError("by", repr(text), FORM)
         known = parameters_of(study)
         if not known:
-            legal = "a study that searches it ([scenario.search]) or has it as an axis of its matrix"
+            legal = (
+                "a study that searches it ([scenario.search]) or has it as an axis of its matrix"
+            )
             raise InputError("by", f"study {study.name!r} does not vary {name!r}", legal)
         check_name("by", f"study {study.name!r} does not vary {name!r}", name, known)
         values = tuple(sorted({_number(value, text) for value in listed.split(",")}))
         if name in study.scenario.search:
             domain = study.scenario.search[name]
             if values[0] <= domain.lower or values[-1] > domain.upper:
-                legal = f"values above {domain.lower:g} and up to {domain.upper:g}{unit_text(domain.unit)}"
-                raise InputError("by", f"{text!r} is outside the domain of study {study.name!r}", legal)
+                legal = (
+                    f"values above {domain.lower:g} and up to"
+                    f" {domain.upper:g}{unit_text(domain.unit)}"
+                )
+                raise InputError(
+                    "by", f"{text!r} is outside the domain of study {study.name!r}", legal
+                )
             return cls(name, domain.unit, values, domain.lower)
         return cls._of_axis(name, values, study)
 
@@ -80,7 +96,10 @@ class Parameter(NamedTuple):
         suffix = unit_text(unit)
         if values[-1] > highest:
             ending = join_phrases(test.name for test, points in tests if max(points) == highest)
-            problem = f"{name}={values[-1]:g} is beyond the points of {ending}, which end at {highest:g}{suffix}"
+            problem = (
+                f"{name}={values[-1]:g} is beyond the points of {ending}, which end at"
+                f" {highest:g}{suffix}"
+            )
             wider = f", or the study {study.wider}, whose scope is wider" if study.wider else ""
             raise InputError("by", problem, f"values up to {highest:g}{suffix}{wider}")
         if values[0] < lowest:
@@ -93,28 +112,40 @@ class Parameter(NamedTuple):
         return f"{value:g}{unit_text(self.unit)}"
 
     def scope(self, study: Study, value: float, *, between: bool) -> str:
-        """What limits up to a value cover, in words; `between` two points of a matrix an attack drives."""
+        """What limits up to a value cover, in words; `between` two points of a matrix an attack
+        drives.
+        """
         words = scope_of(study_between(study, self, None, value), between=between)
         if self.name in study.scenario.search:
             return words
         by_test = _points_by_test(study, self.name) if between else []
-        above = [test.name for test, points in by_test if points and min(points) < value and value not in points]
+        above = [
+            test.name
+            for test, points in by_test
+            if points and min(points) < value and value not in points
+        ]
         return (
-            f"{words}; up to {self.text(value)} in {join_phrases(above)} only what the attack drove" if above else words
+            f"{words}; up to {self.text(value)} in {join_phrases(above)} only what the attack drove"
+            if above
+            else words
         )
 
 
 def parameters_of(study: Study) -> list[str]:
-    """The names of a study's searched parameters, and of the axes of its matrix that have numbers."""
+    """The names of a study's searched parameters, and of the axes of its matrix that have
+    numbers.
+    """
     tests = [] if study.matrix is None else study.matrix.tests
-    axes = [name for test in tests for name, values in test.over.items() if all(map(_is_number, values))]
+    axes = [
+        name for test in tests for name, values in test.over.items() if all(map(_is_number, values))
+    ]
     return [*dict.fromkeys([*study.scenario.search, *axes])]
 
 
 def usual_values(study: Study, name: str) -> list[float]:
-    """Up to `MAX_VALUES` values of a searched parameter or an axis, the least first, for a question that states none:
-    of a domain the middle below the original's value, that value and the upper end; of an axis its points. None if the
-    study does not vary it.
+    """Up to `MAX_VALUES` values of a searched parameter or an axis, the least first, for a question
+    that states none: of a domain the middle below the original's value, that value and the upper
+    end; of an axis its points. None if the study does not vary it.
     """
     if name not in parameters_of(study):
         return []
@@ -128,18 +159,26 @@ def usual_values(study: Study, name: str) -> list[float]:
     return reached[:: len(reached) // -MAX_VALUES][::-1]
 
 
-def study_between(study: Study, by: Parameter, low: float | None, high: float, *, at_end: bool = False) -> Study:
+def study_between(
+    study: Study, by: Parameter, low: float | None, high: float, *, at_end: bool = False
+) -> Study:
     """The study at values of a parameter above `low`, or from its lowest on, up to `high`.
 
-    In a searched domain the original encounter has the nearest such value. Of a matrix the points remain, and with
-    `at_end` each test also drives at `high`, where that is between two of its points; the least values have the tests
-    that lack the parameter, too. The matrix may have no test.
+    In a searched domain the original encounter has the nearest such value. Of a matrix the points
+    remain, and with `at_end` each test also drives at `high`, where that is between two of its
+    points; the least values have the tests that lack the parameter, too. The matrix may have no
+    test.
     """
     if by.name in study.scenario.search:
         domain = study.scenario.search[by.name]
         low = domain.lower if low is None else low
-        domain = replace(domain, lower=low, upper=high, original=min(max(domain.original, low), high))
-        return replace(study, scenario=replace(study.scenario, search={**study.scenario.search, by.name: domain}))
+        domain = replace(
+            domain, lower=low, upper=high, original=min(max(domain.original, low), high)
+        )
+        return replace(
+            study,
+            scenario=replace(study.scenario, search={**study.scenario.search, by.name: domain}),
+        )
     assert study.matrix is not None
     tests = list[MatrixTest]()
     for test, points in _points_by_test(study, by.name):
@@ -153,7 +192,9 @@ def study_between(study: Study, by: Parameter, low: float | None, high: float, *
 
 
 def cells_between(study: Study, by: Parameter, low: float | None, high: float) -> list[MatrixTest]:
-    """The tests of a matrix with the ends of all cells of an axis between two values, which need not be points."""
+    """The tests of a matrix with the ends of all cells of an axis between two values, which need
+    not be points.
+    """
     tests = list[MatrixTest]()
     for test, points in _points_by_test(study, by.name):
         if by.name not in test.over:
@@ -161,13 +202,18 @@ def cells_between(study: Study, by: Parameter, low: float | None, high: float) -
         start = min(points) if low is None else max(low, min(points))
         if start < high:
             ends = {value for value in points if start < value < high}
-            tests.append(replace(test, over={**test.over, by.name: sorted({start, *ends, min(high, max(points))})}))
+            tests.append(
+                replace(
+                    test,
+                    over={**test.over, by.name: sorted({start, *ends, min(high, max(points))})},
+                )
+            )
     return tests
 
 
 def with_feasible_encounter(study: Study, region: FeasibleRegion) -> Study:
-    """A study between two values of a searched parameter, with another original encounter if constraints forbid its
-    own; `region` is that of the whole study.
+    """A study between two values of a searched parameter, with another original encounter if
+    constraints forbid its own; `region` is that of the whole study.
 
     Raises
     ------
@@ -177,20 +223,31 @@ def with_feasible_encounter(study: Study, region: FeasibleRegion) -> Study:
     members = CharacteristicSet.of(study)
     if region.feasible(members.original[np.newaxis])[0]:
         return study
-    lower, upper = (np.where(members.of_vehicle, members.original, end) for end in (members.lower, members.upper))
+    lower, upper = (
+        np.where(members.of_vehicle, members.original, end)
+        for end in (members.lower, members.upper)
+    )
     drawn = Box(region, lower, upper).draw(1, np.random.default_rng(study.search.seed))
     if not len(drawn):
-        raise InputError("by", f"no encounter satisfies the constraints of study {study.name!r}", "other values")
+        raise InputError(
+            "by", f"no encounter satisfies the constraints of study {study.name!r}", "other values"
+        )
     values = dict(zip(members.names, drawn[0].tolist(), strict=True))
-    search = {name: replace(one, original=values[name]) for name, one in study.scenario.search.items()}
+    search = {
+        name: replace(one, original=values[name]) for name, one in study.scenario.search.items()
+    }
     return replace(study, scenario=replace(study.scenario, search=search))
 
 
 def _points_by_test(study: Study, name: str) -> list[tuple[MatrixTest, list[float]]]:
     """The tests of a matrix whose scenario has a parameter, each with the values of its points."""
     tests = points_of_tests(study, assemble(study).points)
-    by_test = [(test, sorted({_value_at(point, name) for point in points})) for test, points in tests]
-    return [(test, [value for value in values if not math.isnan(value)]) for test, values in by_test]
+    by_test = [
+        (test, sorted({_value_at(point, name) for point in points})) for test, points in tests
+    ]
+    return [
+        (test, [value for value in values if not math.isnan(value)]) for test, values in by_test
+    ]
 
 
 def _value_at(point: Point, name: str) -> float:
@@ -213,7 +270,9 @@ def _number(text: str, whole: str) -> float:
 
 
 def largest_tried(by: Parameter, points: Sequence[tuple[Point, bool]]) -> float | None:
-    """The largest value of an axis such that all points up to it, and those that lack it, hold; None without one."""
+    """The largest value of an axis such that all points up to it, and those that lack it, hold;
+    None without one.
+    """
     values = [(_value_at(point, by.name), holds) for point, holds in points]
     reached = [value for value in by.values if all(holds for at, holds in values if not at > value)]
     return reached[-1] if reached else None

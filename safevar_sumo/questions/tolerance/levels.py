@@ -1,5 +1,5 @@
-"""Limits that hold up to each of some values of a parameter, such as a speed: each level lies within that of the value
-below, and simulates only what is between the two.
+"""Limits that hold up to each of some values of a parameter, such as a speed: each level lies
+within that of the value below, and simulates only what is between the two.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit
 
 SEARCHED_VALUES, VALUES_OF_FITS = 51, 5
-"""Numbers of values, over what is safe up to the value below, at which a characteristic is scanned in many encounters:
-with the study's own fit, and with each.
+"""Numbers of values, over what is safe up to the value below, at which a characteristic is scanned
+in many encounters: with the study's own fit, and with each.
 """
 POINT_SETS = 3
-"""Number of sets of points between those of a matrix: limits alone are found at the first, and tried at
-the others as they are printed.
+"""Number of sets of points between those of a matrix: limits alone are found at the first, and
+tried at the others as they are printed.
 """
 STAGE = "specified limits up to a value"
 
@@ -53,7 +53,8 @@ class Level(NamedTuple):
     Attributes
     ----------
     alone
-        The limits of each characteristic alone; None where the original itself is unsafe, or safe in no encounter.
+        The limits of each characteristic alone; None where the original itself is unsafe, or safe
+        in no encounter.
     models
         The fits in which they hold.
     search
@@ -103,8 +104,9 @@ class LevelSearch:
             return original_reach(self.evaluator, self.by, self.unsafe)
 
     def contacts(self, levels: Sequence[Level]) -> Contacts | None:
-        """Contacts, in encounters that do not count, of vehicles within the specified limits, or without such limits
-        within each limit alone up to the greatest value; None if no scenario is searched, or nothing was falsified.
+        """Contacts, in encounters that do not count, of vehicles within the specified limits, or
+        without such limits within each limit alone up to the greatest value; None if no scenario is
+        searched, or nothing was falsified.
         """
         alone = levels[-1].alone
         if self.whole is None or not self.budget or alone is None:
@@ -122,19 +124,29 @@ class LevelSearch:
                 lower[column], upper[column] = limit.safe or (members.original[column],) * 2
                 boxes.append(Box(box.region, lower, upper))
         with self.evaluator.stage(LEFT_OUT_STAGE):
-            return contacts_left_out(self.whole.members, boxes, self.by.name if self.is_searched else "")
+            return contacts_left_out(
+                self.whole.members, boxes, self.by.name if self.is_searched else ""
+            )
 
     def levels(self, known: FloatArray) -> list[Level]:
-        """The limits up to each value, the least value first; before known failures of one characteristic, too."""
+        """The limits up to each value, the least value first; before known failures of one
+        characteristic, too.
+        """
         levels = list[Level]()
         for number, value in enumerate(self.by.values):
             before = levels[-1] if levels else None
             with self.evaluator.stage(f"limits up to {self.by.text(value)}"):
-                levels.append(self._level(value, self.by.values[number - 1] if number else None, before, known))
+                levels.append(
+                    self._level(
+                        value, self.by.values[number - 1] if number else None, before, known
+                    )
+                )
         return self._nested(levels)
 
     def _nested(self, levels: Sequence[Level]) -> list[Level]:
-        """The levels with limits alone before all failures up to their values that the search of any of them met."""
+        """The levels with limits alone before all failures up to their values that the search of
+        any of them met.
+        """
         searches = [level.search for level in levels if level.search is not None]
         if not self.is_searched or not searches:
             return [*levels]
@@ -146,12 +158,17 @@ class LevelSearch:
                 alone = level.search.limits()
                 before = nested[-1].alone if nested else None
                 if before is not None:
-                    alone = [nested_limit(limit, earlier) for limit, earlier in zip(alone, before, strict=True)]
+                    alone = [
+                        nested_limit(limit, earlier)
+                        for limit, earlier in zip(alone, before, strict=True)
+                    ]
                 level = level._replace(alone=alone)
             nested.append(level)
         return nested
 
-    def _level(self, value: float, low: float | None, before: Level | None, known: FloatArray) -> Level:
+    def _level(
+        self, value: float, low: float | None, before: Level | None, known: FloatArray
+    ) -> Level:
         models = self.models(low, value)
         if models is None or (before is not None and before.alone is None):
             assert before is not None, "the least value is not below all points"
@@ -161,7 +178,11 @@ class LevelSearch:
             assert before.alone is not None
             within = [each.safe or (0.0, 0.0) for each in before.alone]
         own = models.own
-        numbers = (SEARCHED_VALUES, VALUES_OF_FITS) if len(own.evaluator.characteristics.scenario) else (None, VALUES)
+        numbers = (
+            (SEARCHED_VALUES, VALUES_OF_FITS)
+            if len(own.evaluator.characteristics.scenario)
+            else (None, VALUES)
+        )
         scans = scan(own.evaluator, self.columns, self.unsafe, within, numbers[0])
         if any(one.safe is None for one in scans):
             return Level(value, None, models)
@@ -170,10 +191,15 @@ class LevelSearch:
         search = AloneSearch(scans, self.columns, judges, numbers[1])
         search.meet([own], inside)
         whole = self.models(None, value) if self.is_searched else None
-        search.run(self.budget, [model for each in further for model in each if model not in judges], whole)
+        search.run(
+            self.budget, [model for each in further for model in each if model not in judges], whole
+        )
         alone = search.limits()
         if before is not None and before.alone is not None:
-            alone = [nested_limit(each, earlier) for each, earlier in zip(alone, before.alone, strict=True)]
+            alone = [
+                nested_limit(each, earlier)
+                for each, earlier in zip(alone, before.alone, strict=True)
+            ]
         if not self.limits:
             return Level(value, alone, models, search)
         if before is not None and before.failures:
@@ -197,15 +223,21 @@ class LevelSearch:
             members.append(model._replace(evaluator=model.evaluator.for_study(of_fit, verified=0)))
         return self.whole._replace(members=tuple(members))
 
-    def _judges(self, models: Models, low: float | None, high: float, count: int) -> Sequence[Model]:
+    def _judges(
+        self, models: Models, low: float | None, high: float, count: int
+    ) -> Sequence[Model]:
         """The models, with points between those of a matrix if there is an attack."""
         if not self.budget or self.whole is not None:
             return models.members
         cells = cells_between(self.evaluator.study, self.by, low, high)
-        return [with_points_between(model, self.unsafe, count, cells)[0] for model in models.members]
+        return [
+            with_points_between(model, self.unsafe, count, cells)[0] for model in models.members
+        ]
 
     def up_to(self, value: float, settings: FloatArray) -> FloatArray:
-        """Those of M settings, shape (M, n), whose encounter is up to a value of the searched parameter."""
+        """Those of M settings, shape (M, n), whose encounter is up to a value of the searched
+        parameter.
+        """
         column = self.evaluator.characteristics.names.index(self.by.name)
         return np.asarray(settings[settings[:, column] <= value])
 
@@ -216,25 +248,33 @@ class LevelSearch:
         return np.asarray(known[(is_inside | members.of_vehicle).all(axis=1)])
 
     def _promise(self, own: Model) -> Box:
-        """The specified limits in all encounters of a model, all other characteristics as in the original."""
+        """The specified limits in all encounters of a model, all other characteristics as in the
+        original.
+        """
         members = own.evaluator.characteristics
         region = own.evaluator.region
-        everywhere = {item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario}
+        everywhere = {
+            item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
+        }
         columns = [*self.columns, *np.flatnonzero(~members.of_vehicle).tolist()]
         geometry = BoxGeometry(region, columns, {**self.limits, **everywhere})
         return geometry.printed(geometry.fixed)
 
-    def _falsify(self, models: Models, judges: Sequence[Model], value: float) -> Falsification[Model]:
-        """The falsification of the specified limits between two values, up to one that is printed."""
+    def _falsify(
+        self, models: Models, judges: Sequence[Model], value: float
+    ) -> Falsification[Model]:
+        """The falsification of the specified limits between two values, up to one that is
+        printed.
+        """
         box = self._promise(models.own)
         tested = (self.column, value) if self.is_searched else None
         stream = self.evaluator.study.search.seed, Stream.SPECIFIED_BETWEEN, 0
         return falsify(box, judges, enough(self.budget), stream, STAGE, tested)
 
     def reach(self, levels: Sequence[Level]) -> Reach[Model]:
-        """The value up to which the specified limits hold, at most that up to which the original keeps its margin:
-        between two values of a searched parameter, the last at which a falsification finds nothing; of an axis, one of
-        its values.
+        """The value up to which the specified limits hold, at most that up to which the original
+        keeps its margin: between two values of a searched parameter, the last at which a
+        falsification finds nothing; of an axis, one of its values.
         """
         last = Reach[Model]()
         if not self.limits or not self.budget:
@@ -257,21 +297,25 @@ class LevelSearch:
                 models = level.models.members
                 stream = self.evaluator.study.search.seed, Stream.SPECIFIED_UP_TO
                 failures = level.failures or ()
-                found = reach(box, self.column, models, enough(self.budget), stream, STAGE, failures)
+                found = reach(
+                    box, self.column, models, enough(self.budget), stream, STAGE, failures
+                )
                 last = last if found.value is None else found
             break
         return last
 
 
 def nested_limit(limit: AloneLimit, before: AloneLimit) -> AloneLimit:
-    """A limit up to a value, within that up to the value below; where both are the same, what is beyond that one is
-    beyond it, too.
+    """A limit up to a value, within that up to the value below; where both are the same, what is
+    beyond that one is beyond it, too.
     """
     assert limit.safe is not None
     assert before.safe is not None
     ends = [max(limit.safe[0], before.safe[0]), min(limit.safe[1], before.safe[1])]
     beyond = list[Beyond]()
     for side in (0, 1):
-        is_before = ends[side] == before.safe[side] and (ends[side] != limit.safe[side] or limit.beyond[side] is None)
+        is_before = ends[side] == before.safe[side] and (
+            ends[side] != limit.safe[side] or limit.beyond[side] is None
+        )
         beyond.append(before.beyond[side] if is_before else limit.beyond[side])
     return limit._replace(safe=(ends[0], ends[1]), beyond=(beyond[0], beyond[1]))

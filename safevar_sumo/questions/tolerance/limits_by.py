@@ -1,4 +1,6 @@
-"""The answer with limits up to each of some values of a parameter: its table, its words, and its picture."""
+"""The answer with limits up to each of some values of a parameter: its table, its words, and its
+picture.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +43,8 @@ UNSAFE_ORIGINAL = "the original vehicle itself is unsafe, or safe in no encounte
 
 
 def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
-    """Limits of each characteristic alone that hold up to each value of a parameter; `known` are failures of one
-    characteristic that results hold, shape (K, n).
+    """Limits of each characteristic alone that hold up to each value of a parameter; `known` are
+    failures of one characteristic that results hold, shape (K, n).
     """
     by = search.by
     study = search.evaluator.study
@@ -57,7 +59,12 @@ def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
         _title(by),
         columns_by(by),
         _rows(search, levels, scopes),
-        wide=Wide(["characteristic", "unit", "original"], f"by_{by.name}", values, f"to {{:g}}{unit_text(by.unit)}"),
+        wide=Wide(
+            ["characteristic", "unit", "original"],
+            f"by_{by.name}",
+            values,
+            f"to {{:g}}{unit_text(by.unit)}",
+        ),
     )
     sentences = [*_sentences(search, levels, frame, reach, contacts), f"Scope: {scopes[-1]}."]
     return Answer(
@@ -83,8 +90,8 @@ def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
 
 
 def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach[Model]) -> bool | None:
-    """Whether the specified limits hold up to the greatest value; without any, whether the original does. None where
-    that was not tested.
+    """Whether the specified limits hold up to the greatest value; without any, whether the original
+    does. None where that was not tested.
     """
     if levels[0].alone is None:
         return False
@@ -101,19 +108,29 @@ def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> t
         return ()
     if is_kept is None:
         return (NOT_FALSIFIED,) if search.limits else ()
-    return (f"the limits hold up to {_text(search.by, reach.value)}, not {search.by.text(search.by.values[-1])}",)
+    return (
+        (
+            f"the limits hold up to {_text(search.by, reach.value)}, not"
+            f" {search.by.text(search.by.values[-1])}"
+        ),
+    )
 
 
 def _numbers(levels: Sequence[Level], reach: Reach[Model], unsafe: Unsafe) -> JsonObject:
-    """Numbers about the limits up to the greatest value, and about the attack on the specified limits up to the value
-    that they reach.
+    """Numbers about the limits up to the greatest value, and about the attack on the specified
+    limits up to the value that they reach.
     """
     last = levels[-1]
     found = reach.attack
     least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
     attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
     members, left_out = last.models
-    return {"fits": len(members), "fits_tried": len(members) + len(left_out), **attacked, "boxes": 0}
+    return {
+        "fits": len(members),
+        "fits_tried": len(members) + len(left_out),
+        **attacked,
+        "boxes": 0,
+    }
 
 
 def columns_by(by: Parameter) -> Columns:
@@ -127,7 +144,12 @@ def columns_by(by: Parameter) -> Columns:
         "sentence": Column("", "for a maintenance manual", is_shown=False),
         "scope": Column("", "what the limits up to this value cover", is_shown=False),
     }
-    return {**{name: LIMITS[name] for name in first}, **own, **{name: LIMITS[name] for name in rest}, **texts}
+    return {
+        **{name: LIMITS[name] for name in first},
+        **own,
+        **{name: LIMITS[name] for name in rest},
+        **texts,
+    }
 
 
 def _title(by: Parameter) -> str:
@@ -138,7 +160,9 @@ def _text(by: Parameter, value: float | None) -> str:
     return "none of these values" if value is None else by.text(value)
 
 
-def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -> list[tuple[Any, ...]]:
+def _rows(
+    search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]
+) -> list[tuple[Any, ...]]:
     """A row for each characteristic and value."""
     failures = _failures(levels)
     members = search.evaluator.characteristics
@@ -157,10 +181,18 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
                     *(item.name, item.unit, item.original, level.value),
                     *(NOWHERE if alone is None or alone.safe is None else alone.safe),
                     *(*NOWHERE, *specified, kept),
-                    UNSAFE_ORIGINAL if alone is None else None if failure is None else failure.words,
+                    (
+                        UNSAFE_ORIGINAL
+                        if alone is None
+                        else None
+                        if failure is None
+                        else failure.words
+                    ),
                     None if failure is None else _setting(members, failure),
-                    f"Up to {search.by.text(level.value)}{_of_counted(search, level.value)}, "
-                    f"{_keep(item, alone)}. Scope: {scope}.",
+                    (
+                        f"Up to {search.by.text(level.value)}{_of_counted(search, level.value)}, "
+                        f"{_keep(item, alone)}. Scope: {scope}."
+                    ),
                     scope,
                 )
             )
@@ -168,15 +200,22 @@ def _rows(search: LevelSearch, levels: Sequence[Level], scopes: Sequence[str]) -
 
 
 def _of_counted(search: LevelSearch, value: float) -> str:
-    """Which encounters a claim up to a value is about, where the original does not keep its margin in all of them."""
+    """Which encounters a claim up to a value is about, where the original does not keep its margin
+    in all of them.
+    """
     end = search.original.keeps_up_to
     if not search.is_searched or (end is not None and value <= end):
         return ""
-    return f", of the encounters in which the original keeps {search.evaluator.study.scenario.margin:g} m"
+    return (
+        ", of the encounters in which the original keeps"
+        f" {search.evaluator.study.scenario.margin:g} m"
+    )
 
 
 def _setting(members: CharacteristicSet, failure: Failure) -> JsonObject:
-    """The vehicle that fails, and its encounter: searched values, or those of a point of the matrix."""
+    """The vehicle that fails, and its encounter: searched values, or those of a point of the
+    matrix.
+    """
     return {**dict(zip(members.names, failure.setting.tolist(), strict=True)), **failure.point}
 
 
@@ -185,7 +224,9 @@ def _holds(alone: AloneLimit | None, limit: Limit) -> bool:
     if alone is None or alone.safe is None:
         return False
     low, high = alone.safe
-    return (limit.at_least is None or limit.at_least >= low) and (limit.at_most is None or limit.at_most <= high)
+    return (limit.at_least is None or limit.at_least >= low) and (
+        limit.at_most is None or limit.at_most <= high
+    )
 
 
 def _keep(item: Characteristic, alone: AloneLimit | None) -> str:
@@ -198,12 +239,16 @@ def _keep(item: Characteristic, alone: AloneLimit | None) -> str:
     if low == high:
         return f"no room for {name}: {low:.10g}{item.suffix}, as in the original"
     sides = (("at least", low, item.lower), ("at most", high, item.upper))
-    keep = " and ".join(f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last)
+    keep = " and ".join(
+        f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last
+    )
     return f"with all others as in the original: {name} {keep or 'anywhere in its domain'}"
 
 
 def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
-    """How each characteristic alone fails first, by value and number; failures of one model are driven together."""
+    """How each characteristic alone fails first, by value and number; failures of one model are
+    driven together.
+    """
     models = dict[int, Model]()
     settings = dict[int, dict[str, FloatArray]]()
     places = dict[tuple[float, int], tuple[int, str]]()
@@ -217,13 +262,21 @@ def _failures(levels: Sequence[Level]) -> dict[tuple[float, int], Failure]:
                 settings.setdefault(place[0], {})[place[1]] = setting
                 places[level.value, number] = place
     found = {number: describe(model, settings[number]) for number, model in models.items()}
-    return {key: found[model][name] for key, (model, name) in places.items() if name in found[model]}
+    return {
+        key: found[model][name] for key, (model, name) in places.items() if name in found[model]
+    }
 
 
 def _sentences(
-    search: LevelSearch, levels: Sequence[Level], frame: pd.DataFrame, reach: Reach[Model], contacts: Contacts | None
+    search: LevelSearch,
+    levels: Sequence[Level],
+    frame: pd.DataFrame,
+    reach: Reach[Model],
+    contacts: Contacts | None,
 ) -> Iterator[str]:
-    """The sentences of the verdict, the allowed value first, then the original's own limit and what does not count."""
+    """The sentences of the verdict, the allowed value first, then the original's own limit and what
+    does not count.
+    """
     by = search.by
     unsafe = search.unsafe
     study = search.evaluator.study
@@ -233,9 +286,14 @@ def _sentences(
         what = join_phrases(_limit_texts(search))
         yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."
     elif search.limits:
-        yield f"{where}, up to which value the specified limits hold was not tested: {NOT_FALSIFIED}."
+        yield (
+            f"{where}, up to which value the specified limits hold was not tested: {NOT_FALSIFIED}."
+        )
     else:
-        yield f"{where}, each alone, all others as in the original: {'; '.join(_allowed(search, frame))}."
+        yield (
+            f"{where}, each alone, all others as in the original:"
+            f" {'; '.join(_allowed(search, frame))}."
+        )
     yield _original_in_words(search)
     if contacts is not None:
         yield from contacts_in_words(search.evaluator, contacts)
@@ -247,7 +305,10 @@ def _sentences(
     counted = _of_counted(search, by.values[-1])
     of_counted = f"{counted}," if counted else ""
     hold = "hold" if search.budget else "were only scanned"
-    yield f"Limits up to {values}{of_counted} {hold} {fits}: within them no vehicle that was tried {failure}."
+    yield (
+        f"Limits up to {values}{of_counted} {hold} {fits}: within them no vehicle that was tried"
+        f" {failure}."
+    )
     yield _tried(search)
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
@@ -297,7 +358,11 @@ def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
         is_whole = rows["alone_low"] <= item.lower if is_low else rows["alone_high"] >= item.upper
         whole = rows.loc[is_whole, f"by_{by.name}"].max()
         text = f"{item.name} {item.lower if is_low else item.upper:.10g}{item.suffix}"
-        yield f"{text} not up to {by.text(by.values[0])}" if np.isnan(whole) else f"{text} up to {by.text(whole)}"
+        yield (
+            f"{text} not up to {by.text(by.values[0])}"
+            if np.isnan(whole)
+            else f"{text} up to {by.text(whole)}"
+        )
 
 
 def _draw(answer: Answer, search: LevelSearch) -> Figure:
@@ -307,7 +372,9 @@ def _draw(answer: Answer, search: LevelSearch) -> Figure:
     frame = answer.tables["limits"]
     by = search.by
     title = f"{answer.study.name}: limits alone up to each {by.name.replace('_', ' ')}"
-    figure, axes = new_panels(title, len(search.columns), 4, (2.3, 1.75), min_width=4.6, title_height=1.1)
+    figure, axes = new_panels(
+        title, len(search.columns), 4, (2.3, 1.75), min_width=4.6, title_height=1.1
+    )
     for axis, column in zip(axes, search.columns, strict=True):
         item = search.evaluator.characteristics.members[column]
         if axis is not axes[0]:
@@ -325,11 +392,15 @@ def _draw(answer: Answer, search: LevelSearch) -> Figure:
 
 
 def _draw_limits(axis: Axes, rows: pd.DataFrame, by: Parameter) -> None:
-    """The limits of one characteristic, a step for each value: what holds up to it holds from the value below on."""
+    """The limits of one characteristic, a step for each value: what holds up to it holds from the
+    value below on.
+    """
     from safevar_sumo.questions.figures import BLUE, SKY_BLUE, VERMILION
 
     values = np.concatenate([[by.lowest], rows[f"by_{by.name}"].to_numpy(float)])
-    low, high = (np.append(ends[:1], ends) for ends in rows[["alone_low", "alone_high"]].to_numpy(float).T)
+    low, high = (
+        np.append(ends[:1], ends) for ends in rows[["alone_low", "alone_high"]].to_numpy(float).T
+    )
     axis.fill_betweenx(values, low, high, step="pre", color=SKY_BLUE, alpha=0.6)
     for ends in (low, high):
         axis.step(ends, values, where="post", color=BLUE, linewidth=1.2)
@@ -349,8 +420,12 @@ def check_by(by: str | None, unsafe: str | None, is_together: bool) -> None:
         If another criterion than the margin, or joint limits, are asked for beside `by`.
     """
     if by is not None and is_together:
-        legal = "--by for limits alone, or joint limits of a study with a narrower domain, without --by"
-        raise InputError("together", f"joint limits are not sought up to each value of --by {by}", legal)
+        legal = (
+            "--by for limits alone, or joint limits of a study with a narrower domain, without --by"
+        )
+        raise InputError(
+            "together", f"joint limits are not sought up to each value of --by {by}", legal
+        )
     if by is not None and unsafe is not None:
         legal = "limits that keep the margin (--margin), or the question without --by"
         raise InputError("by", f"{by!r} beside --unsafe {unsafe!r}", legal)

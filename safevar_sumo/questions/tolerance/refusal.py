@@ -1,4 +1,6 @@
-"""What would do in place of limits that are not kept: the nearest value of each with which limits together exist."""
+"""What would do in place of limits that are not kept: the nearest value of each with which limits
+together exist.
+"""
 
 from __future__ import annotations
 
@@ -16,19 +18,27 @@ from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import Characteristic
 
 PARTS, ROUNDS = 8, 3
-"""Each of `ROUNDS` rounds divides the interval from the original to the specified value into `PARTS` parts."""
+"""Each of `ROUNDS` rounds divides the interval from the original to the specified value into
+`PARTS` parts.
+"""
 POINTS, ATTACK = 64, 1024
-"""Number of Sobol points, and of corners, at which a value is tried; simulations of an attack on it."""
+"""Number of Sobol points, and of corners, at which a value is tried; simulations of an attack on
+it.
+"""
 STAGE = "limits that would do"
 
 
-def nearest_limits(models: Models, limits: Mapping[str, Limit]) -> list[tuple[str, str, float, float | None]]:
-    """Rows of name, unit, specified value and the nearest one at which the specified limits hold in all models, the
-    others as specified; None where they do not hold even with the original's value.
+def nearest_limits(
+    models: Models, limits: Mapping[str, Limit]
+) -> list[tuple[str, str, float, float | None]]:
+    """Rows of name, unit, specified value and the nearest one at which the specified limits hold in
+    all models, the others as specified; None where they do not hold even with the original's value.
     """
     rows = []
     for name, limit in limits.items():
-        item = next(member for member in models.own.evaluator.characteristics if member.name == name)
+        item = next(
+            member for member in models.own.evaluator.characteristics if member.name == name
+        )
         for side, value in enumerate((limit.at_least, limit.at_most)):
             if value is not None:
                 rows.append((name, item.unit, value, _nearest(models, limits, item, side, value)))
@@ -45,7 +55,9 @@ def _nearest(
         return None
     for _ in range(ROUNDS):
         values = (safe + (unsafe - safe) * np.arange(1, PARTS + 1) / PARTS).tolist()
-        safe_count = _first_unsafe(models, [_box(models, limits, item, side, each) for each in values])
+        safe_count = _first_unsafe(
+            models, [_box(models, limits, item, side, each) for each in values]
+        )
         if safe_count == PARTS:
             safe = values[-1]
             break
@@ -76,7 +88,12 @@ def _first_unsafe(models: Models, boxes: Sequence[Box]) -> int:
     """The number of boxes before the first in which something is unsafe in any model."""
     seed = models.own.evaluator.study.search.seed
     settings = [
-        np.concatenate([box.corners(seed, 0)[: MAX_CORNERS // len(boxes)], box.spread_and_corners(POINTS, seed)])
+        np.concatenate(
+            [
+                box.corners(seed, 0)[: MAX_CORNERS // len(boxes)],
+                box.spread_and_corners(POINTS, seed),
+            ]
+        )
         for box in boxes
     ]
     ends = np.cumsum([*map(len, settings)])[:-1]
@@ -87,10 +104,17 @@ def _first_unsafe(models: Models, boxes: Sequence[Box]) -> int:
     return int(np.argmin([*is_safe, False]))
 
 
-def _box(models: Models, limits: Mapping[str, Limit], item: Characteristic, side: int, value: float) -> Box:
-    """The specified limits, one of them at another value; all other characteristics as in the original."""
+def _box(
+    models: Models, limits: Mapping[str, Limit], item: Characteristic, side: int, value: float
+) -> Box:
+    """The specified limits, one of them at another value; all other characteristics as in the
+    original.
+    """
     members = models.own.evaluator.characteristics
-    ends: list[Any] = [np.where(members.of_vehicle, members.original, last) for last in (members.lower, members.upper)]
+    ends: list[Any] = [
+        np.where(members.of_vehicle, members.original, last)
+        for last in (members.lower, members.upper)
+    ]
     for name, limit in limits.items():
         column = members.names.index(name)
         for number, end in enumerate((limit.at_least, limit.at_most)):

@@ -1,4 +1,6 @@
-"""The limits of each characteristic: what a workshop needs to know, in its unit and rounded to the safe side."""
+"""The limits of each characteristic: what a workshop needs to know, in its unit and rounded to the
+safe side.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 ALONE = "alone (only if all other parts are as new)"
 """Heading of the limits of one characteristic alone, which do not hold together."""
-CHARACTERISTIC: Columns = {"characteristic": "characteristic of the vehicle", "unit": "unit of its values"}
+CHARACTERISTIC: Columns = {
+    "characteristic": "characteristic of the vehicle",
+    "unit": "unit of its values",
+}
 LIMITS: Columns = {
     **CHARACTERISTIC,
     "original": Column("", "value of the original vehicle", ".6g"),
@@ -44,7 +49,13 @@ UNCERTAINTY: Columns = {
         f"{name}_{end}": Column("", f"{end}est value that is safe alone {meaning}", ".10g")
         for name, meaning in (
             ("own_fit", "at the points of the scan with the study's own fit"),
-            ("alone", "with every fit, also between points, in all encounters that were met, and under the attack"),
+            (
+                "alone",
+                (
+                    "with every fit, also between points, in all encounters that were met, and"
+                    " under the attack"
+                ),
+            ),
         )
         for end in ("low", "high")
     },
@@ -54,7 +65,8 @@ NOWHERE: Ends = None, None
 
 
 class LimitRows(NamedTuple):
-    """The rows of the table of limits, and what is wrong with each of the user's limits that is not kept.
+    """The rows of the table of limits, and what is wrong with each of the user's limits that is not
+    kept.
 
     Nothing is said of limits around an unsafe original.
     """
@@ -63,9 +75,14 @@ class LimitRows(NamedTuple):
     broken: list[str]
 
     def without_kept(self) -> LimitRows:
-        """The rows of limits that nothing searched for a counterexample: none of them is called kept."""
+        """The rows of limits that nothing searched for a counterexample: none of them is called
+        kept.
+        """
         place = [*LIMITS].index("kept")
-        rows = [(*row[:place], None if row[place] else row[place], *row[place + 1 :]) for row in self.rows]
+        rows = [
+            (*row[:place], None if row[place] else row[place], *row[place + 1 :])
+            for row in self.rows
+        ]
         return self._replace(rows=rows)
 
 
@@ -95,7 +112,9 @@ def limit_rows(
         failure = beyond.get(name) or beyond_alone.get(name)
         is_kept = None if limit is None else _is_kept(each, specified, together)
         if is_kept is False and each.safe is not None:
-            broken.append(_broken_in_words(each, specified, together, beyond_alone.get(name), models))
+            broken.append(
+                _broken_in_words(each, specified, together, beyond_alone.get(name), models)
+            )
         members = models[0].evaluator.characteristics
         rows.append(
             (
@@ -103,17 +122,32 @@ def limit_rows(
                 *(*(each.safe or NOWHERE), *(ends or NOWHERE), *specified),
                 is_kept,
                 None if failure is None else failure.words,
-                None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True)),
-                None if together is None else _sentence(item, box, members, beyond.get(name), scope),
+                (
+                    None
+                    if failure is None
+                    else dict(zip(members.names, failure.setting.tolist(), strict=True))
+                ),
+                (
+                    None
+                    if together is None
+                    else _sentence(item, box, members, beyond.get(name), scope)
+                ),
             )
         )
     return LimitRows(rows, broken)
 
 
 def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
-    """A row of `UNCERTAINTY` for each characteristic whose limit alone is closer than in the scan."""
+    """A row of `UNCERTAINTY` for each characteristic whose limit alone is closer than in the
+    scan.
+    """
     return [
-        (each.characteristic.name, each.characteristic.unit, *(each.of_own_fit or NOWHERE), *(each.safe or NOWHERE))
+        (
+            each.characteristic.name,
+            each.characteristic.unit,
+            *(each.of_own_fit or NOWHERE),
+            *(each.safe or NOWHERE),
+        )
         for each in alone
         if each.safe != each.of_own_fit
     ]
@@ -121,11 +155,17 @@ def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
 
 def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None) -> bool:
     """Whether a limit is safe alone, and with all specified limits in every fit."""
-    return alone.safe is not None and not _outside(alone, specified)[0] and not (together and together.broken)
+    return (
+        alone.safe is not None
+        and not _outside(alone, specified)[0]
+        and not (together and together.broken)
+    )
 
 
 def _outside(alone: AloneLimit, specified: Ends) -> tuple[float, float]:
-    """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end that is."""
+    """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end
+    that is.
+    """
     assert alone.safe is not None
     ends = zip(specified, alone.safe, (-1, 1), strict=True)
     by = [(max(sign * (end - safe), 0.0), end) for end, safe, sign in ends if end is not None]
@@ -139,15 +179,20 @@ def _broken_in_words(
     failure: Failure | None,
     models: Sequence[Model],
 ) -> str:
-    """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`."""
+    """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by
+    0.08)`.
+    """
     item = alone.characteristic
     by, end = _outside(alone, specified)
     if by:
         members = models[0].evaluator.characteristics
-        # At the specified value itself the original encounter may be safe; then what fails beyond the limit is said.
+        # At the specified value itself the original encounter may be safe; then what fails beyond
+        # the limit is said.
         for model in models:
             setting = members.setting({item.name: end})
-            if found := describe(model, {item.name: setting}, Box(model.evaluator.region, setting, setting)):
+            if found := describe(
+                model, {item.name: setting}, Box(model.evaluator.region, setting, setting)
+            ):
                 failure = found[item.name]
                 break
         words = "the car is unsafe" if failure is None else failure.words
@@ -181,14 +226,22 @@ def _failures_beyond(together: LimitsTogether, models: Sequence[Model]) -> dict[
         if not waiting:
             break
         is_unsafe = model.are_unsafe(np.array([*waiting.values()]), "what fails first")
-        of_model = {name: setting for (name, setting), fails in zip(waiting.items(), is_unsafe, strict=True) if fails}
+        of_model = {
+            name: setting
+            for (name, setting), fails in zip(waiting.items(), is_unsafe, strict=True)
+            if fails
+        }
         failures |= describe(model, of_model, together.box)
         waiting = {name: setting for name, setting in waiting.items() if name not in of_model}
     return failures
 
 
 def _sentence(
-    item: Characteristic, box: Box | None, members: CharacteristicSet, failure: Failure | None, scope: str
+    item: Characteristic,
+    box: Box | None,
+    members: CharacteristicSet,
+    failure: Failure | None,
+    scope: str,
 ) -> str:
     """A sentence for a maintenance manual: all of these may be obeyed together."""
     name = item.short_name[:1].upper() + item.short_name[1:]
@@ -199,7 +252,8 @@ def _sentence(
     domain = (item.lower, item.upper)
     if ends[0] == ends[1]:
         return (
-            f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for it. Scope: {scope}."
+            f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for"
+            f" it. Scope: {scope}."
         )
     keep = " and ".join(
         f"{word} {end:.10g}{item.suffix}"
@@ -207,17 +261,30 @@ def _sentence(
         if end != last
     )
     if not keep:
-        return f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope: {scope}."
-    beyond = "" if failure is None else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
+        return (
+            f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope:"
+            f" {scope}."
+        )
+    beyond = (
+        ""
+        if failure is None
+        else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
+    )
     return f"{name}: keep {keep}{beyond}. Scope: {scope}."
 
 
-def _vehicle_in_words(item: Characteristic, box: Box, members: CharacteristicSet, failure: Failure) -> str:
-    """The vehicle that fails just beyond a limit: `at 0.81`, with what the table's title does not say of the others."""
+def _vehicle_in_words(
+    item: Characteristic, box: Box, members: CharacteristicSet, failure: Failure
+) -> str:
+    """The vehicle that fails just beyond a limit: `at 0.81`, with what the table's title does not
+    say of the others.
+    """
     named = list[str]()
     for other, value, low, high in zip(members, failure.setting, box.lower, box.upper, strict=True):
         # Others are at their limit, if they have one, and as in the original, if they have none.
-        limits = [end for end, last in ((low, other.lower), (high, other.upper)) if end != last] or [other.original]
+        limits = [
+            end for end, last in ((low, other.lower), (high, other.upper)) if end != last
+        ] or [other.original]
         is_said = len(set(limits)) == 1 and np.isclose(value, limits[0])
         if other.name != item.name and not other.is_scenario and not is_said:
             named.append(f"{other.name} {limit_text(other, value)}")

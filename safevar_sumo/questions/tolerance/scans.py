@@ -18,7 +18,9 @@ from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic
 
 SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
-"""Number of values over the domain, besides the original; fewer in a rated study: each takes a whole test matrix."""
+"""Number of values over the domain, besides the original; fewer in a rated study: each takes a
+whole test matrix.
+"""
 PARTS_PER_ROUND = 8
 """Number of parts into which a round divides each interval with a change of state."""
 ROUNDS, RATED_ROUNDS = 4, 1
@@ -36,9 +38,9 @@ class OneAtATimeScan(NamedTuple):
     Attributes
     ----------
     profile
-        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe", "not_simulated" or
-        "infeasible"), and in a rated study `rating_points`, in the order of the values, which are closer together where
-        the state changes.
+        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe",
+        "not_simulated" or "infeasible"), and in a rated study `rating_points`, in the order of the
+        values, which are closer together where the state changes.
     """
 
     characteristic: Characteristic
@@ -46,7 +48,9 @@ class OneAtATimeScan(NamedTuple):
 
     @property
     def intervals(self) -> pd.DataFrame:
-        """The runs of neighbouring values of one state: `state`, the first value `low` and the last one `high`."""
+        """The runs of neighbouring values of one state: `state`, the first value `low` and the last
+        one `high`.
+        """
         states = self.profile["state"]
         values = self.profile["value"]
         is_first = states != states.shift()
@@ -57,20 +61,26 @@ class OneAtATimeScan(NamedTuple):
     def of_state(self, state: str) -> list[Interval]:
         """The intervals of a state."""
         frame = self.intervals
-        return list(frame.loc[frame["state"] == state, ["low", "high"]].itertuples(index=False, name=None))
+        return list(
+            frame.loc[frame["state"] == state, ["low", "high"]].itertuples(index=False, name=None)
+        )
 
     @property
     def safe(self) -> Interval | None:
         """The safe interval around the original; None if the original itself is unsafe."""
         original = self.characteristic.original
-        return next((ends for ends in self.of_state("safe") if ends[0] <= original <= ends[1]), None)
+        return next(
+            (ends for ends in self.of_state("safe") if ends[0] <= original <= ends[1]), None
+        )
 
     def degree(self, value: float) -> float:
         """The safety degree at a value of the profile [m, or -m/s]."""
         return float(self.profile.set_index("value")[SAFETY_DEGREE][value])
 
     def first_loss(self, loss: float = 0.0) -> float:
-        """The value nearest to the original that loses more than `loss` rating points; NaN if no value does."""
+        """The value nearest to the original that loses more than `loss` rating points; NaN if no
+        value does.
+        """
         points = self.profile.set_index("value")[RATING_POINTS.name]
         original = self.characteristic.original
         values = points.index[points < points[original] - loss - POINT_ROUNDING]
@@ -84,14 +94,19 @@ def scan(
     within: Sequence[Interval] | None = None,
     number: int | None = None,
 ) -> list[OneAtATimeScan]:
-    """Scan the domains of some characteristics, or intervals within them, one at a time; at `number` values, by default
-    `SCAN_VALUES`, in a rated study `RATED_SCAN_VALUES`.
+    """Scan the domains of some characteristics, or intervals within them, one at a time; at
+    `number` values, by default `SCAN_VALUES`, in a rated study `RATED_SCAN_VALUES`.
     """
     scanned = [evaluator.characteristics.members[column] for column in columns]
-    usual, rounds = (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    usual, rounds = (
+        (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+    )
     number = number or usual
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
-    values = [np.union1d(np.linspace(*end, number), item.original) for item, end in zip(scanned, ends, strict=True)]
+    values = [
+        np.union1d(np.linspace(*end, number), item.original)
+        for item, end in zip(scanned, ends, strict=True)
+    ]
     profiles = _evaluate_profiles(evaluator, columns, values, unsafe)
     for _ in range(rounds):
         values = [_values_between_states(profile) for profile in profiles]
@@ -110,7 +125,10 @@ def _values_between_states(profile: pd.DataFrame) -> FloatArray:
     values = profile["value"].to_numpy()
     states = profile["state"].to_numpy()
     rows = np.flatnonzero(states[1:] != states[:-1])[:, np.newaxis]
-    inner = values[rows] + (values[rows + 1] - values[rows]) * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
+    inner = (
+        values[rows]
+        + (values[rows + 1] - values[rows]) * np.arange(1, PARTS_PER_ROUND) / PARTS_PER_ROUND
+    )
     return np.setdiff1d(inner, values)
 
 
@@ -128,6 +146,17 @@ def _evaluate_profiles(
         ["infeasible", "not_simulated", "unsafe"],
         "safe",
     )
-    points = {name: column for name, column in evaluations.metrics.items() if name == RATING_POINTS.name}
-    frame = pd.DataFrame({"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state, **points})
-    return [frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)]
+    points = {
+        name: column for name, column in evaluations.metrics.items() if name == RATING_POINTS.name
+    }
+    frame = pd.DataFrame(
+        {
+            "value": np.concatenate(values),
+            SAFETY_DEGREE: evaluations.f_safe,
+            "state": state,
+            **points,
+        }
+    )
+    return [
+        frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)
+    ]

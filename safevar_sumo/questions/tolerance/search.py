@@ -1,4 +1,6 @@
-"""The search for the largest box in which characteristics may vary together, with limits that the user specifies."""
+"""The search for the largest box in which characteristics may vary together, with limits that the
+user specifies.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 PARTS, ROUNDS = 8, 3
-"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS` parts."""
+"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS`
+parts.
+"""
 WIDENING = 0.02
 """Share of its domain by which a side of the box is widened in search of something unsafe."""
 SEARCH_POINTS = 256
@@ -28,18 +32,24 @@ SEARCHED_MODELS = 4
 MAX_ATTEMPTS = 40
 """Maximum number of boxes that are searched for something unsafe, and of tests."""
 DEVIATIONS = tuple(0.35 * 0.7**k for k in range(9))
-"""Standard deviations of the steps by which a random search changes a box, round by round, as shares of the domain."""
+"""Standard deviations of the steps by which a random search changes a box, round by round, as
+shares of the domain.
+"""
 PROPOSALS = 4096
 """Number of boxes that a round of the random search proposes."""
 BATCH, LEAST_BATCH = 512, 64
-"""Simulations, at all points of a study's matrix, that cost hardly more than one; fewest settings of a batch."""
+"""Simulations, at all points of a study's matrix, that cost hardly more than one; fewest settings
+of a batch.
+"""
 LEAST_GAIN = 0.01
 """Least gain in the logarithm of the volume for which a proposed box is simulated."""
 UNDONE_AT_ONCE = 4
-"""Number of changes of a setting of which all combinations are undone in one batch, in search of its causes."""
+"""Number of changes of a setting of which all combinations are undone in one batch, in search of
+its causes.
+"""
 RETREAT = 0.05
-"""By this share of what is left, a box keeps off known failures more after each attack that teaches no new corner:
-where the response is not monotone, the next one would lie beside them.
+"""By this share of what is left, a box keeps off known failures more after each attack that teaches
+no new corner: where the response is not monotone, the next one would lie beside them.
 """
 ROUNDING = 1e-9
 """Rounding errors of a setting, as a share of the domain."""
@@ -49,8 +59,8 @@ Step = Sequence[int]
 
 
 class BoxGeometry:
-    """Boxes that are given by their sides: the extents below and above the original, shape (2, n), in the units of the
-    characteristics.
+    """Boxes that are given by their sides: the extents below and above the original, shape (2, n),
+    in the units of the characteristics.
 
     Attributes
     ----------
@@ -63,23 +73,30 @@ class BoxGeometry:
     is_free
         Which sides may move; the others are at their limits.
     longest
-        The longest that each side may be: a free one to the end of its domain, a fixed one to its limit.
+        The longest that each side may be: a free one to the end of its domain, a fixed one to its
+        limit.
     fixed
         The box whose free sides are 0.
     """
 
-    def __init__(self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]) -> None:
+    def __init__(
+        self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]
+    ) -> None:
         members = region.characteristics
         self.region = region
         self.original = members.original
         is_varied = np.isin(range(len(members)), columns)
-        self.domain = np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        self.domain = (
+            np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
+        )
         self.width = self.domain.sum(axis=0)
         self.limits = np.full_like(self.domain, np.nan)
         for name, limit in limits.items():
             self.limits[:, members.names.index(name)] = limit.at_least, limit.at_most  # None is NaN
         self.is_free = (self.domain > 0) & np.isnan(self.limits)
-        self.longest = np.where(np.isnan(self.limits), self.domain, np.abs(self.limits - self.original))
+        self.longest = np.where(
+            np.isnan(self.limits), self.domain, np.abs(self.limits - self.original)
+        )
         self.fixed = np.where(self.is_free, 0.0, self.longest)
 
     @property
@@ -94,12 +111,17 @@ class BoxGeometry:
         return np.stack([self.original - box.lower, box.upper - self.original])
 
     def printed(self, sides: FloatArray) -> Box:
-        """A box as it is printed: limits and ends of domains exactly, all others rounded inwards."""
+        """A box as it is printed: limits and ends of domains exactly, all others rounded
+        inwards.
+        """
         box = self.box(sides)
         members = self.characteristics
         ends = np.array(
             [
-                [item.rounded(end, upwards=upwards) for item, end in zip(members, ends, strict=True)]
+                [
+                    item.rounded(end, upwards=upwards)
+                    for item, end in zip(members, ends, strict=True)
+                ]
                 for ends, upwards in ((box.lower, True), (box.upper, False))
             ]
         )
@@ -109,7 +131,9 @@ class BoxGeometry:
         return Box(self.region, lower, upper)
 
     def extents(self, settings: FloatArray) -> FloatArray:
-        """The sides that a box needs to hold each of K settings, shape (K, 2, n); below 0 where it needs none."""
+        """The sides that a box needs to hold each of K settings, shape (K, 2, n); below 0 where it
+        needs none.
+        """
         change = settings - self.original
         return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
 
@@ -117,13 +141,19 @@ class BoxGeometry:
         """A box with some sides moved outwards by a share of the domain, at most to its end."""
         wider = sides.copy()
         for side, column in steps:
-            wider[side, column] = min(sides[side, column] + share * self.width[column], self.domain[side, column])
+            wider[side, column] = min(
+                sides[side, column] + share * self.width[column], self.domain[side, column]
+            )
         return wider
 
     def log_volume(self, boxes: FloatArray) -> FloatArray:
         """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
-        shares = np.divide(boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0)
-        return np.asarray(np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1))  # finite for a width of 0, too
+        shares = np.divide(
+            boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0
+        )
+        return np.asarray(
+            np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)
+        )  # finite for a width of 0, too
 
 
 class BoxSearch(BoxGeometry):
@@ -136,8 +166,9 @@ class BoxSearch(BoxGeometry):
     unsafe_settings
         Settings that no box may hold.
     corners
-        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box, 0, the original, or
-        1, the upper end; for each parameter of the scenario its place between original and end.
+        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box,
+        0, the original, or 1, the upper end; for each parameter of the scenario its place between
+        original and end.
     gap
         The share of the way to a known failure by which a box keeps off it.
     batch
@@ -145,7 +176,11 @@ class BoxSearch(BoxGeometry):
     """
 
     def __init__(
-        self, model: Model, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
+        self,
+        model: Model,
+        columns: Sequence[int],
+        limits: Mapping[str, Limit],
+        unsafe_settings: FloatArray,
     ) -> None:
         super().__init__(model.evaluator.region, columns, limits)
         self.models = [model]
@@ -154,7 +189,9 @@ class BoxSearch(BoxGeometry):
         self.gap = 0.0
         self.search_count = 0
         self.seed = model.evaluator.study.search.seed
-        self.batch = max(BATCH // len(model.points or assemble(model.evaluator.study).points), LEAST_BATCH)
+        self.batch = max(
+            BATCH // len(model.points or assemble(model.evaluator.study).points), LEAST_BATCH
+        )
 
     def join(self, model: Model) -> None:
         """Take a model into the search, or more points of one that is in it."""
@@ -168,35 +205,46 @@ class BoxSearch(BoxGeometry):
 
     @property
     def first_models(self) -> list[Model]:
-        """The models in which a box is searched: those in which something failed last. Its test meets them all."""
+        """The models in which a box is searched: those in which something failed last. Its test
+        meets them all.
+        """
         return self.models[:SEARCHED_MODELS]
 
     @property
     def failures_alone(self) -> FloatArray:
-        """The known unsafe settings in which one characteristic of the vehicle is changed, shape (K, n)."""
+        """The known unsafe settings in which one characteristic of the vehicle is changed, shape
+        (K, n).
+        """
         is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
         return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
 
     def needs(self, settings: FloatArray) -> FloatArray:
-        """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2, n)."""
+        """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2,
+        n).
+        """
         extents = self.extents(settings)
         return np.where(self.is_free & (extents > 0), (1 - self.gap) * extents, extents)
 
     def unsafe_inside(self, sides: FloatArray, needs: FloatArray | None = None) -> FloatArray:
-        """The known unsafe settings that a box holds, or, by what they need of a box, that it must not."""
+        """The known unsafe settings that a box holds, or, by what they need of a box, that it must
+        not.
+        """
         needs = self.extents(self.unsafe_settings) if needs is None else needs
         return np.asarray(self.unsafe_settings[(needs <= sides).all(axis=(1, 2))])
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
-        """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one of them."""
+        """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one
+        of them.
+        """
         rows = settings.reshape(-1, 1, len(self.original))
         return self.have_unsafe(rows).reshape(settings.shape[:-1])
 
     def have_unsafe(self, groups: FloatArray) -> BoolArray:
-        """Which of G groups of settings, shape (G, K, n), hold an unsafe one; unsafe ones are remembered.
+        """Which of G groups of settings, shape (G, K, n), hold an unsafe one; unsafe ones are
+        remembered.
 
-        A group is simulated in one model after another until one is unsafe; the model that last found some is the
-        first.
+        A group is simulated in one model after another until one is unsafe; the model that last
+        found some is the first.
         """
         has_unsafe = np.zeros(len(groups), dtype=bool)
         for model in self.first_models:
@@ -217,7 +265,9 @@ class BoxSearch(BoxGeometry):
         corners = np.array(self.corners)
         below = boxes[:, :1]
         above = boxes[:, 1:]
-        return self.original + corners * np.where(corners > 0, above, below)  # a corner of 0 is the original
+        return self.original + corners * np.where(
+            corners > 0, above, below
+        )  # a corner of 0 is the original
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
         """New Sobol points and corners of a box."""
@@ -234,12 +284,12 @@ class BoxSearch(BoxGeometry):
         return found
 
     def learn(self, settings: FloatArray, model: Model | None = None) -> bool:
-        """Add corners that are unsafe, from some settings that are unsafe in a model, or in any; whether there is a new
-        one.
+        """Add corners that are unsafe, from some settings that are unsafe in a model, or in any;
+        whether there is a new one.
 
-        One by one, as many changes of a setting as possible are undone while it stays unsafe; the directions of the
-        remaining changes are the corner. All combinations of the next few are simulated at once. Without a new corner,
-        boxes keep off all failures more.
+        One by one, as many changes of a setting as possible are undone while it stays unsafe; the
+        directions of the remaining changes are the corner. All combinations of the next few are
+        simulated at once. Without a new corner, boxes keep off all failures more.
         """
         number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
         causes = self._causes(settings[:: len(settings) // number][:number], model)
@@ -252,14 +302,18 @@ class BoxSearch(BoxGeometry):
         return is_new
 
     def _corners_of(self, causes: FloatArray) -> FloatArray:
-        """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its place."""
+        """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its
+        place.
+        """
         changes = causes - self.original
         sides = np.where(changes > 0, self.domain[1], self.domain[0])
         shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
         return np.where(self.characteristics.of_vehicle, np.sign(changes), shares)
 
     def _keep_causes(self, causes: FloatArray) -> None:
-        """Know K causes, and forget settings with more than a cause's changes: a box that holds one holds the cause."""
+        """Know K causes, and forget settings with more than a cause's changes: a box that holds one
+        holds the cause.
+        """
         needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
         for cause in np.maximum(self.extents(causes), 0.0):
             is_kept = ~(needs >= cause).all(axis=(1, 2))
@@ -268,7 +322,9 @@ class BoxSearch(BoxGeometry):
         self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
 
     def _causes(self, settings: FloatArray, model: Model | None) -> FloatArray:
-        """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in any."""
+        """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in
+        any.
+        """
         causes = settings.copy()
         columns = np.flatnonzero(self.is_free.any(axis=0))
         for start in range(0, len(columns), UNDONE_AT_ONCE):
@@ -299,33 +355,46 @@ class BoxSearch(BoxGeometry):
         high = 1.0
         for _ in range(ROUNDS):
             shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
-            boxes = np.where(self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start)
+            boxes = np.where(
+                self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start
+            )
             needs = self.needs(self.unsafe_settings)
-            is_safe = self.are_safe(boxes) & [not (needs <= box).all(axis=(1, 2)).any() for box in boxes]
-            safe_count = int(np.argmin([*is_safe, False]))  # the smallest ones, before the first unsafe
+            is_safe = self.are_safe(boxes) & [
+                not (needs <= box).all(axis=(1, 2)).any() for box in boxes
+            ]
+            safe_count = int(
+                np.argmin([*is_safe, False])
+            )  # the smallest ones, before the first unsafe
             low = shares[safe_count]
             high = shares[min(safe_count + 1, PARTS)]
         return np.where(self.is_free, low * sides, start)
 
     def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
-        """A box within `start` that is safe at the known corners, and keeps off known unsafe settings, as large as a
-        random search makes it.
+        """A box within `start` that is safe at the known corners, and keeps off known unsafe
+        settings, as large as a random search makes it.
 
-        `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated at their corners.
+        `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated
+        at their corners.
         """
         rng = Stream.LARGER_BOXES.generator(self.seed)
         best = self.shrunk(sides, start)
         for deviation in DEVIATIONS:
             larger = self._larger(best, start, deviation, rng)
-            tried = [*islice(self._without_known_failures(larger), max(self.batch // len(self.corners), 1))]
+            tried = [
+                *islice(
+                    self._without_known_failures(larger), max(self.batch // len(self.corners), 1)
+                )
+            ]
             if tried:
                 boxes = np.array(tried)
                 best = max(boxes[self.are_safe(boxes)], key=self.log_volume, default=best)
         return best
 
-    def _larger(self, best: FloatArray, start: FloatArray, deviation: float, rng: np.random.Generator) -> FloatArray:
-        """Larger boxes near to the best one, within `start`, shape (B, 2, n): random steps of a random share of the
-        sides.
+    def _larger(
+        self, best: FloatArray, start: FloatArray, deviation: float, rng: np.random.Generator
+    ) -> FloatArray:
+        """Larger boxes near to the best one, within `start`, shape (B, 2, n): random steps of a
+        random share of the sides.
         """
         shape = (PROPOSALS, *start.shape)
         is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
@@ -345,8 +414,9 @@ class BoxSearch(BoxGeometry):
                 yield box
 
     def widened(self, sides: FloatArray) -> FloatArray:
-        """Move the free sides of a box outwards in steps, until something unsafe is in the next step of each or the
-        domain ends. Sides move together where their steps together are safe, too.
+        """Move the free sides of a box outwards in steps, until something unsafe is in the next
+        step of each or the domain ends. Sides move together where their steps together are safe,
+        too.
         """
         steps: list[Step] = [*np.argwhere(self.is_free & (sides < self.longest)).tolist()]
         while steps := self.safe_steps(sides, [[step] for step in steps]):
@@ -355,7 +425,9 @@ class BoxSearch(BoxGeometry):
         return sides
 
     def safe_steps(self, sides: FloatArray, groups: Sequence[Sequence[Step]]) -> list[Step]:
-        """The steps outwards in which nothing unsafe is found; those of a group are made together."""
+        """The steps outwards in which nothing unsafe is found; those of a group are made
+        together.
+        """
 
         def is_open(box: FloatArray, step: Step) -> bool:
             side, column = step
@@ -371,14 +443,16 @@ class BoxSearch(BoxGeometry):
     def settings_at_end(self, sides: FloatArray, step: Step) -> FloatArray:
         """Settings at the end of one side of a box, all other values in the box."""
         side, column = step
-        settings = np.concatenate([self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)])
+        settings = np.concatenate(
+            [self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)]
+        )
         box = self.box(sides)
         settings[:, column] = (box.lower, box.upper)[side][column]
         return settings
 
     def best(self, start: FloatArray) -> FloatArray | None:
-        """The largest box within `start` in which no search finds anything unsafe, moved out as far as it can be;
-        None if every search finds something.
+        """The largest box within `start` in which no search finds anything unsafe, moved out as far
+        as it can be; None if every search finds something.
         """
         sides = start
         for _ in range(MAX_ATTEMPTS):

@@ -1,4 +1,6 @@
-"""How far each limit of a box can move out alone, and how it moves in where an attack found a failure."""
+"""How far each limit of a box can move out alone, and how it moves in where an attack found a
+failure.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +15,22 @@ from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Ste
 from safevar_sumo.records import FloatArray
 
 LEAST_MOVE = 1 / 50
-"""A limit that cannot move out by this share of its range, or by one printed digit, is at its end."""
+"""A limit that cannot move out by this share of its range, or by one printed digit, is at its end.
+"""
 STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
 ORDERS = 31
 """Number of random orders in which failures are cut off."""
 CLEARANCE, RETREAT = 0.8, 0.4
-"""Share of such a move by which a limit keeps off a failure that an attack found between corners; and by how much more
-after each box that failed.
+"""Share of such a move by which a limit keeps off a failure that an attack found between corners;
+and by how much more after each box that failed.
 """
 SLAB_ATTACK = 512
 """Number of simulations of an attack on the room beyond a limit."""
 SLAB_CORNERS = 512
-"""Number of corners of that room, in a study that searches its scenario: the test of the box meets many more."""
+"""Number of corners of that room, in a study that searches its scenario: the test of the box meets
+many more.
+"""
 KNOWN_CORNERS = 32
 """Number of corners with which that attack begins."""
 
@@ -50,7 +55,9 @@ class Settlement:
         return box
 
     def _moved(self, box: Box, step: Step) -> Box | None:
-        """The box with one limit moved out as far as nothing unsafe is met; None if it cannot move."""
+        """The box with one limit moved out as far as nothing unsafe is met; None if it cannot
+        move.
+        """
         moved = None
         for stride in STRIDES:
             wider = self.trial(box, step, stride)
@@ -60,7 +67,9 @@ class Settlement:
         return moved
 
     def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
-        """The box with one limit moved out by some moves, rounded; None at the end of the domain."""
+        """The box with one limit moved out by some moves, rounded; None at the end of the
+        domain.
+        """
         side, column = step
         item = self.search.characteristics.members[column]
         end = (box.lower, box.upper)[side][column]
@@ -94,15 +103,17 @@ class Settlement:
         judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.first_models]
         rng = Stream.EXTENSION.generator(search.seed, side, column)
         found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, found.settings[found.left < 0]])
+        search.unsafe_settings = np.concatenate(
+            [search.unsafe_settings, found.settings[found.left < 0]]
+        )
         return bool((found.left < 0).any())
 
     def cut(self, box: Box, attempts: int = 0) -> Box:
-        """The largest box within a box without its known failures that was found: they are cut off in several orders,
-        first those that leave the least choice of a limit to move in.
+        """The largest box within a box without its known failures that was found: they are cut off
+        in several orders, first those that leave the least choice of a limit to move in.
 
-        After more `attempts` that failed, limits keep off failures by more: where the response is not monotone, others
-        lie beside them.
+        After more `attempts` that failed, limits keep off failures by more: where the response is
+        not monotone, others lie beside them.
         """
         search = self.search
         sides = search.sides_of(box)
@@ -113,7 +124,10 @@ class Settlement:
         if not choices.all():
             return search.printed(search.fixed)
         rng = Stream.ORDERS_OF_CUTS.generator(search.seed)
-        orders = [np.argsort(choices, kind="stable"), *(rng.permutation(len(failures)) for _ in range(ORDERS))]
+        orders = [
+            np.argsort(choices, kind="stable"),
+            *(rng.permutation(len(failures)) for _ in range(ORDERS)),
+        ]
         cuts = [
             self._cut_off(sides, failures[order], CLEARANCE + RETREAT * attempts)
             for order in orders[: len(failures) * ORDERS]
@@ -121,8 +135,9 @@ class Settlement:
         return search.printed(max(cuts, key=search.log_volume))
 
     def _cut_off(self, sides: FloatArray, failures: FloatArray, clearance: float) -> FloatArray:
-        """Sides without failures, given by their extents, shape (K, 2, n), which are cut off in turn: each by that side
-        which loses the least volume, by a `clearance` more than it needs to, as a share of a move.
+        """Sides without failures, given by their extents, shape (K, 2, n), which are cut off in
+        turn: each by that side which loses the least volume, by a `clearance` more than it needs
+        to, as a share of a move.
         """
         search = self.search
         sides = sides.copy()

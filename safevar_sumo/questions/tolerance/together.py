@@ -1,4 +1,6 @@
-"""Limits that may be used together: a box that holds in all fits, under attack, and of which no limit can move out."""
+"""Limits that may be used together: a box that holds in all fits, under attack, and of which no
+limit can move out.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,22 @@ from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
 MAX_SIMULATIONS = 1_500_000
-"""Number of simulations, each at all points of a matrix, after which a search ends with the next box that passes."""
+"""Number of simulations, each at all points of a matrix, after which a search ends with the next
+box that passes.
+"""
 MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
-"""Maximum number of boxes that are tested; of those that a random search seeks; and of times that limits move out."""
+"""Maximum number of boxes that are tested; of those that a random search seeks; and of times that
+limits move out.
+"""
 PROMISE_POINTS = 256
-"""Number of Sobol points, and of corners, at which specified limits are tested, all others as in the original."""
+"""Number of Sobol points, and of corners, at which specified limits are tested, all others as in
+the original.
+"""
 
 
 class LimitsTogether(NamedTuple):
-    """The largest box that was found, by relative volume, in which characteristics reach the limits specified for them.
+    """The largest box that was found, by relative volume, in which characteristics reach the limits
+    specified for them.
 
     Attributes
     ----------
@@ -44,17 +53,21 @@ class LimitsTogether(NamedTuple):
     least
         The least that the attack found [m]: over all fits, and with the study's own.
     between, between_left_out
-        Numbers of points between those of the study's matrix that the attack met, and of those that do not count.
+        Numbers of points between those of the study's matrix that the attack met, and of those that
+        do not count.
     boxes
         Number of boxes that were tried.
     beyond
-        By side and column, an unsafe setting just beyond the box; all its other values are in the box.
+        By side and column, an unsafe setting just beyond the box; all its other values are in the
+        box.
     corners
         The least that the corners keep with each fit [m].
     room
-        Which characteristics could have room, shape (n,): those that vary and have no limit on both sides.
+        Which characteristics could have room, shape (n,): those that vary and have no limit on both
+        sides.
     searched
-        The models that the search of the box had to survive, then all others in which it was tested.
+        The models that the search of the box had to survive, then all others in which it was
+        tested.
     failures_alone
         Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
     """
@@ -110,8 +123,9 @@ def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArr
 
 
 def _keeps_its_margin(promise: Box, model: Model) -> bool:
-    """Whether a promise is the original vehicle, in a study whose encounters count where that keeps a margin, and
-    nothing but less than it would be unsafe: then no encounter that counts can break it.
+    """Whether a promise is the original vehicle, in a study whose encounters count where that keeps
+    a margin, and nothing but less than it would be unsafe: then no encounter that counts can break
+    it.
     """
     members = model.evaluator.characteristics
     is_original = (promise.lower == members.original) & (promise.upper == members.original)
@@ -128,19 +142,20 @@ def find_limits_together(
     unsafe_settings: FloatArray,
     budget: int,
 ) -> LimitsTogether:
-    """The largest box by relative volume in which `columns` vary, in which those of `limits` reach their limits, and
-    that holds none of `unsafe_settings`, shape (K, n).
+    """The largest box by relative volume in which `columns` vary, in which those of `limits` reach
+    their limits, and that holds none of `unsafe_settings`, shape (K, n).
 
     Notes
     -----
-    A random search seeks the largest box that is safe at known corners, within what is safe alone. Causes of what is
-    unsafe, as few changes as possible, are further corners, and the box is sought anew until no search finds anything.
-    Then all corners with each fit, a search for counterexamples with `budget` simulations over all fits, and settings
-    drawn at random test it. What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
-    boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can go, at most
-    `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box is confirmed by further
-    searches for counterexamples. After `MAX_BOXES` boxes or `MAX_SIMULATIONS` simulations the largest that passed is
-    confirmed, or none is found.
+    A random search seeks the largest box that is safe at known corners, within what is safe alone.
+    Causes of what is unsafe, as few changes as possible, are further corners, and the box is sought
+    anew until no search finds anything. Then all corners with each fit, a search for
+    counterexamples with `budget` simulations over all fits, and settings drawn at random test it.
+    What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
+    boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can
+    go, at most `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box
+    is confirmed by further searches for counterexamples. After `MAX_BOXES` boxes or
+    `MAX_SIMULATIONS` simulations the largest that passed is confirmed, or none is found.
     """
     search, nothing = open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
@@ -160,12 +175,22 @@ def find_limits_together(
                 break
             outer = search.printed(sides)
         box = settlement.cut(outer, failed)
-        # A box that is no larger than the one that passed ends the search, if further searches confirm that one.
-        is_over = number == MAX_BOXES or sum(each.evaluator.simulated for each in nothing.members) > MAX_SIMULATIONS
-        is_last = passed is not None and (is_over or volume(search, box) <= volume(search, passed.box))
-        trial = trials.confirmed(passed, number) if passed and is_last else trials.whole(box, number)
+        # A box that is no larger than the one that passed ends the search, if further searches
+        # confirm that one.
+        is_over = (
+            number == MAX_BOXES
+            or sum(each.evaluator.simulated for each in nothing.members) > MAX_SIMULATIONS
+        )
+        is_last = passed is not None and (
+            is_over or volume(search, box) <= volume(search, passed.box)
+        )
+        trial = (
+            trials.confirmed(passed, number) if passed and is_last else trials.whole(box, number)
+        )
         if _learn(search, trials, trial):
-            is_refuted = passed is not None and bool(len(search.unsafe_inside(search.sides_of(passed.box))))
+            is_refuted = passed is not None and bool(
+                len(search.unsafe_inside(search.sides_of(passed.box)))
+            )
             passed = None if is_refuted else passed
             failed += 1
             if is_over and passed is None:
@@ -191,9 +216,14 @@ def volume(search: BoxSearch, box: Box) -> float:
 def open_search(
     models: Models, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
 ) -> tuple[BoxSearch, LimitsTogether]:
-    """The search for a box, and the answer before it: the promise, and the fits in which it is broken."""
-    own = models.own._replace(evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0))
-    # Points at which nothing fails cost as much as the others; the test of a box adds those at which it fails.
+    """The search for a box, and the answer before it: the promise, and the fits in which it is
+    broken.
+    """
+    own = models.own._replace(
+        evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0)
+    )
+    # Points at which nothing fails cost as much as the others; the test of a box adds those at
+    # which it fails.
     first = own.at_worst_points(unsafe_settings, "worst points") if len(unsafe_settings) else own
     search = BoxSearch(first, columns, limits, unsafe_settings)
     promise = search.printed(search.fixed)
@@ -235,35 +265,52 @@ def _learn(search: BoxSearch, trials: Trials, trial: Trial) -> bool:
     return bool(trial.failures)
 
 
-def start_of(search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]) -> FloatArray:
-    """The box of what is safe alone; its corner where every characteristic has gone towards its smaller margin becomes
-    the first that the search knows.
+def start_of(
+    search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]
+) -> FloatArray:
+    """The box of what is safe alone; its corner where every characteristic has gone towards its
+    smaller margin becomes the first that the search knows.
     """
     start = search.longest.copy()
     corner = np.zeros(len(search.original))
-    for column, scan in zip(columns, scans, strict=False):  # parameters of the scenario, which come last, have no scan
+    for column, scan in zip(
+        columns, scans, strict=False
+    ):  # parameters of the scenario, which come last, have no scan
         original = search.original[column]
         low, high = scan.safe or (original, original)
         safe_alone = np.minimum(start[:, column], (original - low, high - original))
         start[:, column] = np.where(search.is_free[:, column], safe_alone, start[:, column])
-        low_degree, high_degree = np.nan_to_num([scan.degree(end) for end in (low, high)], nan=np.inf)
+        low_degree, high_degree = np.nan_to_num(
+            [scan.degree(end) for end in (low, high)], nan=np.inf
+        )
         corner[column] = -1.0 if low_degree < high_degree else 1.0
     search.corners.append(corner)
     return start
 
 
-def result(nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int) -> LimitsTogether:
-    """The limits together from a box that passed its trial; a box that leaves no characteristic any room is none."""
+def result(
+    nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int
+) -> LimitsTogether:
+    """The limits together from a box that passed its trial; a box that leaves no characteristic any
+    room is none.
+    """
     search = settlement.search
     box = trial.box
     least = [np.nan, np.nan]
     if trial.attack is not None:
         judges = [trial.judges[judge] for judge in trial.attack.judges]
-        values = [model.unsafe.value(left) for model, left in zip(judges, trial.attack.left.tolist(), strict=True)]
+        values = [
+            model.unsafe.value(left)
+            for model, left in zip(judges, trial.attack.left.tolist(), strict=True)
+        ]
         of_own = [value for value, model in zip(values, judges, strict=True) if model.fit == 0]
         worst = nothing.members[0].unsafe.worst
         least = [worst(values, default=np.nan), worst(of_own, default=np.nan)]
-    points = [len(model.evaluator.study.matrix.tests) for model in trial.judges[:1] if model.evaluator.study.matrix]
+    points = [
+        len(model.evaluator.study.matrix.tests)
+        for model in trial.judges[:1]
+        if model.evaluator.study.matrix
+    ]
     own_tests = nothing.members[0].evaluator.study.matrix
     return nothing._replace(
         box=box if has_room(search, box) else None,

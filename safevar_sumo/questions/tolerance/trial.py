@@ -1,4 +1,6 @@
-"""The trial of a box: its corners in all fits, an attack over all fits, and settings drawn at random."""
+"""The trial of a box: its corners in all fits, an attack over all fits, and settings drawn at
+random.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,14 @@ from safevar_sumo.records import FloatArray
 MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled setting is safe."""
 KNOWN = 32
-"""Number of the worst corners of the study's own fit with which an attack begins; of each other fit an eighth."""
+"""Number of the worst corners of the study's own fit with which an attack begins; of each other fit
+an eighth.
+"""
 FIRST_CORNERS = 512
 """Number of corners that are tried first: most boxes fail soon."""
 CONFIRMATIONS, STARTS = 3, 256
-"""Number of further attacks on a box that is to be printed, and of settings with which each begins."""
+"""Number of further attacks on a box that is to be printed, and of settings with which each begins.
+"""
 TRIAL_STAGE = "test of the limits together"
 
 
@@ -56,8 +61,8 @@ class Trial(NamedTuple):
 
 
 class Trials:
-    """The trials of boxes in some models; `budget` simulations attack each. Progress is shown by the evaluator of the
-    question.
+    """The trials of boxes in some models; `budget` simulations attack each. Progress is shown by
+    the evaluator of the question.
     """
 
     def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
@@ -67,20 +72,24 @@ class Trials:
         self.seed = models[0].evaluator.study.search.seed
         self._proofs = 0
         self._failing = {0}
-        """Number of proofs so far; numbers of the models in which corners of earlier boxes failed, which come first."""
+        """Number of proofs so far; numbers of the models in which corners of earlier boxes failed,
+        which come first.
+        """
 
     def whole(self, box: Box, attempt: int) -> Trial:
         """Try a box in all models: the first part that finds failures is the last.
 
-        Some corners in the models in which corners failed before; a search for counterexamples from the worst of them;
-        all corners in all models, of which the study's own fit meets more in a study that searches its scenario; and
-        settings drawn at random.
+        Some corners in the models in which corners failed before; a search for counterexamples from
+        the worst of them; all corners in all models, of which the study's own fit meets more in a
+        study that searches its scenario; and settings drawn at random.
         """
         corners = box.corners(self.seed, attempt)
         rng = Stream.FIRST_CORNERS.generator(self.seed, attempt)
         some = rng.permutation(corners[:MAX_CORNERS])[:FIRST_CORNERS]
         total = len(self.models) * min(len(corners), MAX_CORNERS) + self.budget
-        with self.evaluator.stage(TRIAL_STAGE, total + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)):
+        with self.evaluator.stage(
+            TRIAL_STAGE, total + proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
+        ):
             lefts = self._left(some, self._failing)
             if failures := self._failures(some, lefts):
                 return Trial(box, failures)
@@ -90,7 +99,9 @@ class Trials:
             lefts = self._left(corners[:MAX_CORNERS], range(len(self.models)))
             failures = self._failures(corners[:MAX_CORNERS], lefts)
             if len(more := corners[MAX_CORNERS:]):
-                failures += failures_of(self.models[0], more, self.models[0].left(more, TRIAL_STAGE))
+                failures += failures_of(
+                    self.models[0], more, self.models[0].left(more, TRIAL_STAGE)
+                )
             if failures:
                 return trial._replace(failures=failures)
             least = {
@@ -101,14 +112,22 @@ class Trials:
 
     def _left(self, corners: FloatArray, numbers: Iterable[int]) -> dict[int, FloatArray]:
         """What corners leave in some models, by their numbers."""
-        return {number: self.models[number].left(corners, TRIAL_STAGE) for number in sorted(numbers)}
+        return {
+            number: self.models[number].left(corners, TRIAL_STAGE) for number in sorted(numbers)
+        }
 
     def _failures(self, corners: FloatArray, lefts: Mapping[int, FloatArray]) -> list[Failures]:
         """The corners that fail in some models, which later boxes meet first."""
         self._failing |= {number for number, left in lefts.items() if (left < 0).any()}
-        return [one for number in lefts for one in failures_of(self.models[number], corners, lefts[number])]
+        return [
+            one
+            for number in lefts
+            for one in failures_of(self.models[number], corners, lefts[number])
+        ]
 
-    def _attack(self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], attempt: int) -> Trial:
+    def _attack(
+        self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], attempt: int
+    ) -> Trial:
         """Attack a box in all models, beginning at its worst corners in each, or in the first."""
         if not self.budget:
             return Trial(box, judges=self.models)
@@ -118,18 +137,24 @@ class Trials:
             corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
             for number in range(len(self.models))
         ]
-        rows: list[Callable[[FloatArray], FloatArray]] = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
+        rows: list[Callable[[FloatArray], FloatArray]] = [
+            partial(model.left, stage=TRIAL_STAGE) for model in judges
+        ]
         rng = Stream.JOINT_LIMITS.generator(self.seed, attempt)
         found = attack(box, rows, worst, self.budget, rng)
         failures = [
             one
             for number, model in enumerate(judges)
-            for one in failures_of(model, found.settings[found.judges == number], found.left[found.judges == number])
+            for one in failures_of(
+                model, found.settings[found.judges == number], found.left[found.judges == number]
+            )
         ]
         return Trial(box, failures, judges=judges, attack=found, left_out=left_out)
 
     def confirmed(self, trial: Trial, attempt: int) -> Trial:
-        """A trial that passed, with `CONFIRMATIONS` more attacks of as many simulations, which begin anew elsewhere."""
+        """A trial that passed, with `CONFIRMATIONS` more attacks of as many simulations, which
+        begin anew elsewhere.
+        """
         if trial.attack is None:
             return trial
         box = trial.box
@@ -146,12 +171,16 @@ class Trials:
         failures = [
             one
             for number, model in enumerate(judges)
-            for one in failures_of(model, found.settings[found.judges == number], found.left[found.judges == number])
+            for one in failures_of(
+                model, found.settings[found.judges == number], found.left[found.judges == number]
+            )
         ]
         return trial._replace(attack=found, failures=failures)
 
     def _denser(self, attempt: int) -> tuple[list[Model], int]:
-        """The models with points between those of a matrix, too, and the number of these that do not count."""
+        """The models with points between those of a matrix, too, and the number of these that do
+        not count.
+        """
         own = self.models[0].unsafe
         found = [with_points_between(model, own, attempt) for model in self.models]
         return [model for model, _ in found], found[0][1]
@@ -166,11 +195,17 @@ class Trials:
             return Judgement(model.left_by(evaluations) < 0, failed, ~evaluations.infeasible)
 
         rng = Stream.CONFIDENCE_BOUND.generator(self.seed, attempt)
-        proof, unsafe = prove(lambda number: trial.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs)
-        return trial._replace(proof=proof, failures=failures_of(model, unsafe, np.full(len(unsafe), -1.0)))
+        proof, unsafe = prove(
+            lambda number: trial.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs
+        )
+        return trial._replace(
+            proof=proof, failures=failures_of(model, unsafe, np.full(len(unsafe), -1.0))
+        )
 
 
 def failures_of(model: Model, settings: FloatArray, left: FloatArray) -> list[Failures]:
-    """The settings that leave less than nothing, and the model at the points where they do; empty if none does."""
+    """The settings that leave less than nothing, and the model at the points where they do; empty
+    if none does.
+    """
     unsafe = settings[left < 0]
     return [Failures(model.at_worst_points(unsafe, TRIAL_STAGE), unsafe)] if len(unsafe) else []

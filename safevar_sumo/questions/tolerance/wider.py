@@ -1,4 +1,6 @@
-"""The same limits in the scope of a wider study about the same car, which the study names by its key `wider`."""
+"""The same limits in the scope of a wider study about the same car, which the study names by its
+key `wider`.
+"""
 
 from __future__ import annotations
 
@@ -38,16 +40,24 @@ def wider_study(study: Study) -> Study:
     InputError
         If there is none, or it varies other characteristics.
     """
-    paths = [path for folder in study.origin.places if (path := Path(folder, study.wider)).is_file()]
+    paths = [
+        path for folder in study.origin.places if (path := Path(folder, study.wider)).is_file()
+    ]
     try:
         wider = load_study(str(paths[0]) if paths else study.wider)
     except InputError as error:
-        raise InputError(study.source, f"wider = {study.wider!r}: {error.problem}", error.legal) from None
+        raise InputError(
+            study.source, f"wider = {study.wider!r}: {error.problem}", error.legal
+        ) from None
     own = study.vehicle.characteristics
     others = wider.vehicle.characteristics
-    if {name: row.unit for name, row in own.items()} != {name: row.unit for name, row in others.items()}:
+    if {name: row.unit for name, row in own.items()} != {
+        name: row.unit for name, row in others.items()
+    }:
         problem = f"wider = {study.wider!r} varies {', '.join(others)}"
-        raise InputError(study.source, problem, f"a study of the same characteristics: {', '.join(own)}")
+        raise InputError(
+            study.source, problem, f"a study of the same characteristics: {', '.join(own)}"
+        )
     return wider
 
 
@@ -60,14 +70,16 @@ def wider_rows(
     fits: int | None,
     budget: int,
 ) -> list[tuple[Any, ...]]:
-    """The row of `WIDER` for a study that names a wider one: an attack on the limits together in the wider scope, or
-    without such limits on the specified ones.
+    """The row of `WIDER` for a study that names a wider one: an attack on the limits together in
+    the wider scope, or without such limits on the specified ones.
     """
     if not evaluator.study.wider or together is None or not budget:
         return []
     study = wider_study(evaluator.study)
     other = evaluator.for_study(study)
-    models = models_of(other, limit_criterion(other, study, unsafe, margin, other.evaluate_original()), fits)
+    models = models_of(
+        other, limit_criterion(other, study, unsafe, margin, other.evaluate_original()), fits
+    )
     if together.box is None and not limits:
         return []
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
@@ -85,7 +97,9 @@ def wider_rows(
         lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
     members = other.characteristics
-    fails_at = None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True))
+    fails_at = (
+        None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True))
+    )
     return [(study.name, scope_of(study), not found.failures, verdict, fails_at)]
 
 
@@ -106,7 +120,9 @@ def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
 def _verdict(
     models: Models, box: Box, found: Falsification[Model], lowest: tuple[Model, FloatArray] | None
 ) -> tuple[str, Failure | None]:
-    """What the falsification found, in words: the failure at the lowest speed, then the worst; and the former."""
+    """What the falsification found, in words: the failure at the lowest speed, then the worst; and
+    the former.
+    """
     attack = found.attack
     assert attack is not None
     if not found.failures:
@@ -115,8 +131,11 @@ def _verdict(
         model = models.members[int(attack.judges[0])]
         keeps = model.unsafe.value_in_words(model.unsafe.value(attack.left[0]))
         return f"they hold: the worst of {attack.simulated:,} aimed at them {keeps}.", None
-    # The search begins with the worst of the first settings, so its worst failure is the worst of all.
-    worst = (models.members[int(attack.judges[0])], attack.settings[0]) if len(attack.left) else None
+    # The search begins with the worst of the first settings, so its worst failure is the worst of
+    # all.
+    worst = (
+        (models.members[int(attack.judges[0])], attack.settings[0]) if len(attack.left) else None
+    )
     described = [
         failure
         for pair in (lowest, worst)
@@ -125,5 +144,7 @@ def _verdict(
     ]
     new_car = ", where the new car is safe" if lowest is not None else ""
     first = described[0].words if described else "a car within them is unsafe"
-    last = f"; at worst, {described[-1].words}" if len({each.words for each in described}) > 1 else ""
+    last = (
+        f"; at worst, {described[-1].words}" if len({each.words for each in described}) > 1 else ""
+    )
     return f"they do not hold: {first}{new_car}{last}.", described[0] if described else None

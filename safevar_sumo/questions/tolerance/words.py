@@ -1,4 +1,6 @@
-"""The verdict on limits in words: the decision, how sure it is, in how many fits, and in which scope."""
+"""The verdict on limits in words: the decision, how sure it is, in how many fits, and in which
+scope.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +26,31 @@ NOT_FALSIFIED = "with --attack 0, no simulation searched for a counterexample"
 
 
 def rough_in_words(budget: int) -> str:
-    """The beginning of a verdict for which fewer simulations than usual searched for a counterexample."""
+    """The beginning of a verdict for which fewer simulations than usual searched for a
+    counterexample.
+    """
     if budget >= USUAL_BUDGET:
         return ""
-    return f"Rough answer, with {budget:,} instead of {USUAL_BUDGET:,} simulations that search for a counterexample. "
+    return (
+        f"Rough answer, with {budget:,} instead of {USUAL_BUDGET:,} simulations that search for a"
+        " counterexample. "
+    )
 
 
 def contacts_in_words(evaluator: Evaluator, contacts: Contacts) -> Iterator[str]:
-    """What vehicles within the limits do in encounters that do not count; nothing where they touch nobody."""
+    """What vehicles within the limits do in encounters that do not count; nothing where they touch
+    nobody.
+    """
     if contacts.number:
         members = evaluator.characteristics
         item = members.members[members.names.index(contacts.name)]
         margin = evaluator.study.scenario.margin
         yield (
-            f"Where the original touches nobody but keeps less than {margin:g} m, which does not count, vehicles "
-            f"within these limits touch somebody: {number_of(contacts.number, 'such contact')} found, the lowest at "
-            f"{item.name.replace('_', ' ')} {limit_text(item, round(contacts.lowest, item.digits + 1))}."
+            f"Where the original touches nobody but keeps less than {margin:g} m, which does not"
+            " count, vehicles within these limits touch somebody:"
+            f" {number_of(contacts.number, 'such contact')} found, the lowest at"
+            f" {item.name.replace('_', ' ')}"
+            f" {limit_text(item, round(contacts.lowest, item.digits + 1))}."
         )
 
 
@@ -55,7 +66,9 @@ def verdict_sentences(
     refusal: str,
     contacts: Contacts | None,
 ) -> Iterator[str]:
-    """The sentences of the verdict, the decision first; a `refusal` says why no limit can be kept."""
+    """The sentences of the verdict, the decision first; a `refusal` says why no limit can be
+    kept.
+    """
     unsafe = models.own.unsafe
     study = models.own.evaluator.study
     if refusal:
@@ -89,28 +102,41 @@ def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
         fits = fit_names(sorted(together.broken))
         yield f"The specified limits hold in {kept} fits of the vehicle, not in {fits}."
     if models.left_out:
-        yield f"Left out: {fit_names(models.left_out)}, in which the original itself is unsafe or keeps too little."
+        yield (
+            f"Left out: {fit_names(models.left_out)}, in which the original itself is unsafe or"
+            " keeps too little."
+        )
 
 
 def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
     """What would do in place of the specified limits."""
     would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
     if would_do:
-        values = " or ".join(f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do)
+        values = " or ".join(
+            f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do
+        )
         others = ", the other specified limits as they are" if len(nearest) > 1 else ""
         yield f"What would do: {values}{others}."
     elif nearest:
         yield "No value of any one of the specified limits would do."
 
 
-def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, budget: int) -> Iterator[str]:
+def _box_in_words(
+    models: Models, together: LimitsTogether, has_limits: bool, budget: int
+) -> Iterator[str]:
     """The limits together, and what they were tested with."""
     unsafe = models.own.unsafe
     count = len(together.members)
-    where = "in one model" if len(models.members) == 1 else f"in {count} of {len(models.members)} fits"
+    where = (
+        "in one model" if len(models.members) == 1 else f"in {count} of {len(models.members)} fits"
+    )
     if together.box is None:
         if together.boxes:
-            kept = "The specified limits are kept with all others as in the original. " if has_limits else ""
+            kept = (
+                "The specified limits are kept with all others as in the original. "
+                if has_limits
+                else ""
+            )
             boxes = "1 box was" if together.boxes == 1 else f"{together.boxes} boxes were"
             yield (
                 f"{kept}No limits together were found ({unsafe.description}): {boxes} "
@@ -121,8 +147,14 @@ def _box_in_words(models: Models, together: LimitsTogether, has_limits: bool, bu
     if has_limits:
         decision = "The limits together below hold" if together.broken else "Keeps all limits"
     if not budget:
-        decision = "No search for counterexamples tested the limits together below: they hold at their corners"
-    yield f"{decision} {where}: within them no vehicle that was tried {failure_in_words(unsafe, count)}."
+        decision = (
+            "No search for counterexamples tested the limits together below: they hold at their"
+            " corners"
+        )
+    yield (
+        f"{decision} {where}: within them no vehicle that was tried"
+        f" {failure_in_words(unsafe, count)}."
+    )
     yield f"Tried: {trial_in_words(together, budget)}."
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
@@ -136,16 +168,24 @@ def trial_in_words(together: LimitsTogether, budget: int) -> str:
 
 
 def failure_in_words(unsafe: Unsafe, fits: int) -> str:
-    """What no vehicle does within limits that hold in some fits: other fits than the study's own keep no distance."""
+    """What no vehicle does within limits that hold in some fits: other fits than the study's own
+    keep no distance.
+    """
     if not unsafe.keep:
         return f"is unsafe ({unsafe.description}){f' in any of {fits} fits' if fits > 1 else ''}"
     between = " between bumpers" if unsafe.contact else ""
-    others = f" with the study's own fit, and none collides with {number_of(fits - 1, 'other')}" if fits > 1 else ""
+    others = (
+        f" with the study's own fit, and none collides with {number_of(fits - 1, 'other')}"
+        if fits > 1
+        else ""
+    )
     return f"keeps less than {unsafe.keep:.3g} m{between}{others}"
 
 
 def _attack_in_words(together: LimitsTogether, budget: int) -> str:
-    """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67 m)`."""
+    """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67
+    m)`.
+    """
     if together.attack is None or not budget:
         return "not attacked"
     least, own = together.least
@@ -160,7 +200,9 @@ def _attack_in_words(together: LimitsTogether, budget: int) -> str:
     if together.between:
         between = f", at {number_of(together.between, 'point')} between those of the study, too"
         if together.between_left_out:
-            between += f" ({together.between_left_out} left out, where the new car keeps too little)"
+            between += (
+                f" ({together.between_left_out} left out, where the new car keeps too little)"
+            )
     return f"the worst of {together.attack.simulated:,} aimed at them {words}{of_own}{between}"
 
 
@@ -168,7 +210,10 @@ def _proof_in_words(together: LimitsTogether) -> str:
     proof = together.proof
     assert proof is not None
     failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
-    bound = f"at most {100 * proof.at_most:.2f} % of evenly drawn cars are, with {100 * CONFIDENCE:.0f} % confidence"
+    bound = (
+        f"at most {100 * proof.at_most:.2f} % of evenly drawn cars are, with {100 * CONFIDENCE:.0f}"
+        " % confidence"
+    )
     return f"{proof.failures} of {proof.samples:,} drawn at random are unsafe{failed}: {bound}"
 
 

@@ -1,9 +1,11 @@
-"""Repeat a simulation in CARLA: python run_in_carla.py [--host HOST] [--port PORT] [--agent MODULE:CLASS].
+"""Repeat a simulation in CARLA: python run_in_carla.py [--host HOST] [--port PORT] [--agent
+MODULE:CLASS].
 
-Needs a running CARLA server and its Python client. The road comes from `road.xodr`, everything else from
-`vehicle.json`, both beside this script. The vehicle gets the recorded throttle and brake, or those of your agent:
-`CLASS(vehicle)` with a method `run_step()` that returns a `carla.VehicleControl`, as CARLA's own agents have. CARLA's y
-and yaw have the opposite sign of the file's.
+Needs a running CARLA server and its Python client. The road comes from `road.xodr`, everything else
+from `vehicle.json`, both beside this script. The vehicle gets the recorded throttle and brake, or
+those of your agent: `CLASS(vehicle)` with a method `run_step()` that returns a
+`carla.VehicleControl`, as CARLA's own agents have. CARLA's y and yaw have the opposite sign of the
+file's.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ SETTLING = 20
 
 
 def apply_values(physics: Any, scene: Scene) -> Any:
-    """Set the values that the study varies, of the vehicle and of its wheels; all others stay CARLA's."""
+    """Set the values that the study varies, of the vehicle and of its wheels; all others stay
+    CARLA's.
+    """
     for name, value in scene["physics"].items():
         setattr(physics, name, value)
     wheels = list(physics.wheels)
@@ -39,7 +43,9 @@ def apply_values(physics: Any, scene: Scene) -> Any:
 
 def place(x: float, y: float, heading: float, z: float = RIDE_HEIGHT) -> Any:
     """A place of the file in CARLA's left-handed frame."""
-    return carla.Transform(carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(heading)))
+    return carla.Transform(
+        carla.Location(x=x, y=-y, z=z), carla.Rotation(yaw=-math.degrees(heading))
+    )
 
 
 def place_at(actor: Scene, step: int) -> Any:
@@ -68,7 +74,11 @@ def spawn(world: Any, scene: Scene) -> tuple[Any, list[tuple[Scene, Any]]]:
     library = world.get_blueprint_library()
     vehicle = world.spawn_actor(library.filter(scene["blueprint"])[0], place(**scene["start"]))
     vehicle.apply_physics_control(apply_values(vehicle.get_physics_control(), scene))
-    patterns = {"pedestrian": "walker.pedestrian.*", "bicycle": "vehicle.*.crossbike", "car": scene["blueprint"]}
+    patterns = {
+        "pedestrian": "walker.pedestrian.*",
+        "bicycle": "vehicle.*.crossbike",
+        "car": scene["blueprint"],
+    }
     others = []
     for actor in scene["actors"]:
         body = world.spawn_actor(library.filter(patterns[actor["kind"]])[0], place_at(actor, 0))
@@ -81,7 +91,9 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
     """Play the scene; returns the speed of the first collision [m/s], None without one."""
     vehicle, others = spawn(world, scene)
     sensor = world.spawn_actor(
-        world.get_blueprint_library().find("sensor.other.collision"), carla.Transform(), attach_to=vehicle
+        world.get_blueprint_library().find("sensor.other.collision"),
+        carla.Transform(),
+        attach_to=vehicle,
     )
     touched = []
     speed = 0.0
@@ -98,7 +110,9 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
             vehicle.apply_control(agent.run_step() if agent else pedals(scene, step))
             for actor, body in others:
                 if actor["kind"] == "pedestrian":  # it moves its legs; the record places it
-                    body.apply_control(walk(actor["places"], step, scene["step"], body.get_location()))
+                    body.apply_control(
+                        walk(actor["places"], step, scene["step"], body.get_location())
+                    )
                 body.set_transform(place_at(actor, step))
             before = speed
             speed = math.hypot(vehicle.get_velocity().x, vehicle.get_velocity().y)
@@ -116,7 +130,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Repeat a simulation in CARLA.")
     parser.add_argument("--host", default="localhost")
     parser.add_argument("--port", type=int, default=2000)
-    parser.add_argument("--agent", metavar="MODULE:CLASS", help="drive with this agent in place of the recorded pedals")
+    parser.add_argument(
+        "--agent",
+        metavar="MODULE:CLASS",
+        help="drive with this agent in place of the recorded pedals",
+    )
     options = parser.parse_args()
     agent_class = None
     if options.agent:
