@@ -1,84 +1,107 @@
-"""The boundary between what is safe and what is unsafe on a straight way: the last safe value
-before some failures.
-"""
+"""The boundary between what is safe and what is unsafe on straight lines of settings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.records import BoolArray, FloatArray
 
-PARTS, ROUNDS = 8, 4
-"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe value into `PARTS` parts.
-"""
-MOVED_BEFORE = 8
-"""Number of failures, the nearest to the safe value, in whose encounters the last safe value is
-safe at once.
-"""
+PARTS = (8, 8, 8, 8)
+"""Number of equal parts into which each round divides what is left of a line."""
+NEAREST = 8
+"""Number of failures, those nearest to a safe value, before which the last safe value is sought."""
 
 
-class Tested(Protocol):
-    """A model in which settings are tested, such as `models.Model`."""
-
-    def left(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
-        where it does not count.
-        """
-
-    def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
-        """Which of M settings are unsafe, shape (M,)."""
-
-
-class Move:
-    """The way of one column from a safe value to the nearest of some failures, shape (K, n): to the
-    last value before it that is safe in the encounters of them all.
-
-    Attributes
-    ----------
-    safe, failure
-        The last safe value, and the failure just beyond it, shape (n,).
+class Boundaries(NamedTuple):
+    """The last safe and the first unsafe share of each of K lines, shape (K,), with the settings
+    there, shape (K, n).
     """
 
-    def __init__(self, column: int, start: float, failures: FloatArray) -> None:
-        self.column = column
-        self.safe = start
-        order = np.argsort(np.abs(failures[:, column] - start), kind="stable")
-        self.encounters = failures[order[:MOVED_BEFORE]]
-        self.failure = self.encounters[0]
-
-    @property
-    def _values(self) -> FloatArray:
-        """The values of a round."""
-        return np.asarray(
-            self.safe + (self.failure[self.column] - self.safe) * np.arange(1, PARTS) / PARTS
-        )
-
-    @property
-    def settings(self) -> FloatArray:
-        """The settings of a round, shape (K (`PARTS` - 1), n)."""
-        settings = np.repeat(self.encounters, PARTS - 1, axis=0)
-        settings[:, self.column] = np.tile(self._values, len(self.encounters))
-        return settings
-
-    def narrow(self, are_unsafe: BoolArray) -> None:
-        """Take what a round gave."""
-        is_unsafe = are_unsafe.reshape(len(self.encounters), PARTS - 1)
-        values = self._values
-        first = int(np.argmax(np.append(is_unsafe.any(axis=0), True)))
-        self.safe = self.safe if first == 0 else float(values[first - 1])
-        if first < len(values):
-            self.failure = self.encounters[np.argmax(is_unsafe[:, first])].copy()
-            self.failure[self.column] = values[first]
+    safe_shares: FloatArray
+    unsafe_shares: FloatArray
+    safe: FloatArray
+    unsafe: FloatArray
 
 
-def find_boundaries(moves: Sequence[Move], model: Tested, stage: str) -> None:
-    """Carry out moves before failures in a model, side by side."""
-    for _ in range(ROUNDS):
-        settings = [each.settings for each in moves]
-        are_unsafe = model.are_unsafe(np.concatenate(settings), stage)
-        parts = np.split(are_unsafe, np.cumsum([*map(len, settings)])[:-1])
-        for each, part in zip(moves, parts, strict=True):
-            each.narrow(part)
+def find_boundaries(
+    starts: FloatArray,
+    ends: FloatArray,
+    are_unsafe: Callable[[FloatArray], BoolArray],
+    parts: Sequence[int] = PARTS,
+    lowest: FloatArray | float = 0.0,
+) -> Boundaries:
+    """The first unsafe place on each of K lines from `starts` to `ends`, shape (K, n), from the
+    share `lowest` on, shape (K,).
+
+    The start of a line counts as safe and its end as unsafe, without being tested. `are_unsafe`
+    tests settings of all lines together, shape (M, n): which of them are unsafe, shape (M,). The
+    error is at most one part of the last round.
+    """
+    lines = np.arange(len(starts))
+    low = np.broadcast_to(np.asarray(lowest, dtype=float), lines.shape)
+    high = np.ones(len(lines))
+    for number in parts:
+        # The bounds between equal parts of what is left of each line.
+        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(number + 1) / number
+        shares[:, -1] = high  # without a rounding error
+        inner = on_lines(starts, ends, shares[:, 1:-1])
+        tested = are_unsafe(inner.reshape(-1, starts.shape[1])).reshape(len(lines), number - 1)
+        # Of these parts the one below the first unsafe bound is left.
+        is_unsafe = np.column_stack([tested, np.ones(len(lines), dtype=bool)])
+        first = np.argmax(is_unsafe, axis=1)
+        low = shares[lines, first]
+        high = shares[lines, first + 1]
+    safe = on_lines(starts, ends, low[:, np.newaxis])[:, 0]
+    unsafe = on_lines(starts, ends, high[:, np.newaxis])[:, 0]
+    return Boundaries(low, high, safe, unsafe)
+
+
+def on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
+    """Settings at P `shares`, shape (K, P), of K lines from `starts` to `ends`, shape (K, n); shape
+    (K, P, n).
+    """
+    factors = shares[..., np.newaxis]
+    start = starts[:, np.newaxis]
+    end = ends[:, np.newaxis]
+    return np.where(factors >= 1, end, start + factors * (end - start))
+
+
+class Failing(NamedTuple):
+    """Failures, shape (K, n), and a safe value of one of their columns."""
+
+    column: int
+    safe: float
+    failures: FloatArray
+
+
+def last_safe_values(
+    groups: Sequence[Failing], are_unsafe: Callable[[FloatArray], BoolArray]
+) -> list[tuple[float, FloatArray]]:
+    """For each group the last value before its failures that is safe in the encounters of the
+    `NEAREST` of them, and the failure just beyond it, shape (n,).
+    """
+    # Every failure ends a line on which its column alone changes, from the safe value on.
+    ends = [_nearest(group) for group in groups]
+    starts = [rows.copy() for rows in ends]
+    for group, rows in zip(groups, starts, strict=True):
+        rows[:, group.column] = group.safe
+    found = find_boundaries(np.concatenate(starts), np.concatenate(ends), are_unsafe)
+    # Of each group the nearest boundary counts.
+    last = np.cumsum([len(rows) for rows in ends])[:-1]
+    values = list[tuple[float, FloatArray]]()
+    for group, safe, unsafe in zip(
+        groups, np.split(found.safe, last), np.split(found.unsafe, last), strict=True
+    ):
+        nearest = np.argmin(np.abs(unsafe[:, group.column] - group.safe))
+        column = safe[:, group.column]
+        value = column[np.argmin(np.abs(column - group.safe))]
+        values.append((float(value), unsafe[nearest]))
+    return values
+
+
+def _nearest(group: Failing) -> FloatArray:
+    distances = np.abs(group.failures[:, group.column] - group.safe)
+    return group.failures[np.argsort(distances, kind="stable")[:NEAREST]]

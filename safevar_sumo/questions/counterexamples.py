@@ -17,7 +17,6 @@ from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.encounters import encounter
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
@@ -93,7 +92,7 @@ def as_printed(
 
 def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
-    points = assemble(model.evaluator.study).points
+    points = model.evaluator.system.points
     points = tuple(points[number] for number in model.points) or points
     members = model.evaluator.characteristics
     runs = model.evaluate(settings, STAGE)

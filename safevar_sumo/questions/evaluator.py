@@ -28,7 +28,7 @@ from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
 
@@ -120,6 +120,11 @@ class Evaluator:
         self.simulated = 0
         self.measure = ""
         self.undefined = list[tuple[int, int]]()
+
+    @cached_property
+    def system(self) -> System:
+        """The models of the study, assembled."""
+        return assemble(self.study)
 
     def evaluate(
         self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False
@@ -219,7 +224,7 @@ class Evaluator:
         """
         if not len(self.characteristics.scenario):
             return evaluations
-        is_left_out = assemble(self.study).measuring.scoring.violation(evaluations) > 0
+        is_left_out = self.system.measuring.scoring.violation(evaluations) > 0
         metrics = {
             name: np.where(is_left_out, np.nan, values)
             for name, values in evaluations.metrics.items()
@@ -461,6 +466,6 @@ def open_evaluator(
     if pool is not None:
         yield Evaluator(study, pool, progress)
         return
-    assemble(study)
+    assemble(study)  # before workers start
     with open_pool(jobs) as new_pool:
         yield Evaluator(study, new_pool, progress)

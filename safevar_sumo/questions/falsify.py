@@ -1,51 +1,72 @@
-"""The falsification of a claim about a box: a search for a setting in it that is unsafe in any of
-some models; and the largest value of a parameter, such as a speed, up to which it finds none.
+"""The falsification of the claim that all settings of a box are safe in some models: a search for
+settings that are unsafe in any of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from safevar_sumo.questions.attack import Attack, attack
-from safevar_sumo.questions.boundary import Move, Tested, find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.records import FloatArray
 
 LEAST_SIMULATIONS = 1000
 """Fewest simulations that search for a counterexample before a value is printed as one that holds.
 """
-POINTS = 128
-"""Number of Sobol points, of corners, of random settings with half of their values at ends, and of
-settings at a value that is tested, with which a falsification begins in each model.
+GENERATION, PARENTS = 512, 32
+"""Settings of a generation; the worst ones so far, which are its parents."""
+STEP, PULL = 0.1, 0.5
+"""Step of a mutation, as a share of the way to a random value; share of the way to a worse parent.
 """
-KNOWN = 16
-"""Number of the worst of these with which the search goes on in each model."""
-MAX_STEPS = 40
-"""Largest number of values that are tried in search of the largest one that holds."""
-AnyModel = TypeVar("AnyModel", bound=Tested)
+DIFFERENCE = 0.7
+"""Factor on the difference of two parents (F of differential evolution; Storn and Price 1997)."""
+MORE_GENERATIONS = 2
+"""Generations after the first with an unsafe setting: several failures at once spare searches of
+boxes beside them.
+"""
+Judge = Callable[[FloatArray], FloatArray]
+"""What each of M settings leaves to the limit in a model, shape (M,): below 0 it is unsafe;
+infinite where it does not count.
+"""
+Rows = npt.NDArray[np.intp]
 
 
-class Falsification(NamedTuple, Generic[AnyModel]):
-    """The unsafe settings that a falsification found, shape (K, n), with the model of each group,
-    none if the claim held; and its search.
+class Falsification(NamedTuple):
+    """The worst settings that a falsification met, worst first; all unsafe ones are among them.
+
+    Attributes
+    ----------
+    settings, judges, left
+        Settings, shape (K, n), the numbers of the judges that they met, and what they leave, shape
+        (K,).
+    simulated
+        Number of settings that were simulated, each in one encounter and one model.
     """
 
-    failures: list[tuple[AnyModel, FloatArray]]
-    attack: Attack | None
+    settings: FloatArray
+    judges: Rows
+    left: FloatArray
+    simulated: int
 
+    @property
+    def failures(self) -> dict[int, FloatArray]:
+        """The unsafe settings, shape (K, n), by the number of the judge; none if the claim held."""
+        is_unsafe = self.left < 0
+        return {
+            judge: self.settings[is_unsafe & (self.judges == judge)]
+            for judge in np.unique(self.judges[is_unsafe]).tolist()
+        }
 
-class Reach(NamedTuple, Generic[AnyModel]):
-    """The largest value that holds, None if none does; the falsification that found nothing up to
-    it; and all unsafe settings that were found beyond it.
-    """
-
-    value: float | None = None
-    attack: Attack | None = None
-    failures: Sequence[tuple[AnyModel, FloatArray]] = ()
+    def merged(self, other: Falsification) -> Falsification:
+        """Both falsifications as one."""
+        left = np.concatenate([self.left, other.left])
+        worst = np.argsort(left, kind="stable")
+        settings = np.concatenate([self.settings, other.settings])[worst]
+        judges = np.concatenate([self.judges, other.judges])[worst]
+        return Falsification(settings, judges, left[worst], self.simulated + other.simulated)
 
 
 def enough(budget: int) -> int:
@@ -57,102 +78,188 @@ def enough(budget: int) -> int:
 
 def falsify(
     box: Box,
-    models: Sequence[AnyModel],
+    judges: Sequence[Judge],
+    known: Sequence[FloatArray],
     budget: int,
-    seed: tuple[int, ...],
-    stage: str,
-    tested: tuple[int, float] | None = None,
-) -> Falsification[AnyModel]:
-    """Search a box for unsafe settings with `budget` simulations, in all models.
+    rng: np.random.Generator,
+) -> Falsification:
+    """Search the settings of a box that leave least, with `budget` simulations; it ends
+    `MORE_GENERATIONS` after one is unsafe.
 
-    `tested` is a column and its value that is to be printed: a part of the first settings has just
-    this value.
+    `known` are settings for each judge, or none, which are the first generation; random ones fill
+    it up.
+
+    Notes
+    -----
+    Half of a generation are children of two parents, each value from one of the two; on average one
+    value mutates: to a random value, a step towards one, or to an end of the box. The other half
+    moves a parent towards a worse one and by a difference of two others, as differential evolution
+    does. After the first generation, half of each meets the judge to whom least is left, and half
+    another one, in turn, the next worst first: few at once make large batches.
     """
-    rng = np.random.default_rng(seed)
-    settings = _first_settings(box, seed, rng, tested)
-    lefts = [model.left(settings, stage) for model in models]
-    failures = [(model, settings[left < 0]) for model, left in zip(models, lefts, strict=True)]
-    found = None
-    if budget:
-        # The search goes on from the worst of the first settings in each model.
-        worst = [settings[np.argsort(left, kind="stable")[:KNOWN]] for left in lefts]
-        judges = [partial(model.left, stage=stage) for model in models]
-        found = attack(box, judges, worst, budget, rng)
-        is_unsafe = found.left < 0
-        failures += [
-            (models[judge], found.settings[is_unsafe & (found.judges == judge)])
-            for judge in np.unique(found.judges[is_unsafe])
-        ]
-    return Falsification([(model, rows) for model, rows in failures if len(rows)], found)
+    return falsify_all([box], judges, [known], budget, [rng])[0]
 
 
-def _first_settings(
-    box: Box, seed: tuple[int, ...], rng: np.random.Generator, tested: tuple[int, float] | None
-) -> FloatArray:
-    """The settings with which a falsification begins, shape (K, n)."""
-    spread = box.spread_and_corners(POINTS, int(np.random.SeedSequence(seed).generate_state(1)[0]))
-    at_ends = box.with_ends(POINTS, rng)
-    settings = np.concatenate([spread, at_ends])
-    if tested is not None:
-        column, value = tested
-        just_within = np.concatenate([spread[POINTS:], at_ends])
-        just_within[:, column] = value
-        settings = np.concatenate([settings, just_within])
-    return np.unique(settings, axis=0)
+def falsify_all(
+    boxes: Sequence[Box],
+    judges: Sequence[Judge],
+    known: Sequence[Sequence[FloatArray]],
+    budget: int,
+    rngs: Sequence[np.random.Generator],
+    generation: int = GENERATION,
+) -> list[Falsification]:
+    """Falsify the claim about several boxes side by side, each with `budget` simulations,
+    `generation` of them at once: a judge meets a generation of all boxes together, as few large
+    batches cost less than many small ones.
+    """
+    found = dict[int, Falsification]()
+    steps = [
+        _steps(box, len(judges), of_box, budget, generation, rng)
+        for box, of_box, rng in zip(boxes, known, rngs, strict=True)
+    ]
+    waiting = dict[int, _Generation]()
+
+    def go_on(number: int, left: FloatArray | None) -> None:
+        try:
+            waiting[number] = next(steps[number]) if left is None else steps[number].send(left)
+        except StopIteration as end:
+            found[number] = end.value
+
+    for number in range(len(boxes)):
+        go_on(number, None)
+    while waiting:
+        # All boxes' generations meet each judge in one batch.
+        numbers = [*waiting]
+        generations = [*waiting.values()]
+        waiting.clear()
+        settings = np.concatenate([each.settings for each in generations])
+        met = np.concatenate([each.judges for each in generations])
+        left = np.full(len(settings), np.inf)
+        for judge in np.unique(met):
+            left[met == judge] = judges[judge](settings[met == judge])
+        ends = np.cumsum([len(each.settings) for each in generations])[:-1]
+        for number, of_box in zip(numbers, np.split(left, ends), strict=True):
+            go_on(number, of_box)
+    return [found[number] for number in range(len(boxes))]
 
 
-def reach(
+class _Generation(NamedTuple):
+    """Settings, shape (M, n), and the numbers of the judges that they are to meet."""
+
+    settings: FloatArray
+    judges: Rows
+
+
+def _steps(
     box: Box,
-    column: int,
-    models: Sequence[AnyModel],
+    n_judges: int,
+    known: Sequence[FloatArray],
     budget: int,
-    seed: tuple[int, ...],
-    stage: str,
-    known: Sequence[tuple[AnyModel, FloatArray]] = (),
-) -> Reach[AnyModel]:
-    """The largest value of a column of a box up to which a falsification finds nothing, from its
-    lower end on.
-
-    Where a setting fails, a `known` one or one that is found, the value moves down to the last one
-    before it with which its encounter is safe. A value is rounded down as it is printed, and
-    falsified again.
-    """
-    item = box.region.characteristics.members[column]
-    low = float(box.lower[column])
-    high = float(box.upper[column])
-    failures = [*known]
-    new = [*known]
-    for number in range(MAX_STEPS):
-        # The last value before all failures with which their encounters are safe.
-        for model, rows in new:
-            inside = rows[rows[:, column] <= high]
-            if len(inside):
-                move = Move(column, low, inside)
-                find_boundaries([move], model, stage)
-                failures.append((model, move.failure[np.newaxis]))
-                high = move.safe
-        if high < box.upper[column]:
-            high = rounded_down(high, item.digits, item.unit)
-        if high <= low:
-            break
-        upper = box.upper.copy()
-        upper[column] = high
-        found = falsify(
-            Box(box.region, box.lower, upper),
-            models,
-            budget,
-            (*seed, number),
-            stage,
-            (column, high),
+    size: int,
+    rng: np.random.Generator,
+) -> Generator[_Generation, FloatArray, Falsification]:
+    """The generations of a falsification, which takes what each leaves."""
+    found = Falsification(np.zeros((0, len(box.lower))), np.zeros(0, dtype=np.intp), np.zeros(0), 0)
+    seen = set[tuple[int, bytes]]()
+    generations_left = 1 + MORE_GENERATIONS
+    settings = np.concatenate([found.settings, *known])
+    numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(np.intp)
+    least = np.full(n_judges, np.inf)
+    generation = 0
+    while found.simulated < budget:
+        # The first generation holds all known settings, each later one at most `size`.
+        number = min(
+            max(size, len(settings)) if generation == 0 else size, budget - found.simulated
         )
-        if not found.failures:
-            return Reach(high, found.attack, failures)
-        new = found.failures
-        failures += new
-    return Reach(None, None, failures)
+        choice = np.arange(n_judges) if generation == 0 else _pair(least, generation)
+        settings, numbers = _new_ones(box, settings, numbers, choice, number, seen, rng)
+        if not len(settings):
+            break
+        left = yield _Generation(settings, numbers)
+        np.minimum.at(least, numbers, left)
+        found = _worst(found, settings, numbers, left)
+        generations_left -= int((found.left < 0).any())
+        if not generations_left:
+            break
+        settings = _children(box, found, max(size, GENERATION), rng)
+        generation += 1
+        # Of two neighbours one is mutated and one moved: each judge gets both.
+        numbers = _pair(least, generation)[np.arange(len(settings)) // 2 % 2]
+    return found
 
 
-def rounded_down(value: float, digits: int, unit: str) -> float:
-    """A value as it is printed: a speed in km/h has one decimal."""
-    scale = 10.0 ** (min(digits, 1) if unit == "km/h" else digits)
-    return float(np.floor(np.round(value * scale, 6)) / scale)
+def _pair(least: FloatArray, generation: int) -> Rows:
+    """The judges of a generation: that with the least left, and another one in turn."""
+    first, *others = np.argsort(least, kind="stable").tolist()
+    second = others[(generation - 1) % len(others)] if others else first
+    return np.array([first, second])
+
+
+def _new_ones(
+    box: Box,
+    settings: FloatArray,
+    numbers: Rows,
+    choice: Rows,
+    size: int,
+    seen: set[tuple[int, bytes]],
+    rng: np.random.Generator,
+) -> tuple[FloatArray, Rows]:
+    """Up to `size` settings of the box that their judges have not met; random ones where there are
+    too few.
+    """
+    is_held = box.holds(settings)
+    random = box.draw(size, rng)
+    settings = np.concatenate([settings[is_held], random])
+    numbers = np.concatenate(
+        [numbers[is_held], choice[rng.integers(len(choice), size=len(random))]]
+    )
+    rows = list[int]()
+    for row, key in enumerate(
+        zip(numbers.tolist(), map(np.ndarray.tobytes, settings), strict=True)
+    ):
+        if key not in seen and len(rows) < size:
+            seen.add(key)
+            rows.append(row)
+    return settings[rows], numbers[rows]
+
+
+def _worst(
+    found: Falsification, settings: FloatArray, numbers: Rows, left: FloatArray
+) -> Falsification:
+    """The falsification after a generation, with the worst settings that count, and all unsafe
+    ones.
+    """
+    is_counted = np.isfinite(left)
+    all_left = np.concatenate([found.left, left[is_counted]])
+    worst = np.argsort(all_left, kind="stable")[: max(PARENTS, np.count_nonzero(all_left < 0))]
+    return Falsification(
+        np.concatenate([found.settings, settings[is_counted]])[worst],
+        np.concatenate([found.judges, numbers[is_counted]])[worst],
+        all_left[worst],
+        found.simulated + len(left),
+    )
+
+
+def _children(box: Box, found: Falsification, number: int, rng: np.random.Generator) -> FloatArray:
+    """A number of children; none before a setting counts."""
+    parents = found.settings[:PARENTS]
+    if not len(parents):
+        return parents
+    shape = (number, len(box.lower))
+    first, second, third, fourth = rng.integers(len(parents), size=(4, number))
+    mixed = np.where(rng.random(shape) < 0.5, parents[first], parents[second])
+    random = box.at(rng.random(shape))
+    ends = np.where(rng.random(shape) < 0.5, box.lower, box.upper)
+    # Of a child's values, 0.4 on average are drawn anew, 0.4 make a step, and 0.4 go to an end.
+    draw = rng.random(shape) * max(int(np.count_nonzero(box.lower < box.upper)), 1)
+    mutated = np.select(
+        [draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed
+    )
+    worse = parents[np.minimum(first, second)]  # the worst parents come first
+    moved = (
+        parents[first]
+        + PULL * (worse - parents[first])
+        + DIFFERENCE * (parents[third] - parents[fourth])
+    )
+    is_moved = (np.arange(number) % 2 == 1)[:, np.newaxis]
+    return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))

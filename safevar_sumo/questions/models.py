@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -16,6 +17,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import points_of_tests
@@ -92,6 +94,11 @@ class Model(NamedTuple):
         )
 
 
+def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
+    """What falsifies a claim in some models; progress is shown for `stage`."""
+    return [partial(model.left, stage=stage) for model in models]
+
+
 class Models(NamedTuple):
     """The fits in which a claim is tested, the study's own first, and the numbers of those left
     out: fits in which the original itself is unsafe, or keeps less than the margin.
@@ -129,7 +136,7 @@ def limit_criterion(
     is_distance = unsafe is None and margin is not None
     criterion = Unsafe() if is_distance else evaluator.choose_criterion(unsafe, subject, original)
     check_margin(criterion, margin)
-    criterion = replace(criterion, contact=assemble(study).contact)
+    criterion = replace(criterion, contact=evaluator.system.contact)
     # A collision that is asked for stands alone.
     if not criterion.is_collision or (margin is None and unsafe is not None):
         return criterion

@@ -28,7 +28,7 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import at_point, simulate
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 
 REFERENCE_DRIVERS = "reference drivers in the same vehicle"
 """The stage of progress."""
@@ -150,7 +150,7 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     too, or if he cannot be simulated. The columns are the drivers' names and `point`, the name of
     the point.
     """
-    system = assemble(evaluator.study)
+    system = evaluator.system
     drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(
         point=""

@@ -30,8 +30,7 @@ class Stream(IntEnum):
     LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
     NEAREST_LIMIT = 8  # falsification of a limit in place of a specified one that does not hold
-    WIDER_SCOPE = 9  # falsification of limits in the scope of a wider study
-    WIDER_SCOPE_FROM = WIDER_SCOPE  # the same, for the lowest value at which they fail there
+    WIDER_SCOPE = 9  # falsification of limits in the scope of a wider study, and up to a value
     EXTENSION = 10  # falsification of joint limits of which one is extended
     SPECIFIED_BETWEEN = 11  # falsification of specified limits between two values of a parameter
     SPECIFIED_UP_TO = 12  # the same, up to the largest value at which they hold

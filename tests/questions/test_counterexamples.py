@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,14 +18,15 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify, reach, rounded_down
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.models import Model, judges_of
+from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import region_of
+from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool, refused
 from tests.questions.conftest import made_up_evaluator, made_up_study
 
@@ -211,11 +213,12 @@ def test_a_reach_ends_just_before_a_planted_boundary(edge: float) -> None:
 
     evaluator = made_up_evaluator(2, pocket)
     box = Box(evaluator.region, np.array([5.0, 0.0]), np.array([10.0, 10.0]))
-    found = reach(box, 0, [Model(0, evaluator, Unsafe())], LEAST_SIMULATIONS, (1,), "reach")
+    judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
+    found = reach(box, (1, 0), 5.0, judges, LEAST_SIMULATIONS, (1,))
     assert found.value is not None
     assert edge - 0.11 <= found.value <= edge
-    assert found.attack is not None
-    assert found.attack.simulated >= LEAST_SIMULATIONS
+    assert found.falsification is not None
+    assert found.falsification.simulated >= LEAST_SIMULATIONS
 
 
 def test_a_falsification_names_the_model_that_fails() -> None:
@@ -224,18 +227,51 @@ def test_a_falsification_names_the_model_that_fails() -> None:
         Model(1, made_up_evaluator(2, lambda rows: rows[:, 1] > 9.5), Unsafe()),
     ]
     box = Box(models[0].evaluator.region, np.zeros(2), np.full(2, 10.0))
-    found = falsify(box, models, 2000, (1,), "falsification")
-    assert {model.fit for model, _ in found.failures} == {1}
-    assert all((rows[:, 1] > 9.5).all() for _, rows in found.failures)
+    found = falsify_limits(box, judges_of(models, "falsification"), 2000, (1,))
+    assert [*found.failures] == [1]
+    assert (found.failures[1][:, 1] > 9.5).all()
+
+
+@pytest.mark.parametrize("edge", [4.0, 2.33, 0.01])
+def test_a_reach_of_a_lower_end_is_its_mirror_image(edge: float) -> None:
+    """Unsafe is a below `edge`, where b is within 0.4 of 8."""
+
+    def pocket(rows: FloatArray) -> BoolArray:
+        return np.asarray((rows[:, 0] < edge) & (np.abs(rows[:, 1] - 8) < 0.4))
+
+    evaluator = made_up_evaluator(2, pocket)
+    box = Box(evaluator.region, np.array([0.0, 0.0]), np.array([5.0, 10.0]))
+    judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
+    found = reach(box, (0, 0), 5.0, judges, LEAST_SIMULATIONS, (1,))
+    assert found.value is not None
+    assert edge <= found.value <= edge + 0.11
+
+
+def test_a_reach_ends_at_its_start_or_nowhere() -> None:
+    box = Box(region_of(made_up_study(2)), np.array([5.0, 0.0]), np.array([10.0, 10.0]))
+    values = []
+    for edge in (5.0, 4.9):
+        evaluator = made_up_evaluator(2, lambda rows, edge=edge: np.asarray(rows[:, 0] > edge))
+        judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
+        values.append(reach(box, (1, 0), 5.0, judges, LEAST_SIMULATIONS, (1,)).value)
+    assert values == [5.0, None]
 
 
 @pytest.mark.parametrize(
-    ("value", "unit", "expected"), [(48.97, "km/h", 48.9), (48.9, "km/h", 48.9), (0.127, "s", 0.12)]
+    ("start", "value", "unit", "expected"),
+    [
+        (10, 48.97, "km/h", 48.9),
+        (10, 48.9, "km/h", 48.9),
+        (0, 0.127, "s", 0.12),
+        (0.5, 0.121, "s", 0.13),
+        (0.125, 0.127, "s", 0.125),
+    ],
 )
-def test_values_are_rounded_down_as_they_are_printed(
-    value: float, unit: str, expected: float
+def test_values_are_rounded_towards_the_start_as_they_are_printed(
+    start: float, value: float, unit: str, expected: float
 ) -> None:
-    assert rounded_down(value, 2, unit) == expected
+    item = SimpleNamespace(digits=2, unit=unit)
+    assert rounded_towards(start, value, cast(Characteristic, item)) == expected
 
 
 def test_a_limit_on_the_wrong_side_is_refused_with_the_other_one() -> None:

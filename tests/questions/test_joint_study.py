@@ -15,10 +15,10 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import evaluator
-from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import open_evaluator
+from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import identity_digest, manifest_of
@@ -253,7 +253,7 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
             np.where(members.of_vehicle, np.minimum(members.original, vehicle), members.lower),
             np.where(members.of_vehicle, np.maximum(members.original, vehicle), members.upper),
         )
-        found = attack(
+        found = falsify(
             box,
             [lambda settings: model.left(settings, "attack")],
             [],

@@ -13,9 +13,9 @@ import pytest
 from safevar_sumo import explain, tolerance
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.attack import Attack, attack, attack_all
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import Falsification, falsify, falsify_all
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
@@ -136,12 +136,12 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
             np.abs((rows - members.lower) / (members.upper - members.lower) - 0.7).sum(axis=1) - 0.5
         )
 
-    def alone(number: int) -> Attack:
-        return attack(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
+    def alone(number: int) -> Falsification:
+        return falsify(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
 
     rngs = [np.random.default_rng(number) for number in (0, 1)]
     for one, other in zip(
-        attack_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True
+        falsify_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True
     ):
         assert np.array_equal(one.settings, other.settings)
         assert one.simulated == other.simulated

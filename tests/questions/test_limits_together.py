@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import scan
@@ -103,11 +103,11 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
     points = found.box.at(np.random.default_rng(1).random((20_000, 3)))
     assert not tooth(points).any()
     assert relative_volume(found) > 0.02
-    assert found.attack is not None
-    assert found.attack.simulated == (1 + CONFIRMATIONS) * 2000
+    assert found.falsification is not None
+    assert found.falsification.simulated == (1 + CONFIRMATIONS) * 2000
     region = region_of(made_up_study(3))
     whole = Box(region, np.zeros(3), np.full(3, 10.0))
-    hit = attack(
+    hit = falsify(
         whole,
         [lambda rows: np.where(tooth(rows), -1.0, np.abs(rows - 6.3).max(axis=1))],
         [],

@@ -60,7 +60,6 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.words import counted_in_words, join_phrases, number_of
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
-from safevar_sumo.sumo.system import assemble
 
 
 @question
@@ -202,7 +201,7 @@ def _criteria(
         criterion = replace(
             criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators)
         )
-    return [replace(criterion, contact=assemble(one.study).contact) for one in evaluators]
+    return [replace(criterion, contact=one.system.contact) for one in evaluators]
 
 
 def _default_criterion(

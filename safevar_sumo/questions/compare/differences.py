@@ -27,7 +27,6 @@ from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic
 
 LIMIT_COLUMNS = {
@@ -218,7 +217,7 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
     A's does not collide, if there is one. A point that A does not have counts unless A's original
     vehicle collides anywhere.
     """
-    systems = [assemble(one.study) for one in evaluators]
+    systems = [one.system for one in evaluators]
     in_a, in_b = (
         {
             result.point.name: result
@@ -263,7 +262,7 @@ def _ends_of_originals(
             f"{side}_outcome": str(original.outcome[0]),
             f"{side}_degree": float(original.f_safe[0]),
         }
-        if contact := assemble(one.study).contact:
+        if contact := one.system.contact:
             numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
     return numbers
 
@@ -272,7 +271,7 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """In how many of A's benign scenes the original vehicles of A and B brake, None without any;
     and the number of these scenes.
     """
-    systems = [assemble(one.study) for one in (a, b)]
+    systems = [one.system for one in (a, b)]
     # What a study searches in its scenario, these scenes do not have.
     systems = [replace(one, characteristics=one.characteristics.vehicle) for one in systems]
     scenes = benign_scenes(a.study, systems[0])
@@ -307,7 +306,5 @@ def _onset_places(evaluator: Evaluator) -> FloatArray:
     """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does
     not [m].
     """
-    onsets, _ = drive_new_cars(
-        assemble(evaluator.study), evaluator.characteristics.original[np.newaxis]
-    )
+    onsets, _ = drive_new_cars(evaluator.system, evaluator.characteristics.original[np.newaxis])
     return np.asarray(onsets[0])

@@ -61,7 +61,6 @@ from safevar_sumo.questions.words import (
 )
 from safevar_sumo.records import BoolArray, JsonObject, Outcome
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -231,7 +230,7 @@ def _verdict(
 ) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
     unsafe = population.unsafe
-    contact = assemble(evaluator.study).contact
+    contact = evaluator.system.contact
     runs = population.evaluations
     counts = (
         f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe"

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
+from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -223,14 +224,10 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     return pd.DataFrame(rows, columns=[*keys, "failures", "examined", "causes"])
 
 
-LINE_SETTINGS = 32
-"""Number of settings first simulated on each line from the original to a setting. The search finds
-every unsafe stretch of the line that is as long as their spacing.
+PARTS = (32, 8, 8, 8)
+"""Number of parts into which each round divides what is left of a line from the original to a
+setting. The search finds every unsafe stretch of the line that is as long as the first parts.
 """
-PARTS_PER_ROUND = 8
-"""Number of parts into which each further round divides the interval with the boundary."""
-ROUNDS = 3
-"""Number of rounds after the first."""
 
 
 class BoundaryState(StrEnum):
@@ -288,13 +285,10 @@ def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -
         out=np.zeros(ends.shape),
         where=is_scaled,
     )
-    with evaluator.stage(
-        BOUNDARIES, len(starts) * (LINE_SETTINGS - 1 + ROUNDS * (PARTS_PER_ROUND - 1))
-    ):
-        shares, states = find_boundary_shares(
+    with evaluator.stage(BOUNDARIES, len(starts) * (sum(PARTS) - len(PARTS) + 1)):
+        shares, limits, states = _first_unsafe_shares(
             evaluator, starts, ends, unsafe, thresholds.max(axis=1)
         )
-    limits = settings_on_lines(starts, ends, shares[:, np.newaxis])[:, 0]
     first_lines = np.cumsum([0, *line_counts])
     return [
         Limits(
@@ -326,49 +320,25 @@ def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> 
     return np.array(values).reshape(-1, len(characteristics))
 
 
-def settings_on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
-    """Settings at K `shares`, shape (M, K), of M lines from `starts` to `ends`, shape (M, n); shape
-    (M, K, n).
-    """
-    factors = shares[..., np.newaxis]
-    start = starts[:, np.newaxis]
-    end = ends[:, np.newaxis]
-    return np.where(factors >= 1, end, start + factors * (end - start))
-
-
-def find_boundary_shares(
+def _first_unsafe_shares(
     evaluator: Evaluator, starts: FloatArray, ends: FloatArray, unsafe: Unsafe, lowest: FloatArray
-) -> tuple[FloatArray, list[BoundaryState]]:
-    """The first unsafe share of each of M lines, shape (M,), and what lies just below it.
+) -> tuple[FloatArray, FloatArray, list[BoundaryState]]:
+    """The first unsafe share of each of M lines, shape (M,), the setting there, shape (M, n), and
+    what lies just below it.
 
     A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`,
-    shape (M,), on, and its end must be unsafe. Each round simulates the bounds between equal parts
-    of the interval from `low` to `high`, and keeps the part below the first unsafe one. The error
-    is at most 1 / 16,384 of the line above `lowest`: one part of the last round. A setting that
-    cannot be simulated is neither safe nor unsafe; just below the share, it gives the state
-    `NOT_SIMULATED`.
+    shape (M,), on, and its end must be unsafe. The error is at most 1 / 16,384 of the line above
+    `lowest`. A setting that cannot be simulated is neither safe nor unsafe; just below the share,
+    it gives the state `NOT_SIMULATED`.
     """
-    lines = np.arange(len(starts))
-    always = np.ones(len(starts), dtype=bool)
-    low = lowest
-    low_is_valid = always
-    high = np.ones(len(starts))
-    for parts in (LINE_SETTINGS, *(PARTS_PER_ROUND,) * ROUNDS):
-        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(parts + 1) / parts
-        shares[:, -1] = high  # without a rounding error
-        inner = settings_on_lines(starts, ends, shares[:, 1:-1])
-        evaluations = evaluator.evaluate(inner.reshape(-1, starts.shape[1]), BOUNDARIES)
-        shape = (len(starts), parts - 1)
-        is_unsafe = np.column_stack([~always, unsafe.of(evaluations).reshape(shape), always])
-        is_valid = np.column_stack([low_is_valid, evaluations.valid.reshape(shape), always])
-        first_unsafe = np.argmax(is_unsafe, axis=1)
-        high = shares[lines, first_unsafe]
-        low = shares[lines, first_unsafe - 1]
-        low_is_valid = is_valid[lines, first_unsafe - 1]
-    is_at_threshold = (low == lowest) & (lowest > 0)
+    found = find_boundaries(
+        starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), PARTS, lowest
+    )
+    is_valid = evaluator.evaluate(found.safe, BOUNDARIES).valid
+    is_at_threshold = (found.safe_shares == lowest) & (lowest > 0)
     states = np.select(
-        [is_at_threshold, low_is_valid],
+        [is_at_threshold, is_valid | (found.safe_shares == lowest)],
         [BoundaryState.FILTER, BoundaryState.SAFE],
         BoundaryState.NOT_SIMULATED,
     )
-    return high, [BoundaryState(state) for state in states]
+    return found.unsafe_shares, found.unsafe, [BoundaryState(state) for state in states]

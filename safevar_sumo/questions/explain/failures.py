@@ -28,7 +28,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points, worst_points
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 
 Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
@@ -194,9 +194,7 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
         return Chosen(dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True)))
-    limit //= len(
-        assemble(evaluator.study).points
-    )  # an evaluation simulates a setting at every point
+    limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = _failures_that_matter(population, evaluator, limit)
     analysed = sorted({*sample, *reasons})
@@ -227,7 +225,7 @@ def _failures_that_matter(population: Population, evaluator: Evaluator, limit: i
     if not population.rows:
         return reasons
     if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
-        step = assemble(evaluator.study).step
+        step = evaluator.system.step
         index = find_smallest_robust_failure(evaluator, failures, step, population.unsafe, limit)
         if index is not None:
             reasons[population.rows[index]] = ROBUST
@@ -285,7 +283,7 @@ def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointCo
 
     An unknown colour is neither better nor worse.
     """
-    system = assemble(evaluator.study)
+    system = evaluator.system
     original = evaluator.characteristics.original
     assert system.rater is not None
     cells = evaluator.at_each_point(np.vstack([original, settings]), "cells whose colour is worse")

@@ -19,7 +19,6 @@ from safevar_sumo.questions.explain.robustness import (
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE
-from safevar_sumo.sumo.system import assemble
 
 FACTORS = (0.5, 1.0, 2.0)
 """Factors of the study's margin."""
@@ -53,7 +52,7 @@ def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd
             if not len(further)
             else Evaluations.concatenate([population.evaluations, further])
         )
-        contact = assemble(study).contact
+        contact = evaluator.system.contact
         for margin in margins:
             counts = runs.valid & (runs.column(ORIGINAL_DEGREE) >= margin + contact)
             fails = counts & population.unsafe.of(runs)
@@ -83,10 +82,8 @@ def _smallest_cause(
 ) -> JsonObject:
     """The most robust cause of the smallest robust failure, if there is one."""
     unsafe = population.unsafe
-    step = assemble(evaluator.study).step
-    most = limit // len(
-        assemble(evaluator.study).points
-    )  # an evaluation simulates a setting at every point
+    step = evaluator.system.step
+    most = limit // len(evaluator.system.points)  # an evaluation simulates a setting at every point
     row = (
         find_smallest_robust_failure(evaluator, failures, step, unsafe, most)
         if len(failures)

@@ -10,20 +10,20 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
+from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import Cause
 from safevar_sumo.questions.preventability import ANY, LETTER
 from safevar_sumo.questions.tables import Column, Columns
-from safevar_sumo.records import FloatArray, Outcome
+from safevar_sumo.records import BoolArray, FloatArray, Outcome
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point
 from safevar_sumo.study import Domain, ModelTable, Study
-from safevar_sumo.sumo.system import assemble
 
 BORDERS = "borders of what a competent driver avoids"
 """The stage of progress."""
-STEPS, ROUNDS = 12, 3
-"""Number of values between which a border is sought; and how often, from the second time on between
-two neighbours.
+STEPS, REFINING = 12, (12, 12)
+"""Number of values between which a border is sought; and of parts into which each round divides
+what is between two neighbours.
 """
 COLUMNS: Columns = {
     "characteristic": "characteristic that is changed alone",
@@ -50,7 +50,7 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
 
     The driver reacts to any braking of a leader.
     """
-    system = assemble(evaluator.study)
+    system = evaluator.system
     original = evaluator.characteristics.original
     names = list(evaluator.characteristics.names)
     furthest = original.copy()
@@ -128,25 +128,29 @@ def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArr
     It is the domain's lower end if a car is safe from there on, and infinite if no value from the
     study's own on is.
     """
-    rows = np.arange(len(cars))
-    size = STEPS + 1
-    values = np.tile(
-        np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original]), (len(cars), 1)
-    )
-    own = int(np.searchsorted(values[0], domain.original))
-    is_never_safe = np.zeros(len(cars), dtype=bool)
-    for _ in range(ROUNDS):
-        settings = np.column_stack([np.repeat(cars, size, axis=0), values.ravel()])
+    values = np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original])
+
+    def are_unsafe(settings: FloatArray) -> BoolArray:
+        """Which settings collide, or are in an encounter that is infeasible, as the new car
+        collides.
+        """
         runs = evaluator.evaluate(settings, BORDERS, ignore_constraints=True)
-        # Where the new car is unsafe, the encounter is infeasible.
-        fails = (runs.collided | (runs.outcome == Outcome.INFEASIBLE)).reshape(values.shape)
-        is_never_safe |= fails[:, own:].all(axis=1)
-        first_safe = own + np.argmin(fails[:, own:], axis=1)
-        fails &= np.arange(size) < first_safe[:, np.newaxis]
-        last = size - 1 - np.argmax(fails[:, ::-1], axis=1)  # the last unsafe value below
-        ever_fails = fails.any(axis=1)
-        low = np.where(ever_fails, values[rows, last], domain.lower)
-        high = np.where(ever_fails, values[rows, np.minimum(last + 1, size - 1)], domain.lower)
-        values = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.linspace(0.0, 1.0, size)
-        own = size - 1
-    return np.where(is_never_safe, np.inf, high)
+        return np.asarray(runs.collided | (runs.outcome == Outcome.INFEASIBLE))
+
+    # Every car at the same values, which cover the domain.
+    grid = np.column_stack([np.repeat(cars, len(values), axis=0), np.tile(values, len(cars))])
+    fails = are_unsafe(grid).reshape(len(cars), len(values))
+    # A border is below the first safe value from the study's own on.
+    own = int(np.searchsorted(values, domain.original))
+    is_never_safe = fails[:, own:].all(axis=1)
+    first_safe = own + np.argmin(fails[:, own:], axis=1)
+    fails &= np.arange(len(values)) < first_safe[:, np.newaxis]
+    borders = np.where(is_never_safe, np.inf, domain.lower)
+    # It lies between the last unsafe value below that one and its neighbour.
+    rows = np.flatnonzero(fails.any(axis=1) & ~is_never_safe)
+    last = len(values) - 1 - np.argmax(fails[rows, ::-1], axis=1)
+    starts = np.column_stack([cars[rows], values[last + 1]])
+    ends = np.column_stack([cars[rows], values[last]])
+    if len(rows):
+        borders[rows] = find_boundaries(starts, ends, are_unsafe, REFINING).safe[:, -1]
+    return borders

@@ -32,7 +32,6 @@ from safevar_sumo.questions.preventability import (
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray
-from safevar_sumo.sumo.system import assemble
 
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
@@ -120,7 +119,7 @@ def solutions_frame(population: Population, evaluator: Evaluator, reasons: Reaso
         comparisons = compare_at_cells(evaluator, settings)
     else:
         factors = STEP_FACTORS
-        comparisons = compare_at_points(assemble(study), settings, unsafe)
+        comparisons = compare_at_points(evaluator.system, settings, unsafe)
     is_judged = failures.collided & (not is_rated(study))
     judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
     columns = {
@@ -131,7 +130,7 @@ def solutions_frame(population: Population, evaluator: Evaluator, reasons: Reaso
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
         "robust_share": (
-            robust_shares(evaluator, settings, assemble(study).step, unsafe, factors).mean(axis=1)
+            robust_shares(evaluator, settings, evaluator.system.step, unsafe, factors).mean(axis=1)
         ),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
@@ -156,7 +155,7 @@ def causes_table(
     robust = np.full(len(causes), np.nan)
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
-        robust = robust_shares(evaluator, settings, assemble(study).step, unsafe).mean(axis=1)
+        robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
     limits = find_limits(evaluator, causes, unsafe)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:

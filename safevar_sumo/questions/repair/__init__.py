@@ -40,7 +40,6 @@ from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
-from safevar_sumo.sumo.system import assemble
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
@@ -151,7 +150,7 @@ def repair(
     criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
     check_margin(criterion, margin)
     keep = margin_of(study, margin) if unsafe is None or margin is not None else 0.0
-    unsafe_today = replace(criterion, keep=keep, contact=assemble(study).contact)
+    unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
     evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)

@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
@@ -40,12 +40,8 @@ def find_failures(
     judges = [partial(problem.left, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
     with own.evaluator.stage(ATTACK_STAGE, BUDGET):
-        found = attack(own.promise, judges, starts, BUDGET, rng)
-    is_unsafe = found.left < 0
-    numbers = np.unique(found.judges[is_unsafe]).tolist()
-    return {
-        row: np.unique(found.settings[is_unsafe & (found.judges == row)], axis=0) for row in numbers
-    }
+        found = falsify(own.promise, judges, starts, BUDGET, rng)
+    return {row: np.unique(settings, axis=0) for row, settings in found.failures.items()}
 
 
 def prove_change(

@@ -10,7 +10,6 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.sumo.system import assemble
 
 HARDEST = (2, 8)
 """Numbers of the hardest points that are asked first, and then; all others follow."""
@@ -31,7 +30,7 @@ class FullBraking:
     def __init__(self, evaluator: Evaluator, unsafe: Unsafe) -> None:
         self.evaluator = evaluator
         self._unsafe = unsafe
-        self._failures = np.zeros(len(assemble(evaluator.study).points))
+        self._failures = np.zeros(len(evaluator.system.points))
         """How many vehicles were least safe, and not safe, at each point."""
 
     def saves(self, settings: FloatArray) -> BoolArray:

@@ -356,7 +356,7 @@ class RepairProblem:
         """Full braking at the first possible moment; None where it has no approach
         (`approach_parameters`), and by a bound of a measure, of which it need not be the best.
         """
-        approach = None if self.unsafe.bound else approach_parameters(assemble(self.study))
+        approach = None if self.unsafe.bound else approach_parameters(self.evaluator.system)
         if approach is None:
             return None
         ads = ModelTable(model="full_braking", parameters=approach)

@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.attack import attack_all
-from safevar_sumo.questions.boundary import Move, find_boundaries
+from safevar_sumo.questions.boundary import Failing, last_safe_values
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
-from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify_all
+from safevar_sumo.questions.models import Model, Models, judges_of
 from safevar_sumo.questions.sampling import Interval, Stream
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import FloatArray
@@ -219,17 +218,17 @@ def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -
     matter. Whether any end has moved.
     """
     has_moved = False
-    while moves := {
-        (number, side): Move(each.column, each.item.original, of_side)
+    while groups := {
+        (number, side): Failing(each.column, each.item.original, of_side)
         for number, (each, rows) in enumerate(zip(ends, failures, strict=True))
         for side, of_side in enumerate(_by_side(each, rows))
         if len(of_side)
     }:
-        find_boundaries([*moves.values()], model, ALONE_STAGE)
-        for (number, side), move in moves.items():
-            ends[number].ends[side] = move.safe
-            ends[number].beyond[side] = move.failure, model
-            ends[number].failures.append(move.failure)
+        found = last_safe_values([*groups.values()], partial(model.are_unsafe, stage=ALONE_STAGE))
+        for (number, side), (safe, failure) in zip(groups, found, strict=True):
+            ends[number].ends[side] = safe
+            ends[number].beyond[side] = failure, model
+            ends[number].failures.append(failure)
         has_moved = True
     return has_moved
 
@@ -244,11 +243,12 @@ def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
-    """Attack the limits in encounters that no scan met, until nothing is found."""
+    """Falsify the limits in encounters that no scan met, until nothing is found."""
     members = models[0].evaluator.characteristics
     seed = models[0].evaluator.study.search.seed
-    judges = [partial(model.left, stage="attack on limits alone") for model in models]
+    judges = judges_of(models, "falsification of limits alone")
     waiting = [*ends]
+    nothing = np.zeros((0, len(members)))
     size = max(budget // GENERATIONS, 1)
     for number in range(ATTACKS):
         boxes = list[Box]()
@@ -264,14 +264,10 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
             at_limit = boxes[-1].draw(size, rng)
             at_limit[:, each.column] = np.resize(limit, len(at_limit))  # both ends in turn
             known.append(np.array_split(at_limit, len(models)))
-        found = attack_all(boxes, judges, known, budget, rngs, size)
+        found = [each.failures for each in falsify_all(boxes, judges, known, budget, rngs, size)]
         for judge, model in enumerate(models):
-            _move(
-                waiting,
-                model,
-                [one.settings[(one.left < 0) & (one.judges == judge)] for one in found],
-            )
-        waiting = [each for each, one in zip(waiting, found, strict=True) if (one.left < 0).any()]
+            _move(waiting, model, [failures.get(judge, nothing) for failures in found])
+        waiting = [each for each, failures in zip(waiting, found, strict=True) if failures]
         if not waiting:
             return
     for each in waiting:

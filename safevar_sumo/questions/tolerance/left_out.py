@@ -5,7 +5,7 @@ itself keeps its margin, and vehicles within limits that touch somebody where it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,15 +14,15 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, reach
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, Judge
+from safevar_sumo.questions.models import Model, judges_of
+from safevar_sumo.questions.reach import reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, largest_tried
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import assemble
 
 STAGE = "encounters that do not count"
 
@@ -47,27 +47,18 @@ class Contacts(NamedTuple):
     lowest: float = np.nan
 
 
-@dataclass(frozen=True)
-class _LeftOut:
-    """A model in the encounters in which the original vehicle touches nobody, but keeps less than
-    `demanded` [m].
+def _judge_left_out(model: Model, demanded: float) -> Judge:
+    """What settings keep [m] in the encounters in which the original vehicle touches nobody, but
+    keeps less than `demanded` [m], below 0 on a contact; infinite in all other encounters.
     """
 
-    model: Model
-    demanded: float
+    def left(settings: FloatArray) -> FloatArray:
+        runs = model.evaluate(settings, STAGE)
+        is_between = runs.column(ORIGINAL_DEGREE) < demanded
+        counts = is_between & model.evaluator.region.feasible(settings)
+        return np.where(counts, model.left_by(runs), np.inf)
 
-    def left(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What settings keep [m], below 0 on a contact, shape (M,); infinite in all other
-        encounters.
-        """
-        runs = self.model.evaluate(settings, stage)
-        is_between = runs.column(ORIGINAL_DEGREE) < self.demanded
-        counts = is_between & self.model.evaluator.region.feasible(settings)
-        return np.where(counts, self.model.left_by(runs), np.inf)
-
-    def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
-        """Which settings touch somebody, shape (M,)."""
-        return self.left(settings, stage) < 0
+    return left
 
 
 def leading_parameter(study: Study) -> str:
@@ -85,7 +76,7 @@ def original_reach(evaluator: Evaluator, by: Parameter, unsafe: Unsafe) -> Origi
     contact = Unsafe(contact=unsafe.contact)
     if by.name not in study.scenario.search:
         results = simulate_all_points(
-            assemble(study), evaluator.characteristics.original[np.newaxis]
+            evaluator.system, evaluator.characteristics.original[np.newaxis]
         )
         runs = [(result.point, result.evaluations) for result in results]
         keeps = largest_tried(by, [(point, not unsafe.of(found)[0]) for point, found in runs])
@@ -100,12 +91,14 @@ def original_reach(evaluator: Evaluator, by: Parameter, unsafe: Unsafe) -> Origi
     box = Box(evaluator.region, lower, upper)
     # At points that are selected all encounters count, also those in which the original is not
     # safe.
-    every_point = tuple(range(len(assemble(study).points)))
+    every_point = tuple(range(len(evaluator.system.points)))
     reaches = list[float | None]()
     for demanded in (study.scenario.margin, 0.0):
         original = Model(0, evaluator, replace(contact, keep=demanded), every_point)
+        judges = judges_of([original], STAGE)
         stream = study.search.seed, Stream.ORIGINAL_UP_TO
-        reaches.append(reach(box, column, [original], LEAST_SIMULATIONS, stream, STAGE).value)
+        start = float(lower[column])
+        reaches.append(reach(box, (1, column), start, judges, LEAST_SIMULATIONS, stream).value)
     return OriginalReach(*reaches)
 
 
@@ -118,21 +111,19 @@ def contacts_left_out(models: Sequence[Model], boxes: Sequence[Box], name: str =
     study = evaluator.study
     name = name or leading_parameter(study)
     column = evaluator.characteristics.names.index(name)
-    left_out = list[_LeftOut]()
+    judges = list[Judge]()
     for model in models:
         own = model.evaluator.study
         nearer = replace_in(own, scenario=replace_in(own.scenario, margin=0.0))
         unsafe = Unsafe(contact=model.unsafe.contact)
         demanded = study.scenario.margin + model.unsafe.contact
-        left_out.append(
-            _LeftOut(
-                Model(model.fit, model.evaluator.for_study(nearer, verified=0), unsafe), demanded
-            )
-        )
+        in_all = Model(model.fit, model.evaluator.for_study(nearer, verified=0), unsafe)
+        judges.append(_judge_left_out(in_all, demanded))
     found = list[FloatArray]()
     for number, box in enumerate(boxes):
         stream = study.search.seed, Stream.LEFT_OUT, number
-        failures = reach(box, column, left_out, LEAST_SIMULATIONS, stream, STAGE).failures
+        start = float(box.lower[column])
+        failures = reach(box, (1, column), start, judges, LEAST_SIMULATIONS, stream).failures
         found += [rows for _, rows in failures]
     if not found:
         return Contacts(0)

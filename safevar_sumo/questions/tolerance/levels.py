@@ -4,18 +4,18 @@ within that of the value below, and simulates only what is between the two.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.attack import Attack
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import Falsification, Reach, enough, falsify, reach
-from safevar_sumo.questions.models import Model, Models, models_of, with_points_between
+from safevar_sumo.questions.falsify import Falsification, enough
+from safevar_sumo.questions.models import Model, Models, judges_of, models_of, with_points_between
+from safevar_sumo.questions.reach import Reach, falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond
 from safevar_sumo.questions.tolerance.by_parameter import (
@@ -60,17 +60,18 @@ class Level(NamedTuple):
     search
         The search for the limits alone; None without such limits.
     failures
-        How the specified limits fail up to the value; None where they hold, or none is specified.
-    attack
-        The attack on the specified limits.
+        How the specified limits fail up to the value, by the number of the model; none where they
+        hold, or none is specified.
+    falsification
+        That of the specified limits.
     """
 
     value: float
     alone: list[AloneLimit] | None
     models: Models
     search: AloneSearch | None = None
-    failures: Sequence[tuple[Model, FloatArray]] | None = None
-    attack: Attack | None = None
+    failures: Mapping[int, FloatArray] = {}
+    falsification: Falsification | None = None
 
 
 class LevelSearch:
@@ -204,8 +205,14 @@ class LevelSearch:
             return Level(value, alone, models, search)
         if before is not None and before.failures:
             return before._replace(value=value, alone=alone, models=models, search=search)
-        found = self._falsify(models, judges, value)
-        return Level(value, alone, models, search, found.failures or None, found.attack)
+        found = falsify_limits(
+            self._promise(models.own),
+            judges_of(judges, STAGE),
+            enough(self.budget),
+            (self.evaluator.study.search.seed, Stream.SPECIFIED_BETWEEN),
+            (1, self.column) if self.is_searched else None,
+        )
+        return Level(value, alone, models, search, found.failures, found)
 
     def models(self, low: float | None, high: float) -> Models | None:
         """The fits between two values; None if no test of a matrix drives there."""
@@ -260,33 +267,23 @@ class LevelSearch:
         geometry = BoxGeometry(region, columns, {**self.limits, **everywhere})
         return geometry.printed(geometry.fixed)
 
-    def _falsify(
-        self, models: Models, judges: Sequence[Model], value: float
-    ) -> Falsification[Model]:
-        """The falsification of the specified limits between two values, up to one that is
-        printed.
-        """
-        box = self._promise(models.own)
-        tested = (self.column, value) if self.is_searched else None
-        stream = self.evaluator.study.search.seed, Stream.SPECIFIED_BETWEEN, 0
-        return falsify(box, judges, enough(self.budget), stream, STAGE, tested)
-
-    def reach(self, levels: Sequence[Level]) -> Reach[Model]:
+    def reach(self, levels: Sequence[Level]) -> Reach:
         """The value up to which the specified limits hold, at most that up to which the original
         keeps its margin: between two values of a searched parameter, the last at which a
         falsification finds nothing; of an axis, one of its values.
         """
-        last = Reach[Model]()
+        last = Reach()
         if not self.limits or not self.budget:
             return last
-        end = -np.inf if self.original.keeps_up_to is None else self.original.keeps_up_to
+        keeps_up_to = self.original.keeps_up_to
+        last_value = -np.inf if keeps_up_to is None else keeps_up_to
         low = self.by.lowest
         for level in levels:
-            high = min(level.value, end)
+            high = min(level.value, last_value)
             if level.alone is None or high <= low:
                 break
             if not level.failures and high == level.value:
-                last = Reach(level.value, level.attack)
+                last = Reach(level.value, level.falsification)
                 low = level.value
                 continue
             if self.is_searched:
@@ -294,12 +291,11 @@ class LevelSearch:
                 upper = box.upper.copy()
                 upper[self.column] = high
                 box = Box(box.region, box.lower, upper)
-                models = level.models.members
+                judges = judges_of(level.models.members, STAGE)
                 stream = self.evaluator.study.search.seed, Stream.SPECIFIED_UP_TO
-                failures = level.failures or ()
-                found = reach(
-                    box, self.column, models, enough(self.budget), stream, STAGE, failures
-                )
+                start = float(box.lower[self.column])
+                end = (1, self.column)
+                found = reach(box, end, start, judges, enough(self.budget), stream, level.failures)
                 last = last if found.value is None else found
             break
         return last

@@ -14,8 +14,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.counterexamples import Failure, describe
-from safevar_sumo.questions.falsify import Reach, enough
+from safevar_sumo.questions.falsify import enough
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.reach import Reach
 from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
 from safevar_sumo.questions.tolerance.alone import AloneLimit, budget_alone
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
@@ -32,7 +33,6 @@ from safevar_sumo.questions.tolerance.words import (
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit, unit_text
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
     )
 
 
-def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach[Model]) -> bool | None:
+def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach) -> bool | None:
     """Whether the specified limits hold up to the greatest value; without any, whether the original
     does. None where that was not tested.
     """
@@ -102,7 +102,7 @@ def _is_kept(search: LevelSearch, levels: Sequence[Level], reach: Reach[Model]) 
     return not search.limits or reach.value == search.by.values[-1]
 
 
-def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> tuple[str, ...]:
+def _failed(search: LevelSearch, reach: Reach, is_kept: bool | None) -> tuple[str, ...]:
     """What makes the command end with exit code 3."""
     if is_kept:
         return ()
@@ -116,12 +116,12 @@ def _failed(search: LevelSearch, reach: Reach[Model], is_kept: bool | None) -> t
     )
 
 
-def _numbers(levels: Sequence[Level], reach: Reach[Model], unsafe: Unsafe) -> JsonObject:
+def _numbers(levels: Sequence[Level], reach: Reach, unsafe: Unsafe) -> JsonObject:
     """Numbers about the limits up to the greatest value, and about the attack on the specified
     limits up to the value that they reach.
     """
     last = levels[-1]
-    found = reach.attack
+    found = reach.falsification
     least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
     attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
     members, left_out = last.models
@@ -271,7 +271,7 @@ def _sentences(
     search: LevelSearch,
     levels: Sequence[Level],
     frame: pd.DataFrame,
-    reach: Reach[Model],
+    reach: Reach,
     contacts: Contacts | None,
 ) -> Iterator[str]:
     """The sentences of the verdict, the allowed value first, then the original's own limit and what
@@ -279,8 +279,8 @@ def _sentences(
     """
     by = search.by
     unsafe = search.unsafe
-    study = search.evaluator.study
-    names = dict.fromkeys(point.weather.name.replace("_", " ") for point in assemble(study).points)
+    points = search.evaluator.system.points
+    names = dict.fromkeys(point.weather.name.replace("_", " ") for point in points)
     where = f"{rough_in_words(search.budget)}On a {' or '.join(names)} road"
     if search.limits and search.budget:
         what = join_phrases(_limit_texts(search))

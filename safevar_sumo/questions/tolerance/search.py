@@ -9,18 +9,16 @@ from itertools import islice
 
 import numpy as np
 
+from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
-PARTS, ROUNDS = 8, 3
-"""Each of `ROUNDS` rounds divides the interval from a safe to an unsafe size of a box into `PARTS`
-parts.
-"""
+SHRINKING = (8, 8, 8)
+"""Number of parts into which each round divides the sizes between a safe and an unsafe box."""
 WIDENING = 0.02
 """Share of its domain by which a side of the box is widened in search of something unsafe."""
 SEARCH_POINTS = 256
@@ -189,9 +187,7 @@ class BoxSearch(BoxGeometry):
         self.gap = 0.0
         self.search_count = 0
         self.seed = model.evaluator.study.search.seed
-        self.batch = max(
-            BATCH // len(model.points or assemble(model.evaluator.study).points), LEAST_BATCH
-        )
+        self.batch = max(BATCH // len(model.points or model.evaluator.system.points), LEAST_BATCH)
 
     def join(self, model: Model) -> None:
         """Take a model into the search, or more points of one that is in it."""
@@ -351,23 +347,21 @@ class BoxSearch(BoxGeometry):
 
     def shrunk(self, sides: FloatArray, start: FloatArray) -> FloatArray:
         """A box whose free sides are the largest share of `sides` with which it is safe."""
-        low = 0.0
-        high = 1.0
-        for _ in range(ROUNDS):
-            shares = [low, *(low + (high - low) * np.arange(1, PARTS + 1) / PARTS).tolist()]
-            boxes = np.where(
-                self.is_free, np.array(shares[1:])[:, np.newaxis, np.newaxis] * sides, start
-            )
-            needs = self.needs(self.unsafe_settings)
-            is_safe = self.are_safe(boxes) & [
-                not (needs <= box).all(axis=(1, 2)).any() for box in boxes
-            ]
-            safe_count = int(
-                np.argmin([*is_safe, False])
-            )  # the smallest ones, before the first unsafe
-            low = shares[safe_count]
-            high = shares[min(safe_count + 1, PARTS)]
-        return np.where(self.is_free, low * sides, start)
+        whole = np.where(self.is_free, sides, start).reshape(1, -1)
+        if not self._are_unsafe_boxes(whole)[0]:
+            return whole.reshape(start.shape)
+        least = np.where(self.is_free, 0.0, start).reshape(1, -1)
+        found = find_boundaries(least, whole, self._are_unsafe_boxes, SHRINKING)
+        return found.safe.reshape(start.shape)
+
+    def _are_unsafe_boxes(self, rows: FloatArray) -> BoolArray:
+        """Which of B boxes, a row of sides each, are unsafe at known corners, or hold a known
+        failure.
+        """
+        boxes = rows.reshape(-1, *self.domain.shape)
+        needs = self.needs(self.unsafe_settings)
+        holds_failure = [(needs <= box).all(axis=(1, 2)).any() for box in boxes]
+        return np.asarray(~self.are_safe(boxes) | holds_failure)
 
     def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
         """A box within `start` that is safe at the known corners, and keeps off known unsafe

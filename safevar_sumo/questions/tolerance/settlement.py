@@ -4,12 +4,11 @@ failure.
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from safevar_sumo.questions.attack import attack
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.falsify import falsify
+from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Step
 from safevar_sumo.records import FloatArray
@@ -25,8 +24,8 @@ CLEARANCE, RETREAT = 0.8, 0.4
 """Share of such a move by which a limit keeps off a failure that an attack found between corners;
 and by how much more after each box that failed.
 """
-SLAB_ATTACK = 512
-"""Number of simulations of an attack on the room beyond a limit."""
+SLAB_SIMULATIONS = 512
+"""Number of simulations that falsify the room beyond a limit."""
 SLAB_CORNERS = 512
 """Number of corners of that room, in a study that searches its scenario: the test of the box meets
 many more.
@@ -100,13 +99,12 @@ class Settlement:
             return True
         beyond = [wider.lower.copy(), wider.upper.copy()]
         beyond[1 - side][column] = (box.lower, box.upper)[side][column]
-        judges = [partial(model.left, stage=SEARCH_STAGE) for model in search.first_models]
+        judges = judges_of(search.first_models, SEARCH_STAGE)
         rng = Stream.EXTENSION.generator(search.seed, side, column)
-        found = attack(Box(wider.region, *beyond), judges, [slab[:KNOWN_CORNERS]], SLAB_ATTACK, rng)
-        search.unsafe_settings = np.concatenate(
-            [search.unsafe_settings, found.settings[found.left < 0]]
-        )
-        return bool((found.left < 0).any())
+        room = Box(wider.region, *beyond)
+        found = falsify(room, judges, [slab[:KNOWN_CORNERS]], SLAB_SIMULATIONS, rng).failures
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, *found.values()])
+        return bool(found)
 
     def cut(self, box: Box, attempts: int = 0) -> Box:
         """The largest box within a box without its known failures that was found: they are cut off

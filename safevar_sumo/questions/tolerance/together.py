@@ -9,10 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.attack import Attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
-from safevar_sumo.questions.falsify import enough
-from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.falsify import Falsification, enough, falsify
+from safevar_sumo.questions.models import Model, Models, judges_of
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
 from safevar_sumo.questions.tolerance.settlement import Settlement
@@ -48,13 +47,13 @@ class LimitsTogether(NamedTuple):
         Numbers of the fits in which the promise itself is unsafe, and the worst setting of each.
     members
         The models in which the box holds.
-    proof, attack
+    proof, falsification
         Of the box; of the promise without one.
     least
-        The least that the attack found [m]: over all fits, and with the study's own.
+        The least that the falsification found [m]: over all fits, and with the study's own.
     between, between_left_out
-        Numbers of points between those of the study's matrix that the attack met, and of those that
-        do not count.
+        Numbers of points between those of the study's matrix that the falsification met, and of
+        those that do not count.
     boxes
         Number of boxes that were tried.
     beyond
@@ -77,7 +76,7 @@ class LimitsTogether(NamedTuple):
     broken: Mapping[int, FloatArray]
     members: tuple[Model, ...]
     proof: Proof | None
-    attack: Attack | None
+    falsification: Falsification | None
     least: tuple[float, float]
     between: int
     between_left_out: int
@@ -92,7 +91,7 @@ class LimitsTogether(NamedTuple):
     def numbers(self) -> JsonObject:
         """What an answer says of them in numbers."""
         proof = self.proof
-        found = self.attack
+        found = self.falsification
         return {
             "box": self.box is not None,
             "samples": None if proof is None else proof.samples,
@@ -114,12 +113,12 @@ def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArr
     )
     settings = np.unique(settings, axis=0)
     models = [model for model in models if not _keeps_its_margin(promise, model)]
-    broken = dict[int, FloatArray]()
-    for model in models:
-        left = model.left(settings, "specified limits with each fit")
-        if left.min() < 0:
-            broken[model.fit] = settings[np.argmin(left)]
-    return broken
+    judges = judges_of(models, "specified limits with each fit")
+    # Every setting meets each model once.
+    known = [settings] * len(models)
+    total = len(models) * len(settings)
+    found = falsify(promise, judges, known, total, np.random.default_rng(seed))
+    return {models[judge].fit: rows[0] for judge, rows in found.failures.items()}
 
 
 def _keeps_its_margin(promise: Box, model: Model) -> bool:
@@ -297,11 +296,11 @@ def result(
     search = settlement.search
     box = trial.box
     least = [np.nan, np.nan]
-    if trial.attack is not None:
-        judges = [trial.judges[judge] for judge in trial.attack.judges]
+    if trial.falsification is not None:
+        judges = [trial.judges[judge] for judge in trial.falsification.judges]
         values = [
             model.unsafe.value(left)
-            for model, left in zip(judges, trial.attack.left.tolist(), strict=True)
+            for model, left in zip(judges, trial.falsification.left.tolist(), strict=True)
         ]
         of_own = [value for value, model in zip(values, judges, strict=True) if model.fit == 0]
         worst = nothing.members[0].unsafe.worst
@@ -315,7 +314,7 @@ def result(
     return nothing._replace(
         box=box if has_room(search, box) else None,
         proof=trial.proof,
-        attack=trial.attack,
+        falsification=trial.falsification,
         least=(least[0], least[1]),
         between=sum(points) - (len(own_tests.tests) if own_tests else 0),
         between_left_out=trial.left_out,

@@ -4,16 +4,15 @@ random.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.attack import Attack, attack
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model, with_points_between
+from safevar_sumo.questions.falsify import Falsification, falsify
+from safevar_sumo.questions.models import Model, judges_of, with_points_between
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
@@ -55,7 +54,7 @@ class Trial(NamedTuple):
     failures: Sequence[Failures] = ()
     corners: Mapping[int, float] = {}
     judges: Sequence[Model] = ()
-    attack: Attack | None = None
+    falsification: Falsification | None = None
     proof: Proof | None = None
     left_out: int = 0
 
@@ -93,7 +92,7 @@ class Trials:
             lefts = self._left(some, self._failing)
             if failures := self._failures(some, lefts):
                 return Trial(box, failures)
-            trial = self._attack(box, some, lefts, attempt)
+            trial = self._falsify(box, some, lefts, attempt)
             if trial.failures:
                 return trial
             lefts = self._left(corners[:MAX_CORNERS], range(len(self.models)))
@@ -125,7 +124,7 @@ class Trials:
             for one in failures_of(self.models[number], corners, lefts[number])
         ]
 
-    def _attack(
+    def _falsify(
         self, box: Box, corners: FloatArray, lefts: Mapping[int, FloatArray], attempt: int
     ) -> Trial:
         """Attack a box in all models, beginning at its worst corners in each, or in the first."""
@@ -137,45 +136,29 @@ class Trials:
             corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
             for number in range(len(self.models))
         ]
-        rows: list[Callable[[FloatArray], FloatArray]] = [
-            partial(model.left, stage=TRIAL_STAGE) for model in judges
-        ]
         rng = Stream.JOINT_LIMITS.generator(self.seed, attempt)
-        found = attack(box, rows, worst, self.budget, rng)
-        failures = [
-            one
-            for number, model in enumerate(judges)
-            for one in failures_of(
-                model, found.settings[found.judges == number], found.left[found.judges == number]
-            )
-        ]
-        return Trial(box, failures, judges=judges, attack=found, left_out=left_out)
+        found = falsify(box, judges_of(judges, TRIAL_STAGE), worst, self.budget, rng)
+        failures = _failures_found(found, judges)
+        return Trial(box, failures, judges=judges, falsification=found, left_out=left_out)
 
     def confirmed(self, trial: Trial, attempt: int) -> Trial:
         """A trial that passed, with `CONFIRMATIONS` more attacks of as many simulations, which
         begin anew elsewhere.
         """
-        if trial.attack is None:
+        if trial.falsification is None:
             return trial
         box = trial.box
         with self.evaluator.stage(TRIAL_STAGE, CONFIRMATIONS * self.budget):
-            found = trial.attack
+            found = trial.falsification
             for number in range(CONFIRMATIONS):
                 rng = Stream.VALIDATION.generator(self.seed, attempt, number)
                 judges, _ = self._denser(attempt + number)
                 starts = [box.with_ends(STARTS // len(judges), rng) for _ in judges]
-                rows = [partial(model.left, stage=TRIAL_STAGE) for model in judges]
-                found = found.merged(attack(box, rows, starts, self.budget, rng))
-                if (found.left < 0).any():
+                rows = judges_of(judges, TRIAL_STAGE)
+                found = found.merged(falsify(box, rows, starts, self.budget, rng))
+                if found.failures:
                     break
-        failures = [
-            one
-            for number, model in enumerate(judges)
-            for one in failures_of(
-                model, found.settings[found.judges == number], found.left[found.judges == number]
-            )
-        ]
-        return trial._replace(attack=found, failures=failures)
+        return trial._replace(falsification=found, failures=_failures_found(found, judges))
 
     def _denser(self, attempt: int) -> tuple[list[Model], int]:
         """The models with points between those of a matrix, too, and the number of these that do
@@ -201,6 +184,14 @@ class Trials:
         return trial._replace(
             proof=proof, failures=failures_of(model, unsafe, np.full(len(unsafe), -1.0))
         )
+
+
+def _failures_found(found: Falsification, judges: Sequence[Model]) -> list[Failures]:
+    """What a falsification found, each with its model at the points where it is unsafe."""
+    return [
+        Failures(judges[judge].at_worst_points(rows, TRIAL_STAGE), rows)
+        for judge, rows in found.failures.items()
+    ]
 
 
 def failures_of(model: Model, settings: FloatArray, left: FloatArray) -> list[Failures]:

@@ -12,8 +12,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import Falsification, falsify, reach
-from safevar_sumo.questions.models import Model, Models, limit_criterion, models_of
+from safevar_sumo.questions.falsify import Falsification
+from safevar_sumo.questions.models import Model, Models, judges_of, limit_criterion, models_of
+from safevar_sumo.questions.reach import falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
@@ -85,15 +86,16 @@ def wider_rows(
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
     seed = study.search.seed
     with other.stage(WIDER_STAGE, budget):
+        judges = judges_of(models.members, WIDER_STAGE)
         stream = seed, Stream.WIDER_SCOPE
-        found = falsify(box, models.members, budget, stream, WIDER_STAGE)
+        found = falsify_limits(box, judges, budget, stream)
     lowest = None
     if found.failures and study.scenario.search:
         column = other.characteristics.names.index(leading_parameter(study))
+        start = float(box.lower[column])
         with other.stage(WIDER_STAGE):
-            stream = seed, Stream.WIDER_SCOPE_FROM
-            below = reach(box, column, models.members, budget, stream, WIDER_STAGE, found.failures)
-        failing = [(model, row) for model, rows in below.failures for row in rows]
+            below = reach(box, (1, column), start, judges, budget, stream, found.failures)
+        failing = [(models.members[judge], row) for judge, rows in below.failures for row in rows]
         lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
     members = other.characteristics
@@ -118,27 +120,20 @@ def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
 
 
 def _verdict(
-    models: Models, box: Box, found: Falsification[Model], lowest: tuple[Model, FloatArray] | None
+    models: Models, box: Box, found: Falsification, lowest: tuple[Model, FloatArray] | None
 ) -> tuple[str, Failure | None]:
     """What the falsification found, in words: the failure at the lowest speed, then the worst; and
     the former.
     """
-    attack = found.attack
-    assert attack is not None
+    if not len(found.left):
+        return f"none of {found.simulated:,} simulations met an encounter that counts.", None
+    model = models.members[int(found.judges[0])]
     if not found.failures:
-        if not len(attack.left):
-            return f"none of {attack.simulated:,} simulations met an encounter that counts.", None
-        model = models.members[int(attack.judges[0])]
-        keeps = model.unsafe.value_in_words(model.unsafe.value(attack.left[0]))
-        return f"they hold: the worst of {attack.simulated:,} aimed at them {keeps}.", None
-    # The search begins with the worst of the first settings, so its worst failure is the worst of
-    # all.
-    worst = (
-        (models.members[int(attack.judges[0])], attack.settings[0]) if len(attack.left) else None
-    )
+        keeps = model.unsafe.value_in_words(model.unsafe.value(found.left[0]))
+        return f"they hold: the worst of {found.simulated:,} aimed at them {keeps}.", None
     described = [
         failure
-        for pair in (lowest, worst)
+        for pair in (lowest, (model, found.settings[0]))
         if pair is not None
         for failure in describe(pair[0], {"": pair[1]}, box).values()
     ]

@@ -186,12 +186,12 @@ def _attack_in_words(together: LimitsTogether, budget: int) -> str:
     """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67
     m)`.
     """
-    if together.attack is None or not budget:
+    if together.falsification is None or not budget:
         return "not attacked"
     least, own = together.least
     unsafe = together.members[0].unsafe
     if not abs(least) < float("inf"):
-        return f"{together.attack.simulated:,} aimed at them meet nobody"
+        return f"{together.falsification.simulated:,} aimed at them meet nobody"
     words = unsafe.value_in_words(least)
     of_own = ""
     if own == own and unsafe.value_in_words(own) != words:
@@ -203,7 +203,9 @@ def _attack_in_words(together: LimitsTogether, budget: int) -> str:
             between += (
                 f" ({together.between_left_out} left out, where the new car keeps too little)"
             )
-    return f"the worst of {together.attack.simulated:,} aimed at them {words}{of_own}{between}"
+    return (
+        f"the worst of {together.falsification.simulated:,} aimed at them {words}{of_own}{between}"
+    )
 
 
 def _proof_in_words(together: LimitsTogether) -> str:

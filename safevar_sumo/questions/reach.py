@@ -1,0 +1,123 @@
+"""The falsification of specified limits, and the furthest value of one of their ends up to which a
+falsification finds nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.boundary import Failing, last_safe_values
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.falsify import Falsification, Judge, falsify
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.vehicles import Characteristic
+
+POINTS = 128
+"""Number of Sobol points, of corners, of random settings with half of their values at ends, and of
+settings at a value that is tested, with which a falsification begins in each model.
+"""
+MAX_STEPS = 40
+"""Largest number of values that are tried in search of the furthest one that holds."""
+End = tuple[int, int]
+"""An end of a box: 0, the lower one, or 1, the upper one; and the column."""
+
+
+class Reach(NamedTuple):
+    """The furthest value that holds, None if none does; the falsification that found nothing up to
+    it; and all unsafe settings that were found beyond it, with the numbers of their judges.
+    """
+
+    value: float | None = None
+    falsification: Falsification | None = None
+    failures: Sequence[tuple[int, FloatArray]] = ()
+
+
+def falsify_limits(
+    box: Box, judges: Sequence[Judge], budget: int, seed: tuple[int, ...], end: End | None = None
+) -> Falsification:
+    """Search a box for unsafe settings: at settings that cover it, in all models, and with `budget`
+    further simulations.
+
+    `end` is an end that is to be printed: a part of the first settings has just its value.
+    """
+    rng = np.random.default_rng(seed)
+    # Sobol points and corners, and settings with many values at ends.
+    spread = box.spread_and_corners(POINTS, int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    at_ends = box.with_ends(POINTS, rng)
+    settings = np.concatenate([spread, at_ends])
+    if end is not None:
+        side, column = end
+        just_within = np.concatenate([spread[POINTS:], at_ends])
+        just_within[:, column] = (box.lower, box.upper)[side][column]
+        settings = np.concatenate([settings, just_within])
+    settings = np.unique(settings, axis=0)
+    known = [settings] * len(judges)
+    return falsify(box, judges, known, budget + len(judges) * len(settings), rng)
+
+
+def reach(
+    box: Box,
+    end: End,
+    start: float,
+    judges: Sequence[Judge],
+    budget: int,
+    seed: tuple[int, ...],
+    known: Mapping[int, FloatArray] | None = None,
+) -> Reach:
+    """The furthest value of an end of a box, from `start` on, up to which a falsification finds
+    nothing; `known` are unsafe settings by the number of their judge.
+
+    Where a setting fails, the value moves back to the last one before it with which its encounter
+    is safe. A value is rounded towards the start as it is printed, and falsified again.
+    """
+    side, column = end
+    item = box.region.characteristics.members[column]
+    value = float((box.lower, box.upper)[side][column])
+    failures = list[tuple[int, FloatArray]]()
+    new = dict(known or {})
+    for number in range(MAX_STEPS):
+        # The last value before all failures with which their encounters are safe.
+        for judge, rows in new.items():
+            failures.append((judge, rows))
+            values = rows[:, column]
+            inside = rows[values >= value if side == 0 else values <= value]
+            if len(inside) and value != start:
+                group = Failing(column, start, inside)
+                [(last, failure)] = last_safe_values([group], partial(_are_unsafe, judges[judge]))
+                failures.append((judge, failure[np.newaxis]))
+                value = rounded_towards(start, last, item)
+        # The limits with this value, and the failures within them.
+        found = falsify_limits(_with_end(box, end, value), judges, budget, (*seed, number + 1), end)
+        new = found.failures
+        if not new:
+            return Reach(value, found, failures)
+        if value == start:
+            break
+    return Reach(None, None, [*failures, *new.items()])
+
+
+def _are_unsafe(judge: Judge, settings: FloatArray) -> BoolArray:
+    return judge(settings) < 0
+
+
+def _with_end(box: Box, end: End, value: float) -> Box:
+    """A box with another value of one of its ends."""
+    side, column = end
+    ends = [box.lower.copy(), box.upper.copy()]
+    ends[side][column] = value
+    return Box(box.region, *ends)
+
+
+def rounded_towards(start: float, value: float, item: Characteristic) -> float:
+    """A value as it is printed, rounded towards a start, but not beyond it: a speed in km/h has one
+    decimal.
+    """
+    scale = 10.0 ** (min(item.digits, 1) if item.unit == "km/h" else item.digits)
+    scaled = np.round(value * scale, 6)
+    if value < start:
+        return min(float(np.ceil(scaled) / scale), start)
+    return max(float(np.floor(scaled) / scale), start)
