@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, enough
@@ -18,6 +17,7 @@ from safevar_sumo.questions.models import Model, Models, judges_of, models_of, w
 from safevar_sumo.questions.reach import Reach, falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond
+from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.by_parameter import (
     Parameter,
     cells_between,
@@ -77,26 +77,20 @@ class Level(NamedTuple):
 class LevelSearch:
     """The search for limits up to each value."""
 
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        by: Parameter,
-        unsafe: Unsafe,
-        columns: Sequence[int],
-        limits: dict[str, Limit],
-        fits: int | None,
-        budget: int,
-    ) -> None:
+    def __init__(self, asked: Asked, by: Parameter) -> None:
+        evaluator = asked.evaluator
         self.evaluator = evaluator
         self.by = by
-        self.unsafe = unsafe
-        self.columns = columns
-        self.limits = limits
-        self.fits = fits
-        self.budget = budget
+        self.unsafe = asked.unsafe
+        self.columns = asked.columns
+        self.limits = asked.limits
+        self.fits = asked.fits
+        self.budget = asked.budget
         self.is_searched = by.name in evaluator.study.scenario.search
         self.column = evaluator.characteristics.names.index(by.name) if self.is_searched else -1
-        self.whole = models_of(evaluator, unsafe, fits) if evaluator.study.scenario.search else None
+        self.whole = None
+        if evaluator.study.scenario.search:
+            self.whole = models_of(evaluator, asked.unsafe, asked.fits)
 
     @cached_property
     def original(self) -> OriginalReach:

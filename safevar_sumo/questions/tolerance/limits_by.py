@@ -19,6 +19,7 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.reach import Reach
 from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
 from safevar_sumo.questions.tolerance.alone import AloneLimit, budget_alone
+from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
@@ -42,13 +43,17 @@ if TYPE_CHECKING:
 UNSAFE_ORIGINAL = "the original vehicle itself is unsafe, or safe in no encounter"
 
 
-def answer_by(search: LevelSearch, known: FloatArray) -> Answer:
-    """Limits of each characteristic alone that hold up to each value of a parameter; `known` are
-    failures of one characteristic that results hold, shape (K, n).
+def answer_by(asked: Asked, by: Parameter) -> Answer:
+    """The answer with limits of each characteristic alone that hold up to each value of a
+    parameter.
     """
-    by = search.by
+    search = LevelSearch(asked, by)
     study = search.evaluator.study
-    levels = search.levels(known)
+    members = search.evaluator.characteristics
+    # Limits alone end before failures of one characteristic that results hold.
+    known = asked.unsafe_solutions
+    is_changed = (known != members.original) & members.of_vehicle
+    levels = search.levels(known[np.count_nonzero(is_changed, axis=1) == 1])
     with search.evaluator.stage("specified limits between two values"):
         reach = search.reach(levels)
     contacts = search.contacts(levels)

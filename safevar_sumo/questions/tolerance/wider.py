@@ -4,7 +4,6 @@ key `wider`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,11 @@ from safevar_sumo.questions.reach import falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.left_out import leading_parameter
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Limit, Study, load_study
+from safevar_sumo.study import Study, load_study
 
 WIDER_STAGE = "attack in the wider scope"
 WIDER: Columns = {
@@ -62,26 +62,20 @@ def wider_study(study: Study) -> Study:
     return wider
 
 
-def wider_rows(
-    evaluator: Evaluator,
-    limits: Mapping[str, Limit],
-    together: LimitsTogether | None,
-    unsafe: str | None,
-    margin: float | None,
-    fits: int | None,
-    budget: int,
-) -> list[tuple[Any, ...]]:
+def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any, ...]]:
     """The row of `WIDER` for a study that names a wider one: an attack on the limits together in
     the wider scope, or without such limits on the specified ones.
     """
+    evaluator = asked.evaluator
+    budget = asked.budget
     if not evaluator.study.wider or together is None or not budget:
         return []
     study = wider_study(evaluator.study)
     other = evaluator.for_study(study)
-    models = models_of(
-        other, limit_criterion(other, study, unsafe, margin, other.evaluate_original()), fits
-    )
-    if together.box is None and not limits:
+    original = other.evaluate_original()
+    unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)
+    models = models_of(other, unsafe, asked.fits)
+    if together.box is None and not asked.limits:
         return []
     box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
     seed = study.search.seed

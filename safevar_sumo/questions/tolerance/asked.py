@@ -1,0 +1,87 @@
+"""What is asked about limits: the characteristics, the specified limits, and the criterion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import about, check_name
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.study import Limit, Study, limits_of
+
+
+class Asked(NamedTuple):
+    """A question about limits.
+
+    Attributes
+    ----------
+    columns
+        The columns of the characteristics that vary.
+    limits
+        The specified limits, by name.
+    unsafe
+        What is unsafe, with the distance to keep.
+    original
+        The evaluation of the original vehicle.
+    criterion, margin
+        The options from which `unsafe` comes.
+    fits
+        Number of parameter sets in which the limits hold; None for all.
+    budget
+        Number of simulations that search for a counterexample.
+    """
+
+    subject: Study | Case
+    evaluator: Evaluator
+    columns: list[int]
+    limits: dict[str, Limit]
+    unsafe: Unsafe
+    original: Evaluations
+    criterion: str | None
+    margin: float | None
+    fits: int | None
+    budget: int
+
+    @property
+    def unsafe_solutions(self) -> FloatArray:
+        """The distinct unsafe solutions of results that change no other characteristics than those
+        that vary, and parameters of the scenario; shape (K, n).
+        """
+        members = self.evaluator.characteristics
+        if isinstance(self.subject, Study):
+            return np.zeros((0, len(members)))
+        frame = self.subject.solutions[self.unsafe.rows(self.subject.solutions)]
+        settings = frame[list(members.names)].to_numpy(dtype=float)
+        varies = ~members.of_vehicle
+        varies[self.columns] = True
+        is_original = (settings == members.original)[:, ~varies].all(axis=1)
+        return np.unique(settings[is_original], axis=0)
+
+
+def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:
+    """The columns of chosen characteristics, of all without a choice."""
+    chosen = [name.strip() for text in characteristics for name in text.split(",")]
+    for name in chosen:
+        check_name("characteristics", f"there is no characteristic {name!r}", name, names)
+    return [column for column, name in enumerate(names) if not chosen or name in chosen]
+
+
+def specified_limits(
+    study: Study, texts: Sequence[str], columns: Sequence[int]
+) -> dict[str, Limit]:
+    """The limits of the study and of the option for the characteristics that vary."""
+    rows = study.vehicle.characteristics
+    varied = [list(rows)[column] for column in columns]
+    with about("limits"):
+        for name in limits_of(texts, rows):
+            check_name("", f"{name} does not vary with these --characteristics", name, varied)
+        return {
+            name: limit
+            for name, limit in limits_of(texts, rows, study.limits).items()
+            if name in varied
+        }

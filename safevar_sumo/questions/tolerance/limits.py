@@ -1,0 +1,329 @@
+"""The limits of a study: of each characteristic alone, and of all together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import RATING_POINTS
+from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.bars import bars_of
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Models, models_of, with_points_between
+from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
+from safevar_sumo.questions.tolerance.asked import Asked
+from safevar_sumo.questions.tolerance.figure import draw_limits
+from safevar_sumo.questions.tolerance.left_out import contacts_left_out
+from safevar_sumo.questions.tolerance.refusal import nearest_limits
+from safevar_sumo.questions.tolerance.rows import (
+    CHARACTERISTIC,
+    LIMITS,
+    UNCERTAINTY,
+    limit_rows,
+    uncertainty_rows,
+)
+from safevar_sumo.questions.tolerance.scans import (
+    SCAN_STAGE,
+    SCAN_VALUES,
+    WHOLE_POINT_LOSS,
+    OneAtATimeScan,
+    scan,
+)
+from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
+from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED, USUAL_BUDGET, verdict_sentences
+from safevar_sumo.questions.words import constraints_in_words, counted_in_words
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.study import Limit
+from safevar_sumo.vehicles.region import REJECTIONS
+
+LIMITS_TITLE = (
+    "Limits, rounded to the safe side; a car beyond one has the others at theirs unless a sentence"
+    " says which"
+)
+INTERVALS: Columns = {
+    **CHARACTERISTIC,
+    "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
+    "low": Column(
+        "",
+        "first simulated value that is so, all others as in the original, with the study's own fit",
+        ".6g",
+    ),
+    "high": Column("", "last one", ".6g"),
+    "degree_low": Column("m", "safety degree at the first value; in -m/s on a collision", ".2f"),
+    "degree_high": Column("m", "safety degree at the last value; in -m/s on a collision", ".2f"),
+}
+FITS: Columns = {
+    "fit": Column("-", "number of the fit among the sets of [spread]; 0 is the study's own", "d"),
+    "specified": (
+        "whether the specified limits hold with it; left out: the original is unsafe or keeps too"
+        " little"
+    ),
+    "corners": Column(
+        "", "what the worst corner of the limits together keeps [m], or has of a metric", ".2f"
+    ),
+}
+POINTS: Columns = {
+    **CHARACTERISTIC,
+    "any_lost": Column("", "value nearest to the original that loses points", ".5g"),
+    "first_point_lost": Column("", "value nearest to the original that loses a whole point", ".5g"),
+    "least_points": Column("-", "fewest points anywhere in the domain", ".2f"),
+}
+OF_BOX = (
+    *("box", "samples", "failures", "at_most", "not_simulated"),
+    *("fits", "fits_tried", "attacked", "least_attacked"),
+)
+"""Numbers about the limits together."""
+MAX_REFUTED = 4
+"""Largest number of searches for joint limits, each without what refuted the one before."""
+NEAREST: Columns = {
+    **CHARACTERISTIC,
+    "limit": Column("", "the specified value", ".10g"),
+    "nearest": Column(
+        "", "the nearest value with which limits together exist, the others as specified", ".10g"
+    ),
+}
+
+
+class FoundLimits(NamedTuple):
+    """The limits of a study.
+
+    Attributes
+    ----------
+    scans
+        Each characteristic alone, with the study's own parameter set.
+    models
+        The models in which the limits hold.
+    alone
+        The limits of each characteristic alone.
+    together
+        The joint limits; None in a rated study, and around an unsafe original.
+    """
+
+    scans: list[OneAtATimeScan]
+    models: Models
+    alone: list[AloneLimit]
+    together: LimitsTogether | None
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether the original vehicle is safe."""
+        return all(one.safe is not None for one in self.scans)
+
+
+def find_limits(asked: Asked) -> FoundLimits:
+    """Search the limits that a question asks for."""
+    evaluator = asked.evaluator
+    members = evaluator.characteristics
+    # A box of a rated study would take thousands of whole test matrices.
+    is_sought = not is_rated(evaluator.study)
+    if is_sought:
+        _check_drawable(evaluator)
+    # Around an unsafe original there is nothing to scan, but points that are lost.
+    is_safe = not asked.unsafe.of(asked.original)[0]
+    is_scanned = is_safe or not is_sought
+    within = None if is_scanned else [(members.original[column],) * 2 for column in asked.columns]
+    with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(asked.columns)):
+        scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_scanned else 1)
+    models = Models.own_alone(evaluator, asked.unsafe)
+    if is_sought and is_safe:
+        models = models_of(evaluator, asked.unsafe, asked.fits)
+    # Limits alone also hold at points between those of the study's matrix.
+    judges = [*models.members]
+    if is_sought and asked.budget:
+        judges = [with_points_between(model, asked.unsafe, 0)[0] for model in models.members]
+    search_alone = AloneSearch(scans, asked.columns, judges)
+    encounters = 1 + len(evaluator.critical_encounters)
+    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(asked.columns) * encounters):
+        search_alone.run(asked.budget)
+    together = None
+    if is_sought and is_safe:
+        together = _find_together(asked, scans, models, search_alone)
+    return FoundLimits(scans, models, search_alone.limits(), together)
+
+
+def _find_together(
+    asked: Asked, scans: Sequence[OneAtATimeScan], models: Models, search_alone: AloneSearch
+) -> LimitsTogether:
+    """The joint limits, which hold nothing that the search of limits alone met, and the other way
+    round: limits alone end before failures that the search of joint limits met.
+    """
+    members = asked.evaluator.characteristics
+    columns = [*asked.columns, *np.flatnonzero(~members.of_vehicle).tolist()]
+    everywhere = {
+        item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
+    }
+    limits = {**asked.limits, **everywhere}
+    known = [asked.unsafe_solutions, _unsafe_alone(asked, scans)]
+    for _ in range(MAX_REFUTED):
+        unsafe_settings = np.concatenate([*known, search_alone.failures])
+        together = find_limits_together(
+            models, columns, limits, scans, unsafe_settings, asked.budget
+        )
+        search_alone.meet(together.searched, together.failures_alone)
+        if together.box is None or not together.box.holds(search_alone.failures).any():
+            return together
+    return together._replace(box=None)
+
+
+def answer_limits(asked: Asked) -> Answer:
+    """The answer with limits alone and joint limits."""
+    evaluator = asked.evaluator
+    study = evaluator.study
+    found = find_limits(asked)
+    models = found.models
+    together = found.together
+    contacts = None
+    if together is not None and asked.budget and len(evaluator.characteristics.scenario):
+        contacts = contacts_left_out(models.members, [together.box or together.promise])
+    scope = scope_of(study, between=asked.budget > 0)
+    rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
+    if not asked.budget:
+        rows = rows.without_kept()
+    nearest = []
+    if rows.broken and together is not None:
+        nearest = nearest_limits(models, asked.limits)
+    wider = wider_rows(asked, together) if found.is_safe else []
+    refusal = ""
+    if not found.is_safe:
+        breach = asked.unsafe.breach_in_words(asked.original)
+        refusal = f"the original itself {breach}: no limit can be kept"
+    failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
+    is_kept = None if not failures and not asked.budget else not failures
+    sentences = verdict_sentences(
+        *(models, found.alone, together, asked.limits, rows.broken, asked.budget),
+        *(nearest, wider, refusal, contacts),
+    )
+    return Answer(
+        question="tolerance",
+        study=study,
+        verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
+        numbers={
+            "unsafe": str(asked.unsafe),
+            "margin": asked.unsafe.keep,
+            "kept": is_kept,
+            "rough": asked.budget < USUAL_BUDGET,
+            "scope": scope,
+            "contacts_left_out": None if contacts is None else contacts.number,
+            **_numbers(found),
+        },
+        tables=_tables(found, rows.rows, nearest, wider),
+        failures=(NOT_FALSIFIED,) if is_kept is None and asked.limits else failures,
+        draw=partial(draw_limits, scans=found.scans),
+    )
+
+
+def _numbers(found: FoundLimits) -> JsonObject:
+    """The numbers about joint limits; without such limits they are undefined."""
+    if found.together is None:
+        return {**dict.fromkeys(OF_BOX), "boxes": 0}
+    return {**found.together.numbers, "fits_tried": len(found.models.members)}
+
+
+def _tables(
+    found: FoundLimits,
+    rows: Sequence[tuple[Any, ...]],
+    nearest: Sequence[tuple[Any, ...]],
+    wider: Sequence[tuple[Any, ...]],
+) -> dict[str, pd.DataFrame]:
+    """The tables of an answer, the limits first; those without rows are left out."""
+    scans = found.scans
+    limits = tabulate(LIMITS_TITLE, LIMITS, rows)
+    limits.attrs["bars"] = bars_of(
+        limits, [(one.characteristic.lower, one.characteristic.upper) for one in scans]
+    )
+    intervals = tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans))
+    tables = {"limits": limits, "intervals": intervals}
+    if moved := uncertainty_rows(found.alone):
+        tables["uncertainty"] = tabulate(
+            "Limits alone: with one fit and with all", UNCERTAINTY, moved
+        )
+    tried = len(found.models.members) + len(found.models.left_out)
+    if found.together is not None and tried > 1:
+        fits = _fit_rows(found.models, found.together)
+        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, fits)
+    if RATING_POINTS.name in scans[0].profile:
+        tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
+    if nearest:
+        tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
+    if wider:
+        tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
+    return tables
+
+
+def _check_drawable(evaluator: Evaluator) -> None:
+    """Refuse a study of which hardly any setting is feasible, before the long scans."""
+    members = evaluator.characteristics
+    region = evaluator.region
+    if not len(
+        Box(region, members.lower, members.upper).draw(
+            1, np.random.default_rng(evaluator.study.search.seed)
+        )
+    ):
+        problem = (
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
+            " box to test: "
+        )
+        legal = "characteristics that the constraints do not tie to each other"
+        raise InputError(evaluator.study.source, f"{problem}{region}", legal)
+
+
+def _unsafe_alone(asked: Asked, scans: Sequence[OneAtATimeScan]) -> FloatArray:
+    """The ends of the unsafe intervals as settings, shape (K, n), each in its worst encounter."""
+    characteristics = asked.evaluator.characteristics
+    ends = [
+        (one.characteristic.name, end)
+        for one in scans
+        for interval in one.of_state("unsafe")
+        for end in interval
+    ]
+    settings = [characteristics.setting({name: end}) for name, end in ends]
+    ends_of_intervals = np.array(settings).reshape(-1, len(characteristics))
+    return asked.evaluator.evaluate_over_encounters(
+        ends_of_intervals, asked.unsafe, "ends of what is unsafe alone"
+    ).settings
+
+
+def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
+    """The rows of the table of intervals."""
+    frames = []
+    for one in scans:
+        degrees = {f"degree_{end}": one.intervals[end].map(one.degree) for end in ("low", "high")}
+        frames.append(
+            one.intervals.assign(
+                characteristic=one.characteristic.name, unit=one.characteristic.unit, **degrees
+            )
+        )
+    return pd.concat(frames, ignore_index=True)[[*INTERVALS]]
+
+
+def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
+    """A row of `FITS` for each fit."""
+    states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
+    states |= dict.fromkeys(models.left_out, "left out")
+    return [
+        (fit, state, together.corners.get(fit, np.nan)) for fit, state in sorted(states.items())
+    ]
+
+
+def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:
+    """A row of `POINTS` for each characteristic."""
+    return [
+        (
+            one.characteristic.name,
+            one.characteristic.unit,
+            one.first_loss(),
+            one.first_loss(WHOLE_POINT_LOSS),
+            one.profile[RATING_POINTS.name].min(),
+        )
+        for one in scans
+    ]
