@@ -174,35 +174,32 @@ class Unsafe:
             collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
         )
 
-    def left(self, evaluations: Evaluations) -> FloatArray:
+    def robustness(self, evaluations: Evaluations) -> FloatArray:
         """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
         unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
         of the collision.
         """
         if self.bound is None:
-            left = evaluations.f_safe - (
-                self.contact + self.keep if self.below is None else self.below
-            )
+            limit = self.contact + self.keep if self.below is None else self.below
+            robustness = evaluations.f_safe - limit
         else:
             difference = evaluations.column(self.bound.measure) - self.bound.limit
-            left = -difference if self.bound.worst_is_largest else difference
-            left = (
-                left
-                if self.is_of_points
-                else np.where(evaluations.collided, evaluations.f_safe, left)
-            )
-        left = np.where(np.isnan(left), np.inf, left)
-        return np.where(self.of(evaluations), np.minimum(left, -LEAST), np.maximum(left, 0.0))
+            robustness = -difference if self.bound.worst_is_largest else difference
+            if not self.is_of_points:
+                robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
+        robustness = np.where(np.isnan(robustness), np.inf, robustness)
+        return np.where(
+            self.of(evaluations), np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0)
+        )
 
-    def value(self, left: float) -> float:
-        """What is `left` away from the limit: a distance between bumpers [m], or the value that is
+    def value(self, robustness: float) -> float:
+        """What has a robustness: a distance between bumpers [m], or the value that is
         limited.
         """
         if self.bound is not None:
-            return (
-                self.bound.limit - left if self.bound.worst_is_largest else self.bound.limit + left
-            )
-        return left + (self.keep if self.below is None else self.below)
+            sign = -1 if self.bound.worst_is_largest else 1
+            return self.bound.limit + sign * robustness
+        return robustness + (self.keep if self.below is None else self.below)
 
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m`, `has drac 5.9`."""

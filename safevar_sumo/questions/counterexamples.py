@@ -96,7 +96,7 @@ def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
     points = tuple(points[number] for number in model.points) or points
     members = model.evaluator.characteristics
     runs = model.evaluate(settings, STAGE)
-    is_unsafe = model.evaluator.region.feasible(settings) & (model.left_by(runs) < 0)
+    is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
     fit = f" (fit {model.fit} of the vehicle)" if model.fit else ""
     failures = dict[int, Failure]()

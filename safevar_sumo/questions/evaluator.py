@@ -253,7 +253,7 @@ class Evaluator:
             -1, settings.shape[1]
         )
         evaluations = self.evaluate(pairs, stage)
-        worst = np.argmin(unsafe.left(evaluations).reshape(-1, len(encounters)), axis=1)
+        worst = np.argmin(unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1)
         first_rows = np.arange(len(settings)) * len(encounters)
         return evaluations.take(first_rows + worst)
 

@@ -48,13 +48,13 @@ class Falsification(NamedTuple):
 
     settings: FloatArray
     judges: Rows
-    left: FloatArray
+    robustness: FloatArray
     simulated: int
 
     @property
     def failures(self) -> dict[int, FloatArray]:
         """The unsafe settings, shape (K, n), by the number of the judge; none if the claim held."""
-        is_unsafe = self.left < 0
+        is_unsafe = self.robustness < 0
         return {
             judge: self.settings[is_unsafe & (self.judges == judge)]
             for judge in np.unique(self.judges[is_unsafe]).tolist()
@@ -62,11 +62,11 @@ class Falsification(NamedTuple):
 
     def merged(self, other: Falsification) -> Falsification:
         """Both falsifications as one."""
-        left = np.concatenate([self.left, other.left])
-        worst = np.argsort(left, kind="stable")
+        robustness = np.concatenate([self.robustness, other.robustness])
+        worst = np.argsort(robustness, kind="stable")
         settings = np.concatenate([self.settings, other.settings])[worst]
         judges = np.concatenate([self.judges, other.judges])[worst]
-        return Falsification(settings, judges, left[worst], self.simulated + other.simulated)
+        return Falsification(settings, judges, robustness[worst], self.simulated + other.simulated)
 
 
 def enough(budget: int) -> int:
@@ -119,9 +119,10 @@ def falsify_all(
     ]
     waiting = dict[int, _Generation]()
 
-    def go_on(number: int, left: FloatArray | None) -> None:
+    def go_on(number: int, robustness: FloatArray | None) -> None:
+        step = steps[number]
         try:
-            waiting[number] = next(steps[number]) if left is None else steps[number].send(left)
+            waiting[number] = next(step) if robustness is None else step.send(robustness)
         except StopIteration as end:
             found[number] = end.value
 
@@ -134,11 +135,11 @@ def falsify_all(
         waiting.clear()
         settings = np.concatenate([each.settings for each in generations])
         met = np.concatenate([each.judges for each in generations])
-        left = np.full(len(settings), np.inf)
+        robustness = np.full(len(settings), np.inf)
         for judge in np.unique(met):
-            left[met == judge] = judges[judge](settings[met == judge])
+            robustness[met == judge] = judges[judge](settings[met == judge])
         ends = np.cumsum([len(each.settings) for each in generations])[:-1]
-        for number, of_box in zip(numbers, np.split(left, ends), strict=True):
+        for number, of_box in zip(numbers, np.split(robustness, ends), strict=True):
             go_on(number, of_box)
     return [found[number] for number in range(len(boxes))]
 
@@ -175,10 +176,10 @@ def _steps(
         settings, numbers = _new_ones(box, settings, numbers, choice, number, seen, rng)
         if not len(settings):
             break
-        left = yield _Generation(settings, numbers)
-        np.minimum.at(least, numbers, left)
-        found = _worst(found, settings, numbers, left)
-        generations_left -= int((found.left < 0).any())
+        robustness = yield _Generation(settings, numbers)
+        np.minimum.at(least, numbers, robustness)
+        found = _worst(found, settings, numbers, robustness)
+        generations_left -= int((found.robustness < 0).any())
         if not generations_left:
             break
         settings = _children(box, found, max(size, GENERATION), rng)
@@ -224,19 +225,19 @@ def _new_ones(
 
 
 def _worst(
-    found: Falsification, settings: FloatArray, numbers: Rows, left: FloatArray
+    found: Falsification, settings: FloatArray, numbers: Rows, robustness: FloatArray
 ) -> Falsification:
     """The falsification after a generation, with the worst settings that count, and all unsafe
     ones.
     """
-    is_counted = np.isfinite(left)
-    all_left = np.concatenate([found.left, left[is_counted]])
+    is_counted = np.isfinite(robustness)
+    all_left = np.concatenate([found.robustness, robustness[is_counted]])
     worst = np.argsort(all_left, kind="stable")[: max(PARENTS, np.count_nonzero(all_left < 0))]
     return Falsification(
         np.concatenate([found.settings, settings[is_counted]])[worst],
         np.concatenate([found.judges, numbers[is_counted]])[worst],
         all_left[worst],
-        found.simulated + len(left),
+        found.simulated + len(robustness),
     )
 
 

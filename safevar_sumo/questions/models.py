@@ -61,23 +61,23 @@ class Model(NamedTuple):
             return self.evaluator.evaluate(settings, stage)
         return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
 
-    def left(self, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
         where it does not count.
         """
         return np.where(
             self.evaluator.region.feasible(settings),
-            self.left_by(self.evaluate(settings, stage)),
+            self.robustness_by(self.evaluate(settings, stage)),
             np.inf,
         )
 
-    def left_by(self, evaluations: Evaluations) -> FloatArray:
+    def robustness_by(self, evaluations: Evaluations) -> FloatArray:
         """What evaluated settings leave; see `left`."""
-        return np.where(evaluations.valid, self.unsafe.left(evaluations), np.inf)
+        return np.where(evaluations.valid, self.unsafe.robustness(evaluations), np.inf)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
-        return self.left(settings, stage) < 0
+        return self.robustness(settings, stage) < 0
 
     def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
         """The model at the points of the study's matrix at which settings are worst; without a
@@ -96,7 +96,7 @@ class Model(NamedTuple):
 
 def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
     """What falsifies a claim in some models; progress is shown for `stage`."""
-    return [partial(model.left, stage=stage) for model in models]
+    return [partial(model.robustness, stage=stage) for model in models]
 
 
 class Models(NamedTuple):

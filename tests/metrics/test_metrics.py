@@ -185,7 +185,7 @@ def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none
         assert criterion.of(runs).tolist() == expected, text
         assert "collision" in criterion.description or "drac" not in text
         if criterion.points is None:
-            assert (criterion.left(runs) < 0).tolist() == expected, text
+            assert (criterion.robustness(runs) < 0).tolist() == expected, text
 
 
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
@@ -287,7 +287,7 @@ def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_mu
 
 def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
     made = made_up_evaluations([2.0, -1.0])
-    assert [Unsafe(below=below).left(made).tolist() for below in (None, 0.5)] == [
+    assert [Unsafe(below=below).robustness(made).tolist() for below in (None, 0.5)] == [
         [2.0, -1.0],
         [1.5, -1.5],
     ]

@@ -255,12 +255,12 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
         )
         found = falsify(
             box,
-            [lambda settings: model.left(settings, "attack")],
+            [lambda settings: model.robustness(settings, "attack")],
             [],
             5000,
             np.random.default_rng(0),
         )
-    assert found.left[0] < 0
+    assert found.robustness[0] < 0
     assert found.simulated <= 5000
 
 

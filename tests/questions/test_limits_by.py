@@ -19,9 +19,9 @@ from safevar_sumo.questions.falsify import Falsification, falsify, falsify_all
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
+from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.search import BoxSearch
-from safevar_sumo.questions.tolerance.settlement import Settlement
-from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_promises
+from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
@@ -325,10 +325,10 @@ def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() 
     model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
     search = BoxSearch(model, [0, 1], {}, np.array([[9.0, 9.5], [9.5, 8.0]]))
     whole = Box(region, np.array([0.0, 0.0]), np.array([10.0, 10.0]))
-    cut = Settlement(search).cut(whole)
+    cut = Extension(search).cut(whole)
     assert cut.upper.tolist() == pytest.approx([8.9, 10], abs=0.1)
     assert not cut.holds(search.unsafe_settings).any()
-    assert Settlement(search).cut(whole, attempts=10).upper[0] < cut.upper[0] - 0.2, (
+    assert Extension(search).cut(whole, attempts=10).upper[0] < cut.upper[0] - 0.2, (
         "it keeps off by more"
     )
 
@@ -343,9 +343,9 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
     model = Model(0, evaluator, Unsafe(keep=0.1))
     new_car = Box(evaluator.region, lower, upper)
     worn = Box(evaluator.region, np.where(members.of_vehicle, members.lower, lower), upper)
-    left = model.left(new_car.draw(16, np.random.default_rng(5)), "new car")
-    assert left.min() >= study.scenario.margin - 0.1
-    assert broken_promises(new_car, [model]) == {}
+    robustness = model.robustness(new_car.draw(16, np.random.default_rng(5)), "new car")
+    assert robustness.min() >= study.scenario.margin - 0.1
+    assert broken_specification(new_car, [model]) == {}
     assert evaluator.simulated == 16
     assert not _keeps_its_margin(worn, model)
     assert not _keeps_its_margin(

@@ -14,7 +14,7 @@ from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.tolerance.trial import CONFIRMATIONS
+from safevar_sumo.questions.tolerance.validation import CONFIRMATIONS
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
@@ -114,7 +114,7 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
         2000,
         np.random.default_rng(0),
     )
-    assert hit.left[0] == -1
+    assert hit.robustness[0] == -1
     assert hit.simulated < 2000, "it ends soon after"
 
 
@@ -152,7 +152,7 @@ def test_limits_that_the_own_fit_breaks_have_no_box() -> None:
     found = box_of(2, lambda rows: rows[:, 0] > 7, {"a": Limit(at_most=9)})
     assert found.box is None
     assert found.broken.keys() == {0}
-    assert found.promise.upper.tolist() == [9, 5]
+    assert found.specified.upper.tolist() == [9, 5]
 
 
 @pytest.mark.parametrize("gap", [0.0, 0.1, 0.4])

@@ -35,19 +35,19 @@ def worst_within(
     shares = np.where(rng.random(shares.shape) < 0.5, np.round(shares), shares)
     settings = lower + shares * (upper - lower)
     of_model = rng.integers(len(models), size=len(settings))
-    left = np.full(len(settings), np.inf)
+    robustness = np.full(len(settings), np.inf)
     for number, model in enumerate(models):
-        left[of_model == number] = model.left(settings[of_model == number], "random")
+        robustness[of_model == number] = model.robustness(settings[of_model == number], "random")
     # From the six worst, steps of some values, which become smaller.
-    order = np.argsort(left)[:WORST]
-    best = [(left[row], settings[row], models[of_model[row]]) for row in order]
+    order = np.argsort(robustness)[:WORST]
+    best = [(robustness[row], settings[row], models[of_model[row]]) for row in order]
     step = 0.3
     for _ in range(SIMULATIONS // 2 // (WORST * STEPS)):
         for place, (least, setting, model) in enumerate(best):
             is_moved = rng.random((STEPS, n)) < rng.choice([0.15, 0.3, 0.6])
             moves = rng.normal(0.0, step, (STEPS, n)) * is_moved * (upper - lower)
             near = np.clip(setting + moves, lower, upper)
-            of_near = model.left(near, "local")
+            of_near = model.robustness(near, "local")
             if of_near.min() < least:
                 best[place] = of_near.min(), near[np.argmin(of_near)], model
         step *= 0.9

@@ -19,7 +19,13 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
-from safevar_sumo.questions.repair import attack, full_braking, smallest, survivors, write_repair
+from safevar_sumo.questions.repair import (
+    full_braking,
+    smallest,
+    survivors,
+    validation,
+    write_repair,
+)
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.questions.repair.problem import Parameter, Promise, RepairProblem
 from safevar_sumo.records import FloatArray, differences
@@ -138,8 +144,8 @@ grip = { at_least = 5 }
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module, name, number in (
-        (attack, "BUDGET", 300),
-        (attack, "MAX_UNSAFE_SHARE", 0.01),
+        (validation, "BUDGET", 300),
+        (validation, "MAX_UNSAFE_SHARE", 0.01),
         (question, "SOBOL_VEHICLES", 32),
     ):
         monkeypatch.setattr(module, name, number)
@@ -180,7 +186,7 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     """The gap of today decides the fastest of them; from there the worst promised sled needs a
     longer one.
     """
-    monkeypatch.setattr(attack, "BUDGET", 2000)
+    monkeypatch.setattr(validation, "BUDGET", 2000)
     search = 'search.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
     planted.write_text(
         STUDY.replace("speed = 72.0, ", "").replace(
@@ -217,12 +223,12 @@ class Adding:
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self._need = np.full(parameters, 0.1), need
 
-    def lefts(
+    def robustness_of_each(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()
     ) -> tuple[FloatArray, Any]:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
-        left = gain[:, np.newaxis] - self._need * settings[:, 0]
-        return left, np.zeros(left.size, dtype=int)
+        robustness = gain[:, np.newaxis] - self._need * settings[:, 0]
+        return robustness, np.zeros(robustness.size, dtype=int)
 
 
 @pytest.mark.parametrize(
@@ -312,7 +318,7 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
         driver = problem.best_driver
         assert driver is not None
         is_safe = (
-            full_braking.lefts_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
+            full_braking.robustness_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
         )
         assert 0 < np.count_nonzero(is_safe) < len(settings)
         for rows in (
@@ -335,7 +341,7 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     """
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
     monkeypatch.setattr(survivors, "find_failures", lambda *_: {})
-    monkeypatch.setattr(survivors, "prove_change", lambda *_: (attack.Proof(5, 0, 0.45, 0), {}))
+    monkeypatch.setattr(survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), {}))
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     worst = kept.numbers["worst_today"]
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6

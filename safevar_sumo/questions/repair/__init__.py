@@ -31,10 +31,10 @@ from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
-from safevar_sumo.questions.repair.attack import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
+from safevar_sumo.questions.repair.validation import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -173,11 +173,11 @@ def repair(
         raise InputError(
             study.source, text, "a smaller --margin, or other domains under [scenario.search]"
         )
-    left = problem.lefts_with(problem.today, first, "the driving system of today")
-    worst_first = np.argsort(left, kind="stable")
+    robustness = problem.robustness_with(problem.today, first, "the driving system of today")
+    worst_first = np.argsort(robustness, kind="stable")
     vehicles = first[worst_first]
     # What no driving system survives needs another part, not a parameter; the rest is repaired.
-    is_repairable = left[worst_first] >= 0
+    is_repairable = robustness[worst_first] >= 0
     is_unsafe = ~is_repairable
     is_repairable[is_unsafe] = problem.repairable(vehicles[is_unsafe])
     survivors = Survivors([], len(problems), ())

@@ -37,20 +37,20 @@ class FullBraking:
         """Which settings are safe, shape (M,)."""
         has_encounters = len(self.evaluator.characteristics.scenario) > 0
         if has_encounters or len(self._failures) <= HARDEST[-1] or len(settings) < LEAST_SETTINGS:
-            return lefts_of(self.evaluator.evaluate(settings, STAGE), self._unsafe) >= 0
+            return robustness_of(self.evaluator.evaluate(settings, STAGE), self._unsafe) >= 0
         is_safe = self.evaluator.region.feasible(settings)
         for points in np.split(np.argsort(-self._failures, kind="stable"), HARDEST):
             rows = np.flatnonzero(is_safe)
             selection = Selection(points=tuple(points.tolist()))
             evaluations = self.evaluator.evaluate_selection(settings[rows], selection, STAGE)
-            is_safe[rows] = lefts_of(evaluations, self._unsafe) >= 0
+            is_safe[rows] = robustness_of(evaluations, self._unsafe) >= 0
             if evaluations.worst_points is not None:
                 np.add.at(self._failures, points[evaluations.worst_points[~is_safe[rows]]], 1)
         return is_safe
 
 
-def lefts_of(evaluations: Evaluations, unsafe: Unsafe) -> FloatArray:
+def robustness_of(evaluations: Evaluations, unsafe: Unsafe) -> FloatArray:
     """What evaluations leave to a limit, shape (M,): infinite without a conflict, minus infinity if
     invalid.
     """
-    return np.where(evaluations.valid, unsafe.left(evaluations), -np.inf)
+    return np.where(evaluations.valid, unsafe.robustness(evaluations), -np.inf)

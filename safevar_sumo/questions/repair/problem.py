@@ -20,7 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.preventability import approach_parameters
-from safevar_sumo.questions.repair.full_braking import FullBraking, lefts_of
+from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
@@ -282,7 +282,7 @@ class RepairProblem:
         )
         return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
 
-    def lefts(
+    def robustness_of_each(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
     ) -> tuple[FloatArray, npt.NDArray[np.intp] | None]:
         """What each of M sets of parameters leaves to the limit with each of L settings, shape (M,
@@ -293,13 +293,13 @@ class RepairProblem:
             values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays
         )
         return (
-            lefts_of(evaluations, self.unsafe).reshape(len(shares), len(settings)),
+            robustness_of(evaluations, self.unsafe).reshape(len(shares), len(settings)),
             evaluations.worst_points,
         )
 
-    def lefts_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """What one set of parameters leaves to the limit with each of L settings, shape (L,)."""
-        return self.lefts(change[np.newaxis], settings, stage)[0].reshape(-1)
+        return self.robustness_of_each(change[np.newaxis], settings, stage)[0].reshape(-1)
 
     def worst_today(self, setting: FloatArray) -> Evaluations:
         """How the ADS of today ends with one setting, shape (n,)."""
@@ -308,16 +308,16 @@ class RepairProblem:
             values, setting[np.newaxis], "the driving system of today", arrays=self.arrays
         )
 
-    def left(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
         """What settings leave to the margin with one set of parameters, shape (L,); infinite where
         they do not hold, or no driving system keeps them safe.
         """
-        left = np.full(len(settings), np.inf)
+        robustness = np.full(len(settings), np.inf)
         rows = np.flatnonzero(self.holds(settings))
-        left[rows] = self.lefts_with(change, settings[rows], stage)
-        unsafe = np.flatnonzero(left < 0)
-        left[unsafe[~self.repairable(settings[unsafe])]] = np.inf
-        return left
+        robustness[rows] = self.robustness_with(change, settings[rows], stage)
+        unsafe = np.flatnonzero(robustness < 0)
+        robustness[unsafe[~self.repairable(settings[unsafe])]] = np.inf
+        return robustness
 
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps
@@ -327,7 +327,9 @@ class RepairProblem:
         characteristics = self.promise.region.characteristics
         if len(characteristics.scenario) and is_promised.any():
             originals = characteristics.with_original_vehicle(settings[is_promised])
-            is_promised[is_promised] = self.lefts_with(self.today, originals, "new vehicles") >= 0
+            is_promised[is_promised] = (
+                self.robustness_with(self.today, originals, "new vehicles") >= 0
+            )
         return is_promised
 
     def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
@@ -371,5 +373,5 @@ class RepairProblem:
             return np.ones(len(settings), dtype=bool)
         is_safe = self.best_driver.saves(settings)
         unsafe = np.flatnonzero(~is_safe)
-        is_safe[unsafe] = self.lefts_with(self.today, settings[unsafe], "full braking") >= 0
+        is_safe[unsafe] = self.robustness_with(self.today, settings[unsafe], "full braking") >= 0
         return is_safe

@@ -141,11 +141,11 @@ class Search:
             while start < len(settings):
                 rows = settings[start : start + size]
                 problem = self.problems[number]
-                (left,), points = problem.lefts(
+                (robustness,), points = problem.robustness_of_each(
                     change[np.newaxis], rows, "changes with all vehicles"
                 )
-                worst = int(np.argmin(left))
-                if left[worst] < 0:
+                worst = int(np.argmin(robustness))
+                if robustness[worst] < 0:
                     return Failure(
                         rows[worst], number, () if points is None else (int(points[worst]),)
                     )
@@ -183,9 +183,9 @@ class Search:
             problem = self.problems[number]
             while len(settings) and len(alive):
                 count = max(1, BATCH // len(alive))
-                left, _ = problem.lefts(
+                robustness, _ = problem.robustness_of_each(
                     changes[alive], settings[:count], "changes with one vehicle", points
                 )
-                alive = alive[(left >= 0).all(axis=1)]
+                alive = alive[(robustness >= 0).all(axis=1)]
                 settings = settings[count:]
         return alive

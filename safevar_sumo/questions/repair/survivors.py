@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from safevar_sumo.questions.box import Proof
-from safevar_sumo.questions.repair.attack import SEARCH_STAGE, find_failures, prove_change
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
+from safevar_sumo.questions.repair.validation import SEARCH_STAGE, find_failures, prove_change
 from safevar_sumo.records import FloatArray
 
 MAX_ROUNDS = 30

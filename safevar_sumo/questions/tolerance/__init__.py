@@ -26,7 +26,7 @@ from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
-from safevar_sumo.questions.tolerance.trial import TRIAL_STAGE
+from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
 from safevar_sumo.questions.tolerance.words import USUAL_BUDGET
 from safevar_sumo.study import Study
@@ -98,7 +98,7 @@ def tolerance(
     study = evaluator.study
     parameter = None if by is None else Parameter.parse(by, study)
     check_by(by, unsafe, together)
-    stages = [SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, TRIAL_STAGE]
+    stages = [SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, VALIDATION_STAGE]
     evaluator.plan(*stages, *([WIDER_STAGE] if study.wider else []))
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)

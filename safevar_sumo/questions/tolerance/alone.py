@@ -22,7 +22,7 @@ from safevar_sumo.vehicles import Characteristic
 VALUES = 17
 """Number of values of what is safe alone in the study's own fit that are simulated in each model.
 """
-ATTACKS, ATTACK_SHARE, GENERATIONS = 20, 0.1, 5
+FALSIFICATIONS, FALSIFICATION_SHARE, GENERATIONS = 20, 0.1, 5
 """Largest number of attacks on a limit, in a study that searches its scenario; the share of
 `--attack` of each, though never less than `LEAST_SIMULATIONS`, and its number of generations, the
 first at the limit itself.
@@ -139,7 +139,7 @@ class AloneSearch:
             pass
         if len(evaluator.characteristics.scenario) and budget:
             models = self.models if attacked is None else attacked.members
-            _attack_alone(self.ends, models, budget_alone(budget))
+            _falsify_alone(self.ends, models, budget_alone(budget))
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
         """Move the limits before failures that another search met, each of one characteristic,
@@ -162,7 +162,7 @@ class AloneSearch:
 
 def budget_alone(budget: int) -> int:
     """Number of simulations of an attack on one limit."""
-    return max(round(ATTACK_SHARE * budget), LEAST_SIMULATIONS)
+    return max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
 
 
 def _find_beyond(ends: Sequence[_Ends], own: Model) -> None:
@@ -185,10 +185,10 @@ def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, nu
     some encounters; whether one has moved.
     """
     settings = [_settings_within(each, encounters, number) for each in ends]
-    lefts = np.split(
-        model.left(np.concatenate(settings), ALONE_STAGE), np.cumsum([*map(len, settings)])[:-1]
-    )
-    return _move(ends, model, [rows[left < 0] for rows, left in zip(settings, lefts, strict=True)])
+    robustness = model.robustness(np.concatenate(settings), ALONE_STAGE)
+    of_each = np.split(robustness, np.cumsum([*map(len, settings)])[:-1])
+    failures = [rows[values < 0] for rows, values in zip(settings, of_each, strict=True)]
+    return _move(ends, model, failures)
 
 
 def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatArray:
@@ -242,7 +242,7 @@ def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]
     return below, above
 
 
-def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
+def _falsify_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
     """Falsify the limits in encounters that no scan met, until nothing is found."""
     members = models[0].evaluator.characteristics
     seed = models[0].evaluator.study.search.seed
@@ -250,7 +250,7 @@ def _attack_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -
     waiting = [*ends]
     nothing = np.zeros((0, len(members)))
     size = max(budget // GENERATIONS, 1)
-    for number in range(ATTACKS):
+    for number in range(FALSIFICATIONS):
         boxes = list[Box]()
         known = list[list[FloatArray]]()
         rngs = [Stream.LIMITS_ALONE.generator(seed, each.column, number) for each in waiting]

@@ -52,13 +52,13 @@ def _judge_left_out(model: Model, demanded: float) -> Judge:
     keeps less than `demanded` [m], below 0 on a contact; infinite in all other encounters.
     """
 
-    def left(settings: FloatArray) -> FloatArray:
+    def robustness(settings: FloatArray) -> FloatArray:
         runs = model.evaluate(settings, STAGE)
         is_between = runs.column(ORIGINAL_DEGREE) < demanded
         counts = is_between & model.evaluator.region.feasible(settings)
-        return np.where(counts, model.left_by(runs), np.inf)
+        return np.where(counts, model.robustness_by(runs), np.inf)
 
-    return left
+    return robustness
 
 
 def leading_parameter(study: Study) -> str:

@@ -107,7 +107,7 @@ class LevelSearch:
         if self.whole is None or not self.budget or alone is None:
             return None
         members = self.evaluator.characteristics
-        box = self._promise(self.whole.own)
+        box = self._specified(self.whole.own)
         if self.is_searched:
             box.upper[self.column] = self.by.values[-1]
         boxes = [box]
@@ -200,7 +200,7 @@ class LevelSearch:
         if before is not None and before.failures:
             return before._replace(value=value, alone=alone, models=models, search=search)
         found = falsify_limits(
-            self._promise(models.own),
+            self._specified(models.own),
             judges_of(judges, STAGE),
             enough(self.budget),
             (self.evaluator.study.search.seed, Stream.SPECIFIED_BETWEEN),
@@ -248,7 +248,7 @@ class LevelSearch:
         is_inside = (known >= members.lower) & (known <= members.upper)
         return np.asarray(known[(is_inside | members.of_vehicle).all(axis=1)])
 
-    def _promise(self, own: Model) -> Box:
+    def _specified(self, own: Model) -> Box:
         """The specified limits in all encounters of a model, all other characteristics as in the
         original.
         """
@@ -281,7 +281,7 @@ class LevelSearch:
                 low = level.value
                 continue
             if self.is_searched:
-                box = self._promise(level.models.own)
+                box = self._specified(level.models.own)
                 upper = box.upper.copy()
                 upper[self.column] = high
                 box = Box(box.region, box.lower, upper)

@@ -184,7 +184,7 @@ def answer_limits(asked: Asked) -> Answer:
     together = found.together
     contacts = None
     if together is not None and asked.budget and len(evaluator.characteristics.scenario):
-        contacts = contacts_left_out(models.members, [together.box or together.promise])
+        contacts = contacts_left_out(models.members, [together.box or together.specified])
     scope = scope_of(study, between=asked.budget > 0)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
     if not asked.budget:

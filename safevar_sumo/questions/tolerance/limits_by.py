@@ -127,7 +127,11 @@ def _numbers(levels: Sequence[Level], reach: Reach, unsafe: Unsafe) -> JsonObjec
     """
     last = levels[-1]
     found = reach.falsification
-    least = None if found is None or not len(found.left) else unsafe.value(float(found.left[0]))
+    least = (
+        None
+        if found is None or not len(found.robustness)
+        else unsafe.value(float(found.robustness[0]))
+    )
     attacked = {"attacked": None if found is None else found.simulated, "least_attacked": least}
     members, left_out = last.models
     return {

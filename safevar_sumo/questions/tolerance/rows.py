@@ -201,7 +201,7 @@ def _broken_in_words(
     assert together is not None
     fits = {model.fit: model for model in models}
     fit, setting = next(iter(together.broken.items()))
-    found = describe(fits[fit], {item.name: setting}, together.promise)
+    found = describe(fits[fit], {item.name: setting}, together.specified)
     words = found[item.name].words if found else "the car is unsafe"
     specified_value = next(value for value in specified if value is not None)
     return f"{item.name} {limit_text(item, specified_value)}: with all specified limits, {words}"

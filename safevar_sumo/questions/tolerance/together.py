@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, enough, falsify
 from safevar_sumo.questions.models import Model, Models, judges_of
+from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
-from safevar_sumo.questions.tolerance.settlement import Settlement
-from safevar_sumo.questions.tolerance.trial import Trial, Trials
+from safevar_sumo.questions.tolerance.validation import Validation, Validator
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
@@ -27,7 +28,7 @@ MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that
 limits move out.
 """
-PROMISE_POINTS = 256
+SPECIFICATION_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in
 the original.
 """
@@ -39,16 +40,25 @@ class LimitsTogether(NamedTuple):
 
     Attributes
     ----------
-    promise
+    specified
         The specified limits, all other characteristics as in the original.
-    box
-        The limits as printed; None if none were found.
-    broken
-        Numbers of the fits in which the promise itself is unsafe, and the worst setting of each.
     members
         The models in which the box holds.
+    broken
+        Numbers of the parameter sets in which the specified limits themselves are unsafe, and the
+        worst setting of each.
+    room
+        Which characteristics could have room, shape (n,): those that vary and have no limit on both
+        sides.
+    searched
+        The models that the search of the box had to survive, then all others in which it was
+        tested.
+    failures_alone
+        Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
+    box
+        The limits as printed; None if none were found.
     proof, falsification
-        Of the box; of the promise without one.
+        Of the box.
     least
         The least that the falsification found [m]: over all fits, and with the study's own.
     between, between_left_out
@@ -60,32 +70,24 @@ class LimitsTogether(NamedTuple):
         By side and column, an unsafe setting just beyond the box; all its other values are in the
         box.
     corners
-        The least that the corners keep with each fit [m].
-    room
-        Which characteristics could have room, shape (n,): those that vary and have no limit on both
-        sides.
-    searched
-        The models that the search of the box had to survive, then all others in which it was
-        tested.
-    failures_alone
-        Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
+        The least that the corners keep with each parameter set [m].
     """
 
-    promise: Box
-    box: Box | None
-    broken: Mapping[int, FloatArray]
+    specified: Box
     members: tuple[Model, ...]
-    proof: Proof | None
-    falsification: Falsification | None
-    least: tuple[float, float]
-    between: int
-    between_left_out: int
-    boxes: int
-    beyond: Mapping[tuple[int, int], FloatArray]
-    corners: Mapping[int, float]
+    broken: Mapping[int, FloatArray]
     room: BoolArray
     searched: tuple[Model, ...]
     failures_alone: FloatArray
+    box: Box | None = None
+    proof: Proof | None = None
+    falsification: Falsification | None = None
+    least: tuple[float, float] = (np.nan, np.nan)
+    between: int = 0
+    between_left_out: int = 0
+    boxes: int = 0
+    beyond: Mapping[tuple[int, int], FloatArray] = {}
+    corners: Mapping[int, float] = {}
 
     @property
     def numbers(self) -> JsonObject:
@@ -105,29 +107,32 @@ class LimitsTogether(NamedTuple):
         }
 
 
-def broken_promises(promise: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
-    """The worst setting of a promise in each fit in which it is unsafe."""
+def broken_specification(specified: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
+    """The worst setting of specified limits in each parameter set in which they are unsafe."""
     seed = models[0].evaluator.study.search.seed
     settings = np.concatenate(
-        [promise.corners(seed, 0)[:MAX_CORNERS], promise.spread_and_corners(PROMISE_POINTS, seed)]
+        [
+            specified.corners(seed, 0)[:MAX_CORNERS],
+            specified.spread_and_corners(SPECIFICATION_POINTS, seed),
+        ]
     )
     settings = np.unique(settings, axis=0)
-    models = [model for model in models if not _keeps_its_margin(promise, model)]
+    models = [model for model in models if not _keeps_its_margin(specified, model)]
     judges = judges_of(models, "specified limits with each fit")
     # Every setting meets each model once.
     known = [settings] * len(models)
     total = len(models) * len(settings)
-    found = falsify(promise, judges, known, total, np.random.default_rng(seed))
+    found = falsify(specified, judges, known, total, np.random.default_rng(seed))
     return {models[judge].fit: rows[0] for judge, rows in found.failures.items()}
 
 
-def _keeps_its_margin(promise: Box, model: Model) -> bool:
-    """Whether a promise is the original vehicle, in a study whose encounters count where that keeps
-    a margin, and nothing but less than it would be unsafe: then no encounter that counts can break
-    it.
+def _keeps_its_margin(specified: Box, model: Model) -> bool:
+    """Whether specified limits are the original vehicle, in a study whose encounters count where
+    that keeps a margin, and nothing but less than it would be unsafe: then no encounter that counts
+    can break them.
     """
     members = model.evaluator.characteristics
-    is_original = (promise.lower == members.original) & (promise.upper == members.original)
+    is_original = (specified.lower == members.original) & (specified.upper == members.original)
     if not len(members.scenario) or not is_original[members.of_vehicle].all():
         return False
     return model.unsafe.is_collision and model.unsafe.keep <= model.evaluator.study.scenario.margin
@@ -156,67 +161,107 @@ def find_limits_together(
     is confirmed by further searches for counterexamples. After `MAX_BOXES` boxes or
     `MAX_SIMULATIONS` simulations the largest that passed is confirmed, or none is found.
     """
-    search, nothing = open_search(models, columns, limits, unsafe_settings)
+    search, nothing = _open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
         return nothing
-    start = start_of(search, columns, scans)
-    trials = Trials(nothing.members, enough(budget), models.own.evaluator)
-    settlement = Settlement(search)
-    passed: Trial | None = None
-    outer: Box | None = None  # the box from which failures are cut off
-    growths = MAX_GROWTHS
-    failed = 0  # boxes since one passed
+    boxes = _Boxes(search, _start_of(search, columns, scans), models.own.evaluator)
+    validator = Validator(nothing.members, enough(budget), models.own.evaluator)
     for number in range(1, MAX_BOXES + 1):
-        if outer is None or (growths == MAX_GROWTHS and number <= EXPLORED):
-            with trials.evaluator.stage(SEARCH_STAGE):
-                sides = search.best(start)
-            if sides is None:
-                break
-            outer = search.printed(sides)
-        box = settlement.cut(outer, failed)
-        # A box that is no larger than the one that passed ends the search, if further searches
-        # confirm that one.
-        is_over = (
-            number == MAX_BOXES
-            or sum(each.evaluator.simulated for each in nothing.members) > MAX_SIMULATIONS
-        )
-        is_last = passed is not None and (
-            is_over or volume(search, box) <= volume(search, passed.box)
-        )
-        trial = (
-            trials.confirmed(passed, number) if passed and is_last else trials.whole(box, number)
-        )
-        if _learn(search, trials, trial):
-            is_refuted = passed is not None and bool(
-                len(search.unsafe_inside(search.sides_of(passed.box)))
-            )
-            passed = None if is_refuted else passed
-            failed += 1
-            if is_over and passed is None:
+        box = boxes.next(number)
+        if box is None:
+            break
+        simulated = sum(model.evaluator.simulated for model in nothing.members)
+        is_over = number == MAX_BOXES or simulated > MAX_SIMULATIONS
+        # A box that is no larger than the one that passed ends the search, if further
+        # falsifications confirm that one.
+        passed = boxes.passed
+        is_last = passed is not None and (is_over or boxes.is_no_larger(box))
+        if passed and is_last:
+            validation = validator.confirm(passed, number)
+        else:
+            validation = validator.validate(box, number)
+        if validation.failures:
+            boxes.refuse(validation)
+            if is_over and boxes.passed is None:
                 break
         elif is_last:
-            return result(nothing, settlement, trial, number)
+            return _result(nothing, boxes.extension, validation, number)
         else:
-            passed = trial
-            outer = box
-            failed = 0
-            if growths and not is_over:
-                growths -= 1
-                with trials.evaluator.stage(SEARCH_STAGE):
-                    outer = settlement.of(box)
-    return without_box(nothing, search, number)
+            boxes.accept(validation, may_grow=not is_over)
+    searched = (*nothing.members, *search.models)
+    return nothing._replace(boxes=number, searched=searched, failures_alone=search.failures_alone)
 
 
-def volume(search: BoxSearch, box: Box) -> float:
-    """The logarithm of a box's volume, as a share of the domain's."""
-    return float(search.log_volume(search.sides_of(box)))
+class _Boxes:
+    """The boxes that are validated: at first the largest that a search finds, then each one without
+    the failures that were found in the one before, and from a box that passed on larger ones.
+
+    Attributes
+    ----------
+    passed
+        The validation of the largest box that passed.
+    """
+
+    def __init__(self, search: BoxSearch, start: FloatArray, evaluator: Evaluator) -> None:
+        self.search = search
+        self.extension = Extension(search)
+        self.passed: Validation | None = None
+        self._start = start
+        self._evaluator = evaluator
+        self._outer: Box | None = None
+        self._growths = MAX_GROWTHS
+        self._failed = 0
+        """The box from which failures are cut off; how often limits may still move out; number of
+        boxes since one passed.
+        """
+
+    def next(self, number: int) -> Box | None:
+        """The next box; None if no search finds one."""
+        is_explored = self._growths == MAX_GROWTHS and number <= EXPLORED
+        if self._outer is None or is_explored:
+            with self._evaluator.stage(SEARCH_STAGE):
+                sides = self.search.best(self._start)
+            if sides is None:
+                return None
+            self._outer = self.search.printed(sides)
+        return self.extension.cut(self._outer, self._failed)
+
+    def is_no_larger(self, box: Box) -> bool:
+        """Whether a box is no larger than the one that passed."""
+        assert self.passed is not None
+        search = self.search
+        sides = np.stack([search.sides_of(box), search.sides_of(self.passed.box)])
+        volumes = search.log_volume(sides)
+        return bool(volumes[0] <= volumes[1])
+
+    def refuse(self, validation: Validation) -> None:
+        """Take failures, and the models in which they are, into the search."""
+        search = self.search
+        with self._evaluator.stage(SEARCH_STAGE):
+            for failures in validation.failures:
+                search.join(failures.model)
+                search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+                search.learn(failures.settings, failures.model)
+        if self.passed and len(search.unsafe_inside(search.sides_of(self.passed.box))):
+            self.passed = None
+        self._failed += 1
+
+    def accept(self, validation: Validation, *, may_grow: bool) -> None:
+        """Take a box that passed; its limits move out as far as they can go."""
+        self.passed = validation
+        self._outer = validation.box
+        self._failed = 0
+        if self._growths and may_grow:
+            self._growths -= 1
+            with self._evaluator.stage(SEARCH_STAGE):
+                self._outer = self.extension.of(validation.box)
 
 
-def open_search(
+def _open_search(
     models: Models, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
 ) -> tuple[BoxSearch, LimitsTogether]:
-    """The search for a box, and the answer before it: the promise, and the fits in which it is
-    broken.
+    """The search for a box, and the answer before it: the specified limits, and the parameter sets
+    in which they are unsafe.
     """
     own = models.own._replace(
         evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0)
@@ -225,46 +270,15 @@ def open_search(
     # which it fails.
     first = own.at_worst_points(unsafe_settings, "worst points") if len(unsafe_settings) else own
     search = BoxSearch(first, columns, limits, unsafe_settings)
-    promise = search.printed(search.fixed)
-    broken = broken_promises(promise, models.members)
+    specified = search.printed(search.fixed)
+    broken = broken_specification(specified, models.members)
     members = tuple(model for model in (own, *models.members[1:]) if model.fit not in broken)
-    nothing = LimitsTogether(
-        promise,
-        None,
-        broken,
-        members,
-        None,
-        None,
-        (np.nan, np.nan),
-        0,
-        0,
-        0,
-        {},
-        {},
-        np.asarray(search.is_free.any(axis=0)),
-        members,
-        search.failures_alone,
-    )
+    room = np.asarray(search.is_free.any(axis=0))
+    nothing = LimitsTogether(specified, members, broken, room, members, search.failures_alone)
     return search, nothing
 
 
-def without_box(nothing: LimitsTogether, search: BoxSearch, boxes: int) -> LimitsTogether:
-    """No limits together, and what the search met."""
-    searched = (*nothing.members, *search.models)
-    return nothing._replace(boxes=boxes, searched=searched, failures_alone=search.failures_alone)
-
-
-def _learn(search: BoxSearch, trials: Trials, trial: Trial) -> bool:
-    """Take failures, and the models in which they are, into a search; whether there are any."""
-    with trials.evaluator.stage(SEARCH_STAGE):
-        for failures in trial.failures:
-            search.join(failures.model)
-            search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
-            search.learn(failures.settings, failures.model)
-    return bool(trial.failures)
-
-
-def start_of(
+def _start_of(
     search: BoxSearch, columns: Sequence[int], scans: Sequence[OneAtATimeScan]
 ) -> FloatArray:
     """The box of what is safe alone; its corner where every characteristic has gone towards its
@@ -272,9 +286,8 @@ def start_of(
     """
     start = search.longest.copy()
     corner = np.zeros(len(search.original))
-    for column, scan in zip(
-        columns, scans, strict=False
-    ):  # parameters of the scenario, which come last, have no scan
+    # Parameters of the scenario, which come last, have no scan.
+    for column, scan in zip(columns, scans, strict=False):
         original = search.original[column]
         low, high = scan.safe or (original, original)
         safe_alone = np.minimum(start[:, column], (original - low, high - original))
@@ -287,46 +300,47 @@ def start_of(
     return start
 
 
-def result(
-    nothing: LimitsTogether, settlement: Settlement, trial: Trial, number: int
+def _result(
+    nothing: LimitsTogether, extension: Extension, validation: Validation, number: int
 ) -> LimitsTogether:
-    """The limits together from a box that passed its trial; a box that leaves no characteristic any
-    room is none.
+    """The joint limits from a box that passed its validation; a box that leaves no characteristic
+    any room is none.
     """
-    search = settlement.search
-    box = trial.box
+    search = extension.search
+    box = validation.box
     least = [np.nan, np.nan]
-    if trial.falsification is not None:
-        judges = [trial.judges[judge] for judge in trial.falsification.judges]
+    if validation.falsification is not None:
+        found = validation.falsification
+        models = [validation.models[judge] for judge in found.judges]
         values = [
-            model.unsafe.value(left)
-            for model, left in zip(judges, trial.falsification.left.tolist(), strict=True)
+            model.unsafe.value(robustness)
+            for model, robustness in zip(models, found.robustness.tolist(), strict=True)
         ]
-        of_own = [value for value, model in zip(values, judges, strict=True) if model.fit == 0]
+        of_own = [value for value, model in zip(values, models, strict=True) if model.fit == 0]
         worst = nothing.members[0].unsafe.worst
         least = [worst(values, default=np.nan), worst(of_own, default=np.nan)]
     points = [
         len(model.evaluator.study.matrix.tests)
-        for model in trial.judges[:1]
+        for model in validation.models[:1]
         if model.evaluator.study.matrix
     ]
     own_tests = nothing.members[0].evaluator.study.matrix
     return nothing._replace(
-        box=box if has_room(search, box) else None,
-        proof=trial.proof,
-        falsification=trial.falsification,
+        box=box if _has_room(search, box) else None,
+        proof=validation.proof,
+        falsification=validation.falsification,
         least=(least[0], least[1]),
         between=sum(points) - (len(own_tests.tests) if own_tests else 0),
-        between_left_out=trial.left_out,
+        between_left_out=validation.left_out,
         boxes=number,
-        beyond=settlement.beyond(box),
-        corners=trial.corners,
-        searched=(*nothing.members, *search.models, *trial.judges),
+        beyond=extension.beyond(box),
+        corners=validation.corners,
+        searched=(*nothing.members, *search.models, *validation.models),
         failures_alone=search.failures_alone,
     )
 
 
-def has_room(search: BoxSearch, box: Box) -> bool:
+def _has_room(search: BoxSearch, box: Box) -> bool:
     """Whether a box leaves any characteristic room, if one may vary."""
     is_open = search.is_free & search.characteristics.of_vehicle
     return not is_open.any() or bool((search.sides_of(box)[is_open] > 0).any())

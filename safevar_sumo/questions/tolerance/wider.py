@@ -77,7 +77,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     models = models_of(other, unsafe, asked.fits)
     if together.box is None and not asked.limits:
         return []
-    box = _box_in(models, evaluator, together.promise if together.box is None else together.box)
+    box = _box_in(models, evaluator, together.specified if together.box is None else together.box)
     seed = study.search.seed
     with other.stage(WIDER_STAGE, budget):
         judges = judges_of(models.members, WIDER_STAGE)
@@ -119,11 +119,11 @@ def _verdict(
     """What the falsification found, in words: the failure at the lowest speed, then the worst; and
     the former.
     """
-    if not len(found.left):
+    if not len(found.robustness):
         return f"none of {found.simulated:,} simulations met an encounter that counts.", None
     model = models.members[int(found.judges[0])]
     if not found.failures:
-        keeps = model.unsafe.value_in_words(model.unsafe.value(found.left[0]))
+        keeps = model.unsafe.value_in_words(model.unsafe.value(found.robustness[0]))
         return f"they hold: the worst of {found.simulated:,} aimed at them {keeps}.", None
     described = [
         failure

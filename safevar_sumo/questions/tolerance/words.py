@@ -155,16 +155,17 @@ def _box_in_words(
         f"{decision} {where}: within them no vehicle that was tried"
         f" {failure_in_words(unsafe, count)}."
     )
-    yield f"Tried: {trial_in_words(together, budget)}."
+    yield f"Tried: {validation_in_words(together, budget)}."
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
 
 
-def trial_in_words(together: LimitsTogether, budget: int) -> str:
+def validation_in_words(together: LimitsTogether, budget: int) -> str:
     """What limits together were tested with: corners, an attack, vehicles drawn at random."""
     searched = len(together.members[0].evaluator.characteristics.scenario) > 0
     met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
-    return f"all corners{met}; {_attack_in_words(together, budget)}; {_proof_in_words(together)}"
+    falsification = _falsification_in_words(together, budget)
+    return f"all corners{met}; {falsification}; {_proof_in_words(together)}"
 
 
 def failure_in_words(unsafe: Unsafe, fits: int) -> str:
@@ -182,7 +183,7 @@ def failure_in_words(unsafe: Unsafe, fits: int) -> str:
     return f"keeps less than {unsafe.keep:.3g} m{between}{others}"
 
 
-def _attack_in_words(together: LimitsTogether, budget: int) -> str:
+def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
     """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67
     m)`.
     """

@@ -34,7 +34,7 @@ KNOWN_CORNERS = 32
 """Number of corners with which that attack begins."""
 
 
-class Settlement:
+class Extension:
     """Moves limits as far as they can go, one at a time, and in where something failed."""
 
     def __init__(self, search: BoxSearch) -> None:
@@ -59,13 +59,13 @@ class Settlement:
         """
         moved = None
         for stride in STRIDES:
-            wider = self.trial(box, step, stride)
+            wider = self.validation(box, step, stride)
             if wider is None or self._is_blocked(box, wider, step):
                 break
             moved = wider
         return moved
 
-    def trial(self, box: Box, step: Step, stride: int = 1) -> Box | None:
+    def validation(self, box: Box, step: Step, stride: int = 1) -> Box | None:
         """The box with one limit moved out by some moves, rounded; None at the end of the
         domain.
         """
@@ -143,8 +143,8 @@ class Settlement:
             ends = np.maximum(failures[0] - clearance * LEAST_MOVE * search.width, 0.0)
             is_choice = search.is_free & (failures[0] > 0)
             lengths = sides.sum(axis=0)
-            left = np.maximum(lengths - sides + ends, 1e-9 * search.width + 1e-300)
-            kept = np.where(is_choice, left / np.maximum(lengths, 1e-300), -np.inf)
+            robustness = np.maximum(lengths - sides + ends, 1e-9 * search.width + 1e-300)
+            kept = np.where(is_choice, robustness / np.maximum(lengths, 1e-300), -np.inf)
             place = np.unravel_index(np.argmax(kept), kept.shape)
             sides[place] = ends[place]
             failures = failures[(failures <= sides).all(axis=(1, 2))]
@@ -154,7 +154,7 @@ class Settlement:
         """For each limit that could move out further, a known failure that it then meets."""
         beyond = dict[tuple[int, int], FloatArray]()
         for side, column in np.argwhere(self.search.domain > 0).tolist():
-            wider = self.trial(box, (side, column))
+            wider = self.validation(box, (side, column))
             if wider is not None:
                 for setting in self.search.unsafe_inside(self.search.sides_of(wider))[:1]:
                     beyond[side, column] = setting

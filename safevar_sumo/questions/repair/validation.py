@@ -37,7 +37,7 @@ def find_failures(
     own = problems[0]
     # These numbers are of no `Stream`: repairs depend on them.
     rng = np.random.default_rng((own.study.search.seed, number))
-    judges = [partial(problem.left, change, stage=ATTACK_STAGE) for problem in problems]
+    judges = [partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
     with own.evaluator.stage(ATTACK_STAGE, BUDGET):
         found = falsify(own.promise, judges, starts, BUDGET, rng)
@@ -57,8 +57,10 @@ def prove_change(
     seed = problems[0].study.search.seed
 
     def judge(settings: FloatArray) -> Judgement:
-        left = own.left(change, settings, PROOF_STAGE)
-        return Judgement(left < 0, np.zeros(len(left), dtype=bool), np.isfinite(left))
+        robustness = own.robustness(change, settings, PROOF_STAGE)
+        return Judgement(
+            robustness < 0, np.zeros(len(robustness), dtype=bool), np.isfinite(robustness)
+        )
 
     rng = Stream.REPAIRED_BOUND.generator(seed, number)
     size = proof_size(attempt, MAX_UNSAFE_SHARE)
@@ -71,7 +73,7 @@ def prove_change(
         fits = rng.integers(1, len(problems), size=len(settings))
         for row in range(1, len(problems)):
             of_fit = settings[fits == row]
-            is_unsafe = problems[row].left(change, of_fit, PROOF_STAGE) < 0
+            is_unsafe = problems[row].robustness(change, of_fit, PROOF_STAGE) < 0
             if is_unsafe.any():
                 failures[row] = of_fit[is_unsafe]
     return proof, failures
