@@ -33,7 +33,8 @@ from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.evaluation import Task, evaluate_batch, evaluate_settings
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES, simulate
 from safevar_sumo.sumo.network import stage_network
 from safevar_sumo.sumo.system import assemble
@@ -202,7 +203,7 @@ def main() -> None:
     )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    study = load_study(arguments.study)
+    study = read_study(arguments.study)
     search = msgspec.structs.replace(
         study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations
     )

@@ -31,7 +31,7 @@ from measuring import Record, clock_seconds, medians_in_turn, print_records, pro
 from safevar_sumo.ads import PerVehicleAds, ScalarAds
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import FloatArray, Observation
-from safevar_sumo.study import load_study
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.sumo.batch import observer_of
 from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.engine import open_world, sumo_options
@@ -129,7 +129,7 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
 
 def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
     """Measure a study's evaluations."""
-    system = assemble(load_study(study))
+    system = assemble(read_study(study))
     network = stage_network(system.points[0].scenario)
     for n in populations:
         settings = settings_of(system, n)

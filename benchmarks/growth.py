@@ -17,7 +17,8 @@ from measuring import Record, print_records
 
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.pool import open_pool
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES
 
 FIRST = 5000
@@ -58,5 +59,5 @@ if __name__ == "__main__":
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     print_records(
-        records_of(load_study(arguments.study), arguments.evaluations), as_json=arguments.json
+        records_of(read_study(arguments.study), arguments.evaluations), as_json=arguments.json
     )

@@ -33,7 +33,8 @@ from safevar_sumo.questions.model_spread import (
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.reference.agreement import defined_pairs, measure_agreement, rank_correlation
 from safevar_sumo.reference.rows import ReferenceData, read_reference
-from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -386,7 +387,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--from-scratch", action="store_true", help="begin at a random place")
     given = parser.parse_args(arguments)
     plan = msgspec.toml.decode(given.plan.read_bytes(), type=Plan)
-    studies = {name: load_study(name) for name in plan.studies}
+    studies = {name: read_study(name) for name in plan.studies}
     rows = {
         name: {
             file: read_reference(given.folder / file, CharacteristicSet.of(studies[name]))

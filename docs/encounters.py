@@ -16,7 +16,7 @@ import numpy as np
 
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.study import load_study
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 
@@ -39,7 +39,7 @@ LINES, PARTS, ENCOUNTERS_ON_LINES = 30, 25, 16
 
 def _up_to(fastest: float) -> System:
     """The study wear_joint up to a speed [km/h]."""
-    return assemble(load_study("wear_joint", scenario={"search": {"speed": {"upper": fastest}}}))
+    return assemble(read_study("wear_joint", scenario={"search": {"speed": {"upper": fastest}}}))
 
 
 def main(path: str) -> None:
@@ -79,7 +79,7 @@ def count_between(fastest: float) -> None:
     """Print how many vehicles are safe at all points of wear, and how many of these collide in
     encounters up to a speed [km/h].
     """
-    grid, joint = assemble(load_study("wear")), _up_to(fastest)
+    grid, joint = assemble(read_study("wear")), _up_to(fastest)
     members, of_vehicle, rng = (
         grid.characteristics,
         joint.characteristics.of_vehicle,
@@ -104,7 +104,7 @@ def compare_lines(fastest: float) -> None:
     """Print on how many lines from the original to worn cars the first collision is earlier in
     wear_joint than in wear, and on how many later.
     """
-    grid, joint = assemble(load_study("wear")), _up_to(fastest)
+    grid, joint = assemble(read_study("wear")), _up_to(fastest)
     members, of_vehicle, rng = (
         grid.characteristics,
         joint.characteristics.of_vehicle,

@@ -19,8 +19,9 @@ from safevar_sumo import openscenario
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study, load_study, study_names
+from safevar_sumo.study import Study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
 PLAIN = {
@@ -201,7 +202,7 @@ def readme() -> str:
 def characteristics() -> str:
     """Every characteristic of the shipped vehicles, by the first study that has it."""
     seen = dict[tuple[str, str], tuple[str, ...]]()
-    for study in map(load_study, study_names()):
+    for study in map(read_study, study_names()):
         for key, row in study.vehicle.characteristics.items():
             model = study.vehicle.model
             seen.setdefault(

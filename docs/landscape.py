@@ -22,8 +22,9 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, read_reference
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import Nsga2, Problem
-from safevar_sumo.study import SAFETY_DEGREE, load_study
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import CharacteristicSet
 
 TREES, POPULATION = 300, 50
@@ -76,7 +77,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=6)
     parser.add_argument("--evaluations", type=int, default=5000)
     arguments = parser.parse_args()
-    study = load_study(arguments.study)
+    study = read_study(arguments.study)
     characteristics = CharacteristicSet.of(study)
     files = [
         evaluations_of(read_reference(path, characteristics), characteristics)

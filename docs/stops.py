@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import load_study
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles.wet_road import WET_FRICTION
@@ -38,7 +38,7 @@ def stops(speed: float, water: float, grip: float) -> FloatArray:
     weather = {"name": "road", "road_friction": friction, "visibility": 1.0, "water": water}
     tables = {"extends": "stop", "name": "picture", "weather": weather}
     matrix = {"tests": [{"name": "stop", "over": {"speed": [speed]}}]}
-    study = load_study(
+    study = read_study(
         {**tables, "matrix": matrix, "vehicle": {"parameters": {"brake_force": 4e4}}}
     )
     system = assemble(study)

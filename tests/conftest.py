@@ -13,6 +13,7 @@ from typing import Any
 import hypothesis
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, function_of
 from safevar_sumo.plugins import ImportPath
@@ -21,7 +22,7 @@ from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
-from safevar_sumo.study import load_study, study_names
+from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched
 

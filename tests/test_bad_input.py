@@ -12,9 +12,10 @@ import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused
 

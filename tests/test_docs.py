@@ -21,13 +21,14 @@ from click.testing import CliRunner
 from PIL import Image
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import commands
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import (
     KEYS_WITHOUT_EFFECT_ON_EVALUATIONS,
     KEYS_WITHOUT_EFFECT_ON_RESULTS,
 )
-from safevar_sumo.study import DESCRIPTION_KEYS, load_study, study_names
+from safevar_sumo.study import DESCRIPTION_KEYS, study_names
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import ROOT, blocks
 

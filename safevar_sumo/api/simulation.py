@@ -28,7 +28,8 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import Point, distance_in_words
-from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike, load_study as read_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.engine import Engine

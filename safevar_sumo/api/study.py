@@ -42,7 +42,8 @@ from safevar_sumo.questions.words import (
 )
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
-from safevar_sumo.study import SAFETY_DEGREE, Study, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.sumo import assemble, evaluate, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
@@ -140,7 +141,7 @@ def study(
     status
         Show the progress of the study in its directory, without disturbing it.
     """
-    as_written = load_study(study)
+    as_written = read_study(study)
     directory = out or Path("results") / as_written.name
     if unsafe is not None and (status or dry_run):
         raise InputError(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,9 +31,7 @@ from safevar_sumo.openscenario.places import (
     way_of,
     way_through,
 )
-
-if TYPE_CHECKING:
-    from safevar_sumo.openscenario.storyboard import Player
+from safevar_sumo.openscenario.player import Player
 
 IGNORED = (
     "ActivateControllerAction",

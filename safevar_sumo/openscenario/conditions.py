@@ -7,7 +7,6 @@ The names are those of the classes in the class reference of ASAM OpenSCENARIO X
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,7 @@ from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
 from safevar_sumo.openscenario.places import Way
-
-if TYPE_CHECKING:
-    from safevar_sumo.openscenario.storyboard import Player
+from safevar_sumo.openscenario.player import Player
 
 REACTIONS = (
     "CollisionCondition",

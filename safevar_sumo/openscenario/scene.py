@@ -13,7 +13,7 @@ from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
 from safevar_sumo.openscenario.conditions import bodies_apart
 from safevar_sumo.openscenario.document import is_number, read, unsupported, violated, whole
 from safevar_sumo.openscenario.road import Pose
-from safevar_sumo.openscenario.storyboard import Player
+from safevar_sumo.openscenario.storyboard import Storyboard
 
 
 class Moved(NamedTuple):
@@ -106,7 +106,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
         raise unsupported(
             f"the file's constraints exclude {', '.join(problems)}", "values that they allow"
         )
-    player = Player(document, ego)
+    player = Storyboard(document, ego)
     player.play()
     own = player.ego
     samples = slice(0, player.sample + 1)
@@ -133,7 +133,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     )
 
 
-def _why_uneventful(player: Player) -> str:
+def _why_uneventful(player: Storyboard) -> str:
     """Why nothing happens to an Ego that holds its speed; "" if something does.
 
     Ego meets a body that it reaches, unless the body left Ego's lane long before, and one that it
@@ -189,7 +189,7 @@ def _moved(actor: Actor, samples: slice) -> Moved:
     )
 
 
-def _remark(player: Player) -> None:
+def _remark(player: Storyboard) -> None:
     """What the user should know of what was not played, and how what was played was understood."""
     root = player.document.root
     if root.find("Entities/ScenarioObject/ObjectController") is not None:

@@ -10,9 +10,9 @@ from itertools import chain
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
-from safevar_sumo.openscenario.actors import STEP, Actor, Array, Running, actors_of
+from safevar_sumo.openscenario.actors import STEP, Actor, Running
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import (
     Document,
@@ -23,8 +23,8 @@ from safevar_sumo.openscenario.document import (
     truth,
     unsupported,
 )
-from safevar_sumo.openscenario.places import Place, Way, place_of, turn_of
-from safevar_sumo.openscenario.road import read_network
+from safevar_sumo.openscenario.places import Way
+from safevar_sumo.openscenario.player import Key, Player
 
 LONGEST = 600.0
 """Time up to which the StopTrigger of a file must hold [s]."""
@@ -36,14 +36,6 @@ TIMES = np.round(np.arange(round((LONGEST + AFTER) / STEP) + 1) * STEP, 9)
 """Times of the samples of the longest scene [s]."""
 BLOCK = 1000
 """Samples that are played at once at most."""
-MAX_TURN = 0.01
-"""Largest turn of an Ego that drives straight on [degrees]."""
-
-
-Key = tuple[str, str]
-"""An element in conditions on states: its kind, and its name after those of all around it, joined
-by `::`.
-"""
 
 
 @dataclass
@@ -97,37 +89,14 @@ def _stop_trigger(element: Element) -> Element | None:
     return stop if stop is not None and len(stop) else None
 
 
-class Player:
+class Storyboard(Player):
     """A storyboard being played; see `play`."""
 
     def __init__(self, document: Document, ego: str) -> None:
-        self.document = document
-        self.network = read_network(document.road)
-        self.times = TIMES
-        actors = {actor.name: actor for actor in actors_of(document.root, len(self.times))}
-        if ego not in actors:
-            raise unsupported(
-                f"no ScenarioObject is named {ego!r}; there are: {', '.join(actors)}",
-                f"ego = {one_of(actors)}",
-            )
-        self.actors = actors
-        self.ego = actors[ego]
-        self.sample = 0
-        self.variables = {
-            attribute(each, "name"): attribute(each, "value")
-            for each in document.root.findall("VariableDeclarations/VariableDeclaration")
-        }
-        self.begun: dict[Key, float] = {}
-        self.ended: dict[Key, float] = {}
-        self.dependences: dict[str, float] = {}
-        self.remarks: dict[str, None] = {}
-        self.ignored: set[str] = set()
-        self.has_begun = False
-        """Whether Init is over."""
+        super().__init__(document, ego, TIMES)
         self._changes = 0
         """How many events have begun or ended."""
         self.stop = math.inf
-        self.seen: dict[int, tuple[int, Array]] = {}
         self._board = part(document.root, "Storyboard")
         self._refuse_states_of_nothing()
         self.acts = [
@@ -135,54 +104,6 @@ class Player:
             for story in self._board.findall("Story")
             for each in story.findall("Act")
         ]
-
-    # What actions and conditions ask
-
-    @property
-    def now(self) -> float:
-        """The time [s]."""
-        return float(self.times[self.sample])
-
-    def actor(self, name: str) -> Actor:
-        """The entity of this name."""
-        if name not in self.actors:
-            raise unsupported(
-                f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}"
-            )
-        return self.actors[name]
-
-    def other(self, element: Element) -> Actor:
-        """The entity that an element refers to."""
-        return self.actor(attribute(element, "entityRef"))
-
-    def place_of(self, name: str) -> Place:
-        """The place of an entity now."""
-        return self.actor(name).here
-
-    def place(self, position: Element) -> Place:
-        """The place that the child of a Position names."""
-        return place_of(position, self.network, self.place_of)
-
-    def depends(self, other: Actor, until: float, what: str) -> None:
-        """Note what depends on Ego, and until when [s]."""
-        if other is self.ego and (self.sample or until > self.now):
-            self.dependences[what] = max(until, self.dependences.get(what, 0.0))
-
-    def ego_turns(self, facings: Array) -> None:
-        """Refuse directions of Ego that differ from the one at the start."""
-        turn = max(
-            turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings)
-        )
-        if turn > MAX_TURN:
-            raise unsupported(
-                f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees"
-            )
-
-    def remark(self, text: str) -> None:
-        """Note a remark, once."""
-        self.remarks[text] = None
-
-    # The storyboard
 
     def _act(self, element: Element, story: Key) -> Act:
         act_key = _below(story, element)

@@ -26,8 +26,9 @@ from safevar_sumo.scenarios import (
     WorldScenario,
     equals_clear,
 )
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import DESCRIPTIONS
-from safevar_sumo.study import free_parameters, load_study, study_names, unit_text
+from safevar_sumo.study import free_parameters, study_names, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 NAME: Columns = {"name": "name in a study"}
@@ -120,7 +121,7 @@ def list_models(kind: str | None = None) -> Answer:
 
 
 def _studies() -> Iterator[tuple[str, ...]]:
-    for study in map(load_study, study_names()):
+    for study in map(read_study, study_names()):
         weather = study.weather if isinstance(study.weather, str) else study.weather.name
         yield (
             study.name,
@@ -133,7 +134,7 @@ def _studies() -> Iterator[tuple[str, ...]]:
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
-    studies = {study.vehicle.model: study for study in reversed([*map(load_study, study_names())])}
+    studies = {study.vehicle.model: study for study in reversed([*map(read_study, study_names())])}
     for vehicle, study in sorted(studies.items()):
         for row in CharacteristicSet.of(study).vehicle:
             yield vehicle, *(getattr(row, name) for name in list(VEHICLES)[1:])

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
-from safevar_sumo.study import Study, StudyLike, load_study, study_names
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import Study, StudyLike, study_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -152,7 +153,7 @@ def study_or_case(
             "a study is simulated as it is now anyway",
             "results, which keep the study that they had",
         )
-    return load_study(source)
+    return read_study(source)
 
 
 def study_in(subject: Study | Case) -> Study:

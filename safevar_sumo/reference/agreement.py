@@ -22,7 +22,8 @@ from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.results import evaluation_keys
-from safevar_sumo.study import SAFETY_DEGREE, Study, load_study, study_names, tables_of
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import SAFETY_DEGREE, Study, study_names, tables_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -150,7 +151,7 @@ def shipped_agreement(study: Study) -> pd.DataFrame:
     """
     frame = pd.read_csv(SHIPPED_AGREEMENT)
     keys = {
-        name: evaluation_keys(tables_of(load_study(name)))
+        name: evaluation_keys(tables_of(read_study(name)))
         for name in frame["study"].unique()
         if name in study_names()
     }

@@ -20,7 +20,8 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN, write_imported
-from safevar_sumo.study import SAFETY_DEGREE, StudyLike, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import SAFETY_DEGREE, StudyLike
 from safevar_sumo.vehicles import CharacteristicSet
 
 COLUMNS = {SAFETY_DEGREE: "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
@@ -223,7 +224,7 @@ def import_published(
         If the study or a file cannot be used, no file is given, or the original vehicle's safety
         degree is unknown.
     """
-    loaded_study = load_study(study)
+    loaded_study = read_study(study)
     directory = Path(out)
     given = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}

@@ -10,10 +10,11 @@ from safevar_sumo.study.characteristics import (
 )
 from safevar_sumo.study.file import (
     SCHEMA_LINE as SCHEMA_LINE,
+    checked_study as checked_study,
     data_files as data_files,
     fmus_of as fmus_of,
-    load_study as load_study,
     plain_values as plain_values,
+    read_tables as read_tables,
     study_names as study_names,
     user_code as user_code,
     user_code_names as user_code_names,

@@ -7,17 +7,16 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import tomli_w
 
-from safevar_sumo.errors import InputError, about, did_you_mean, one_of, warn
+from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study.characteristics import Domain
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
@@ -44,9 +43,9 @@ SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
 
 
-class _RawStudy(NamedTuple):
-    """Unchecked tables of a study, their origin, and remarks for the user on what they do not
-    inherit.
+class StudyTables(NamedTuple):
+    """The tables of a study before they are checked, with its source in errors, its origin, and
+    remarks for the user on what they do not inherit.
     """
 
     source: object
@@ -78,18 +77,19 @@ def study_path(study: str) -> Path:
     raise InputError("study", f"{problem}{did_you_mean(study, names)}", legal)
 
 
-def load_study(study: StudyLike, **changes: Any) -> Study:
-    """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its
-    shipped models.
+def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
+    """The tables of a study, with the studies that it extends and the scenario's file, in the shape
+    of the records; `safevar_sumo.scenarios.declared.read_study` completes and checks them.
     """
     raw = _raw_study(study)
     if changes:
         raw = _with_overrides(raw, plain_values(changes), raw.source)
     with about(raw.source):
-        loaded_study = _converted(raw)
-    for remark in raw.remarks:
-        warn(remark)
-    return loaded_study
+        if "origin" in raw.tables:
+            raise InputError("", "origin: there is no such key")
+        tables = with_file(raw.tables, raw.origin.places)
+        tables = _with_parameters(tables, "search", SearchTable)
+        return raw._replace(tables=_with_parameters(tables, "repair", RepairTable))
 
 
 def plain_values(value: Any) -> Any:
@@ -106,28 +106,24 @@ def plain_values(value: Any) -> Any:
     return plain_values(value.tolist()) if hasattr(value, "tolist") else value
 
 
-def _raw_study(study: StudyLike) -> _RawStudy:
+def _raw_study(study: StudyLike) -> StudyTables:
     if isinstance(study, Study):
-        return _RawStudy(study.source, tables_of(study), study.origin)
+        return StudyTables(study.source, tables_of(study), study.origin)
     if isinstance(study, Mapping):
-        return _with_base(_RawStudy("study", plain_values(study)), Path("."), ())
+        return _with_base(StudyTables("study", plain_values(study)), Path("."), ())
     return _read_file(study_path(str(study)), visited_paths=())
 
 
-def _converted(raw: _RawStudy) -> Study:
-    if "origin" in raw.tables:
-        raise InputError("", "origin: there is no such key")
-    tables = with_file(raw.tables, raw.origin.places)
-    tables = _with_parameters(
-        _with_parameters(tables, "search", SearchTable), "repair", RepairTable
-    )
+def checked_study(raw: StudyTables) -> Study:
+    """The study of complete tables; the error of a mistake does not name its source."""
+    tables = dict(raw.tables)
     matrix = tables.get("matrix")
     vehicle = tables.get("vehicle")
     if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
-    study = convert_table(_with_declared(tables, raw.origin.places), Study)
+    study = convert_table(tables, Study)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
         raise InputError(
             "", "rating.claims: the study is not rated", "matrix.protocol, or no claims"
@@ -135,26 +131,6 @@ def _converted(raw: _RawStudy) -> Study:
     for name in study.spread:
         locate_parameter(msgspec.to_builtins(study), name)
     return msgspec.structs.replace(study, origin=raw.origin)
-
-
-def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
-    """The tables of a study, with what the scenario's class declares of parameters that the study
-    searches.
-    """
-    scenario = tables.get("scenario")
-    search = scenario.get("search") if isinstance(scenario, dict) else None
-    if not isinstance(scenario, dict) or not isinstance(search, dict):
-        return tables
-    needed = {field.name for field in msgspec.structs.fields(Domain) if field.required}
-    domains = dict(search)
-    for name, domain in search.items():
-        if isinstance(domain, dict) and needed - domain.keys():
-            from safevar_sumo.scenarios.declared import (
-                with_declared,
-            )  # the one import upwards: classes declare ranges
-
-            domains[name] = with_declared(domain, name, tables, places)
-    return {**tables, "scenario": {**scenario, "search": domains}}
 
 
 def _without_characteristics(model: object) -> InputError:
@@ -196,7 +172,7 @@ def _with_parameters(
     return {**tables, name: {**other_keys, "parameters": parameters}} if inner_tables else tables
 
 
-def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
+def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table
     by table.
     """
@@ -213,10 +189,10 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
         places=folders,
         files=(os.path.abspath(path),) if folders else (),
     )
-    return _with_base(_RawStudy(path, tables, origin), path, visited_paths)
+    return _with_base(StudyTables(path, tables, origin), path, visited_paths)
 
 
-def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _RawStudy:
+def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     """The tables of `raw`, over those of the study that it extends, if any; with the folders of
     both.
     """
@@ -249,7 +225,7 @@ def _with_base(raw: _RawStudy, path: Path, visited_paths: tuple[Path, ...]) -> _
     )
 
 
-def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawStudy:
+def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> StudyTables:
     """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none
     its wider study.
     """
@@ -292,7 +268,7 @@ def _with_overrides(base: _RawStudy, overrides: Tables, source: object) -> _RawS
             of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
             text = f"{source}: has a different {differences} {of_base}"
             remarks = (*remarks, text)
-    return _RawStudy(source, tables, base.origin, remarks)
+    return StudyTables(source, tables, base.origin, remarks)
 
 
 def _names_scenario(table: object, base_table: object) -> bool:

@@ -19,6 +19,7 @@ from safevar_sumo.ads import ADS, Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.published import Apollo, WorldOnRails
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import (
@@ -30,7 +31,7 @@ from safevar_sumo.records import (
     SimulationRuns,
 )
 from safevar_sumo.scenarios import Along, CarToCar
-from safevar_sumo.study import ModelTable, load_study, study_names
+from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import seen
 from tests.scenarios.holding import CARLA, Hold, driven

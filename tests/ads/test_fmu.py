@@ -16,9 +16,9 @@ import pytest
 from pythonfmu.builder import FmuBuilder
 from pythonfmu3.builder import FmuBuilder as FmuBuilder3
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Nominal, Observation
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 

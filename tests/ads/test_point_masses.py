@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads.reference_drivers import FuzzySafety, Rss
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn
 from safevar_sumo.scenarios.tracks import VUT_WIDTH
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.scenarios.ideal import Mass, agreement, ideal, met_at_once, point_mass
 

@@ -14,9 +14,9 @@ import pytest
 from safevar_sumo.ads.car_following import Acc, Idm
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reference_drivers import R157, FullBraking, FuzzySafety, Rss
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import FloatArray, Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.network import CopiedNetwork

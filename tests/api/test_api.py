@@ -14,7 +14,8 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.study import load_study, tables_of
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.study import tables_of
 from safevar_sumo.sumo.matrix import at_point, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, questions, run_campaign
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.share import carry_share
@@ -19,7 +20,7 @@ from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
 from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
@@ -26,7 +27,7 @@ from safevar_sumo.errors import SafevarError
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
 from tests.in_process import InlinePool, searched
 from tests.made_up import made_up_evaluations

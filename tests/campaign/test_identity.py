@@ -15,13 +15,14 @@ import portalocker
 import pytest
 
 from safevar_sumo import output
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import load_runs, manifest, read_manifest
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from tests.campaign import formulas
 from tests.campaign.formulas import FormulaPool

@@ -16,6 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.evaluation import (
     Task,
@@ -32,7 +33,7 @@ from safevar_sumo.errors import (
     UserCodeError,
 )
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.study import ModelTable, Origin, Study, load_study
+from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress

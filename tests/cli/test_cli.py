@@ -20,11 +20,12 @@ import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, function_of, main
 from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, refused, run

@@ -16,7 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from safevar_sumo.study import load_study
+from safevar_sumo.api.simulation import load_study
 from tests.in_process import run, searched
 
 STUDY = """

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.reference.rows import package_filter
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet

@@ -16,10 +16,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import searched
 

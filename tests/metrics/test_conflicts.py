@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import OPTIONAL_METRICS, time_to_collision
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from tests.scenarios.ideal import met_at_once

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios import OpenScenario, TrackScenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.tracks import BODIES, PERSONS, VUT_LENGTH, VUT_WIDTH
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.openscenario.writing import (
     AT_ONCE,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import simulate_with_original
+from safevar_sumo.api.simulation import load_study, simulate_with_original
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.replay.export import write_files
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import play
 from safevar_sumo.scenarios import OpenScenario
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import MAX_VEHICLES, evaluate, largest_batch
 from safevar_sumo.sumo.system import assemble

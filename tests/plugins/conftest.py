@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.study import load_study
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.sumo.system import System, assemble
 
 Mine = Callable[..., System]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import algorithm_of
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from tests.in_process import refused, run
 from tests.made_up import original_of

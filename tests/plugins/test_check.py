@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.plugins.check import check, study_to_check
-from safevar_sumo.study import load_study
 from tests.in_process import files_of, json_of, run
 
 SCALAR = """import random

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import differences
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import original_of

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import Command, differences
 from safevar_sumo.results import load_runs
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle

@@ -16,6 +16,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, time_to_collision
 from safevar_sumo.protocol.cells import MODELS
@@ -23,7 +24,7 @@ from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import Study, free_parameters, load_study
+from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES

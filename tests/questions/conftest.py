@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.questions import Batches
@@ -21,7 +22,7 @@ from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.study import CharacteristicTable, Limit, Study, load_study
+from safevar_sumo.study import CharacteristicTable, Limit, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool

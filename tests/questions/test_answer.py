@@ -18,11 +18,11 @@ import pytest
 from click.testing import CliRunner
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
 from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.words import list_of_changes
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, files_of, refused, run
 

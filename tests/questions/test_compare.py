@@ -13,9 +13,9 @@ import scipy
 import tomli_w
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.research_questions.statistics import compare_samples
 from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched

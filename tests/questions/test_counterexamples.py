@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo import compare, tolerance
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box
@@ -23,7 +24,7 @@ from safevar_sumo.questions.models import Model, judges_of
 from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
+from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of

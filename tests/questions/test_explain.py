@@ -12,6 +12,7 @@ import pytest
 import scipy
 from hypothesis import given, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -31,7 +32,6 @@ from safevar_sumo.questions.explain.causes import (
 )
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import evaluator
@@ -22,7 +23,6 @@ from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import identity_digest, manifest_of
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, refused, run, searched

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo import explain, tolerance
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box
@@ -23,7 +24,7 @@ from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of

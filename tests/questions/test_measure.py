@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.measure import STAGE, study_by
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import load_study
 from tests.in_process import json_of, refused, run, searched
 
 METRIC = """

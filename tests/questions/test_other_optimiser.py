@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from safevar_sumo import tolerance
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, limit_criterion, models_of
 from safevar_sumo.questions.tolerance.together import MAX_SIMULATIONS
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
 

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 import scipy
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
@@ -28,7 +29,7 @@ from safevar_sumo.questions.preventability import (
     judge_sample,
 )
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import ModelTable, ScenarioTable, load_study
+from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool

@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 
 from safevar_sumo import risk, rules
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.risk import deciding_in_words
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import load_study
 from tests.questions.conftest import (
     Plant,
     Region,

@@ -15,6 +15,7 @@ import scipy
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo import tolerance
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -26,7 +27,6 @@ from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of

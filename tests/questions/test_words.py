@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import words
 from safevar_sumo.questions.case import load_cases
-from safevar_sumo.study import load_study
 from tests.in_process import json_of, searched
 
 STUDY = """

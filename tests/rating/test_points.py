@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, protocol_of
 from safevar_sumo.protocol.rater import Points, Rater, colours_of, darken
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.rating import rate
 from safevar_sumo.records import CellResults
 from safevar_sumo.scenarios import WEATHERS
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import CharacteristicSet
 
 STUDY = load_study("euro_ncap_rating")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import _verdict
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins.check import check
@@ -24,7 +25,6 @@ from safevar_sumo.questions.explain.failures import compare_at_cells
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.results import record
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
 from tests.made_up import case_of

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference.agreement import (
@@ -17,7 +18,6 @@ from safevar_sumo.reference.agreement import (
     shipped_agreement,
 )
 from safevar_sumo.reference.rows import ReferenceData, read_reference
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo import simulate
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from calibration import fit
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import (
@@ -22,7 +23,7 @@ from safevar_sumo.questions.model_spread import (
 )
 from safevar_sumo.questions.tolerance import scans, tolerance
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool

@@ -19,12 +19,11 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import simulate_with_original
+from safevar_sumo.api.simulation import load_study, simulate_with_original
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.results import write_imported
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import refused, run

@@ -25,6 +25,7 @@ import pytest
 import safevar_sumo
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.reference_drivers import FullBraking
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.ask import find_question, parse_question
 from safevar_sumo.questions.case import Case, load_cases
@@ -35,7 +36,6 @@ from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.scenarios import SCENARIOS
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import VEHICLES

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.report.pack import read_pack
 from safevar_sumo.results import load_runs
-from safevar_sumo.study import load_study
 from tests.in_process import refused, run, searched
 from tests.report.test_evidence import bare as bare, changed, not_same, texts_of, verified
 

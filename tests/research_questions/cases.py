@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import CharacteristicTable, Study, load_study
+from safevar_sumo.study import CharacteristicTable, Study
 
 ORIGINAL = {"safety_degree": 2.0, "tet": 1.0, "tit": 0.5, "ave_dece": 6.0}
 CHARACTERISTICS = {

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scipy
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import summarise
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
@@ -24,7 +25,6 @@ from safevar_sumo.questions.research_questions.fronts import (
 )
 from safevar_sumo.questions.research_questions.statistics import can_be_significant
 from safevar_sumo.questions.subject import load
-from safevar_sumo.study import load_study
 from tests.campaign.formulas import carried_out
 from tests.research_questions.cases import made_up, row
 

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case, load_cases
@@ -30,7 +31,7 @@ from safevar_sumo.results import (
     solutions_frame,
 )
 from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
-from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.study import Study, tables_of
 from tests.campaign.formulas import with_search
 from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations

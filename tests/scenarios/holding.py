@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import Ads
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Scenario
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, Trace
 from safevar_sumo.scenarios import Lane
@@ -22,7 +23,6 @@ from safevar_sumo.scenarios.euro_ncap import SpeedProfile
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.tracks import VUT_WIDTH
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import made_up_runs

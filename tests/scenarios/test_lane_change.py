@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.preventability import ANY
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo

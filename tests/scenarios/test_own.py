@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.scenarios import SCENARIOS
-from safevar_sumo.study import Study, load_study, tables_of
+from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.system import assemble

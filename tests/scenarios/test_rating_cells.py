@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.scenarios.tracks import BODIES
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo import drive
 from safevar_sumo.sumo.bodies import Contacts
 from safevar_sumo.sumo.matrix import simulate_all_points

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.replay.simulate import simulate
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 

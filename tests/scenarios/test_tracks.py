@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.ads import Aeb
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble

@@ -15,13 +15,13 @@ import pytest
 from deap import tools
 from hypothesis import given, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.search.baselines import _Ranges
 from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.made_up import made_up_evaluations
 

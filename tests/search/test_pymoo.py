@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.running import run
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.runs import algorithm_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import PUBLISHED_SCORING
@@ -21,7 +22,7 @@ from safevar_sumo.results import load_runs, read_manifest
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.search import pymoo
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
-from safevar_sumo.study import ORIGINAL_DEGREE, Study, load_study
+from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import FormulaPool, carried_out, solutions
 from tests.search.test_algorithms import POPULATION, begun, built, sphere

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import json_of, run
 from tests.search.test_algorithms import SUN

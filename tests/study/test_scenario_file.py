@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import OpenScenario
-from safevar_sumo.study import Study, data_files, load_study
+from safevar_sumo.study import Study, data_files
 from safevar_sumo.study.schema import tables_of
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.encounters import encounter

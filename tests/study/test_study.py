@@ -21,22 +21,14 @@ from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.results.manifest import evaluation_keys
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study import (
-    Limit,
-    Origin,
-    Study,
-    limits_of,
-    load_study,
-    study_names,
-    tables_of,
-    write_study,
-)
+from safevar_sumo.study import Limit, Origin, Study, limits_of, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import ROOT
 
-SUN = load_study("sun").vehicle.characteristics
+SUN = read_study("sun").vehicle.characteristics
 ALL_FIXED = "".join(
     f"[[constraints]]\nsum = {{ {name} = 1 }}\nat_least = {row.original}\nat_most ="
     f" {row.original}\n"
@@ -318,7 +310,7 @@ def with_remarks(study: str, **changes: Any) -> tuple[Study, list[str]]:
     """A study, and what reading it warns of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        return load_study(study, **changes), [str(one.message) for one in caught]
+        return read_study(study, **changes), [str(one.message) for one in caught]
 
 
 @pytest.mark.parametrize(
@@ -339,7 +331,7 @@ def test_another_system_inherits_neither_title_nor_published_values(
 ) -> None:
     (tmp_path / "mine.toml").write_text(f'extends = "sun"\n{text}\n')
     study, remarks = with_remarks(str(tmp_path / "mine.toml"))
-    sun = load_study("sun")
+    sun = read_study("sun")
     assert study.name == "mine", "a study without a name is called as its file"
     assert (study.title == sun.title) == inherits
     assert (study.published == sun.published) == inherits
@@ -356,7 +348,7 @@ def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that
     Path("headed.toml").write_text('extends = "metric.toml"\ntitle = "A heading"\n')
     Path("heir.toml").write_text('extends = "headed.toml"\n')
     titles = [
-        load_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")
+        read_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")
     ]
     assert titles == ["mine", "own", "rash", "A heading", "A heading"]
 
@@ -380,13 +372,13 @@ def test_a_shipped_study_names_the_schema_which_accepts_it_and_all_that_it_exten
     text = (STUDIES / f"{name}.toml").read_text()
     assert text.startswith(f"#:schema ./{STUDY_SCHEMA.name}\n")
     assert is_accepted(text)
-    write_study(tmp_path / "whole.toml", load_study(name), "")
+    write_study(tmp_path / "whole.toml", read_study(name), "")
     whole = (tmp_path / "whole.toml").read_text()
     assert whole.startswith(f"#:schema {STUDY_SCHEMA}\n")
     assert is_accepted(whole)
 
 
-ROWS = load_study("native").vehicle.characteristics
+ROWS = read_study("native").vehicle.characteristics
 
 
 def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> None:
@@ -434,29 +426,29 @@ def test_a_text_that_is_no_limit_is_refused(texts: str, message: str) -> None:
 
 @pytest.mark.parametrize("name", study_names())
 def test_a_study_that_another_process_received_has_the_same_tables(name: str) -> None:
-    study = load_study(
-        name, variation={next(iter(load_study(name).domains)): {"distribution": "triangular"}}
+    study = read_study(
+        name, variation={next(iter(read_study(name).domains)): {"distribution": "triangular"}}
     )
     assert json.loads(json.dumps(tables_of(study))) == tables_of(study)
     assert tables_of(pickle.loads(pickle.dumps(study))) == tables_of(study)
-    assert load_study(tables_of(study)) == msgspec.structs.replace(study, origin=Origin())
+    assert read_study(tables_of(study)) == msgspec.structs.replace(study, origin=Origin())
 
 
 def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> None:
-    study = load_study("native", limits={"decel": {"at_least": 6, "source": "workshop manual"}})
-    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(load_study("native")))
-    assert "limits" not in tables_of(load_study("native"))
-    assert load_study(tables_of(study)).limits == study.limits
+    study = read_study("native", limits={"decel": {"at_least": 6, "source": "workshop manual"}})
+    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(read_study("native")))
+    assert "limits" not in tables_of(read_study("native"))
+    assert read_study(tables_of(study)).limits == study.limits
 
 
 def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
-    study = load_study(
+    study = read_study(
         {"extends": "wear", "name": "mine", "scenario": scenario, "matrix": {"tests": []}}
     )
     assert study.matrix is None
     assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
-    assert load_study(tables_of(study)).matrix is None
+    assert read_study(tables_of(study)).matrix is None
 
 
 @pytest.mark.parametrize(
@@ -479,7 +471,7 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     same, remarks = with_remarks(
         "wear", scenario={"model": "crossing", "parameters": {"speed": 30}}
     )
-    assert (same.matrix, remarks) == (load_study("wear").matrix, [])
+    assert (same.matrix, remarks) == (read_study("wear").matrix, [])
 
 
 def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -> None:
@@ -495,4 +487,4 @@ def test_an_unknown_study_is_refused_with_the_path_first() -> None:
         InputError,
         match=r"'nativ'; did you mean 'native'\?\nexpected: the path of a study file \(TOML\), or",
     ):
-        load_study("nativ")
+        read_study("nativ")

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.ads.base import DelayLine
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import FloatArray, Outcome, differences
 from safevar_sumo.scenarios.base import Scene
-from safevar_sumo.study import Weather, load_study
+from safevar_sumo.study import Weather
 from safevar_sumo.sumo.drive import _Outcomes
 from safevar_sumo.sumo.matrix import evaluate, simulate
 from safevar_sumo.sumo.perception import Perception

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import simulate
+from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
@@ -21,7 +21,7 @@ from safevar_sumo.records import ROUNDING
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import Study, free_parameters, load_study
+from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
 from safevar_sumo.sumo.system import assemble

@@ -11,11 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, differences
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
-from safevar_sumo.study import MatrixTable, MatrixTest, Study, load_study
+from safevar_sumo.study import MatrixTable, MatrixTest, Study
 from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble

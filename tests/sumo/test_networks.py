@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import sumo
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.network import built_network, copied_network, open_network

@@ -15,12 +15,13 @@ import platformdirs
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import ROUNDING, FloatArray, Observation, differences
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict

@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
-from safevar_sumo.study import ModelTable, load_study
+from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Command, FloatArray
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import slope_of
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.questions import COMPILING, compile_vehicle
 from safevar_sumo.records import Command
-from safevar_sumo.study import load_study
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState
 from tests.in_process import InlinePool
@@ -76,7 +76,7 @@ def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: Mod
 
 
 LOADING = """
-from safevar_sumo.study import load_study
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.sumo.system import assemble
 vehicle = assemble(load_study("rain")).vehicle
 print(vehicle.compile(only_load=True), vehicle.compile())

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import tomli_w
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, FloatArray, JsonObject
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of

@@ -20,12 +20,12 @@ from scipy.stats import spearmanr
 
 from calibration import wet_friction as fit
 from safevar_sumo.ads.base import is_in_the_way
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road

@@ -16,8 +16,9 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import Study, load_study, user_code
+from safevar_sumo.study import Study, user_code
 from safevar_sumo.study.file import WHOLE_TABLES
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.system import assemble
@@ -84,7 +85,7 @@ def study_to_check(name: str) -> Study:
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
     no_data: dict[str, Any] = {key: {} for key in WHOLE_TABLES}  # about the study's own ADS
     return (
-        load_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else load_study(name)
+        read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else read_study(name)
     )
 
 

@@ -21,7 +21,8 @@ from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.left_out import leading_parameter
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study, load_study
+from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import Study
 
 WIDER_STAGE = "attack in the wider scope"
 WIDER: Columns = {
@@ -45,7 +46,7 @@ def wider_study(study: Study) -> Study:
         path for folder in study.origin.places if (path := Path(folder, study.wider)).is_file()
     ]
     try:
-        wider = load_study(str(paths[0]) if paths else study.wider)
+        wider = read_study(str(paths[0]) if paths else study.wider)
     except InputError as error:
         raise InputError(
             study.source, f"wider = {study.wider!r}: {error.problem}", error.legal

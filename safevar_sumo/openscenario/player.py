@@ -1,0 +1,96 @@
+"""The state of a scene that is being played: what its actions and conditions ask and note."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.errors import one_of
+from safevar_sumo.openscenario.actors import Actor, Array, actors_of
+from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
+from safevar_sumo.openscenario.places import Place, place_of, turn_of
+from safevar_sumo.openscenario.road import read_network
+
+MAX_TURN = 0.01
+"""Largest turn of an Ego that drives straight on [degrees]."""
+Key = tuple[str, str]
+"""An element in conditions on states: its kind, and its name after those of all around it, joined
+by `::`.
+"""
+
+
+class Player:
+    """A scene that is being played, at the sample `sample` of `times` [s].
+
+    `begun` and `ended` are times of elements of the storyboard [s]; `dependences` says until when
+    the scene depends on Ego, and why; `ignored` are elements without effect; `has_begun` says
+    whether Init is over; `seen` are the values of conditions, from the sample on at which they were
+    asked for the first time.
+    """
+
+    def __init__(self, document: Document, ego: str, times: Array) -> None:
+        self.document = document
+        self.network = read_network(document.road)
+        self.times = times
+        self.actors = {actor.name: actor for actor in actors_of(document.root, len(times))}
+        if ego not in self.actors:
+            raise unsupported(
+                f"no ScenarioObject is named {ego!r}; there are: {', '.join(self.actors)}",
+                f"ego = {one_of(self.actors)}",
+            )
+        self.ego = self.actors[ego]
+        self.sample = 0
+        self.variables = {
+            attribute(each, "name"): attribute(each, "value")
+            for each in document.root.findall("VariableDeclarations/VariableDeclaration")
+        }
+        self.begun: dict[Key, float] = {}
+        self.ended: dict[Key, float] = {}
+        self.dependences: dict[str, float] = {}
+        self.remarks: dict[str, None] = {}
+        self.ignored: set[str] = set()
+        self.has_begun = False
+        self.seen: dict[int, tuple[int, Array]] = {}
+
+    @property
+    def now(self) -> float:
+        """The time [s]."""
+        return float(self.times[self.sample])
+
+    def actor(self, name: str) -> Actor:
+        """The entity of this name."""
+        if name not in self.actors:
+            raise unsupported(
+                f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}"
+            )
+        return self.actors[name]
+
+    def other(self, element: Element) -> Actor:
+        """The entity that an element refers to."""
+        return self.actor(attribute(element, "entityRef"))
+
+    def place_of(self, name: str) -> Place:
+        """The place of an entity now."""
+        return self.actor(name).here
+
+    def place(self, position: Element) -> Place:
+        """The place that the child of a Position names."""
+        return place_of(position, self.network, self.place_of)
+
+    def depends(self, other: Actor, until: float, what: str) -> None:
+        """Note what depends on Ego, and until when [s]."""
+        if other is self.ego and (self.sample or until > self.now):
+            self.dependences[what] = max(until, self.dependences.get(what, 0.0))
+
+    def ego_turns(self, facings: Array) -> None:
+        """Refuse directions of Ego that differ from the one at the start."""
+        turn = max(
+            turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings)
+        )
+        if turn > MAX_TURN:
+            raise unsupported(
+                f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees"
+            )
+
+    def remark(self, text: str) -> None:
+        """Note a remark, once."""
+        self.remarks[text] = None
