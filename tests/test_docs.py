@@ -24,11 +24,14 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import commands
 from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.results.manifest import (
-    KEYS_WITHOUT_EFFECT_ON_EVALUATIONS,
-    KEYS_WITHOUT_EFFECT_ON_RESULTS,
+from safevar_sumo.study import (
+    WITHOUT_EFFECT,
+    CharacteristicTable,
+    SearchTable,
+    Study,
+    keys_with,
+    study_names,
 )
-from safevar_sumo.study import DESCRIPTION_KEYS, study_names
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import ROOT, blocks
 
@@ -211,7 +214,9 @@ def test_the_page_on_results_lists_every_key_that_may_change() -> None:
     )
     keys = re.findall(r"`\[*(\w+)\]*`", listed)
     assert sorted(keys) == sorted(
-        [*KEYS_WITHOUT_EFFECT_ON_RESULTS, *DESCRIPTION_KEYS, *KEYS_WITHOUT_EFFECT_ON_EVALUATIONS]
+        key
+        for record in (Study, CharacteristicTable, SearchTable)
+        for key in keys_with(WITHOUT_EFFECT, record)
     )
 
 

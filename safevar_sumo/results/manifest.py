@@ -19,7 +19,7 @@ from msgspec import Struct
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import DESCRIPTION_KEYS, PYMOO, Study, convert_table, tables_of
+from safevar_sumo.study import PYMOO, Study, convert_table, tables_of, with_effect
 from safevar_sumo.study.schema import Tables
 
 FORMAT = 5
@@ -33,22 +33,6 @@ PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
 PYMOO_PACKAGES = ("pymoo", "cma")
 """Packages on whose versions the searches of pymoo depend, named in the manifest of a study that
 has some.
-"""
-KEYS_WITHOUT_EFFECT_ON_RESULTS = (
-    "title",
-    "published",
-    "repeatability",
-    "spread",
-    "model_error",
-    "variation",
-    "correlations",
-    "limits",
-    "repair",
-    "wider",
-)
-"""Keys of a study that change no result."""
-KEYS_WITHOUT_EFFECT_ON_EVALUATIONS = ("runs", "algorithms", "evaluations", "time_limit")
-"""Keys of a study's search table that change no evaluation, but decide which evaluations there are.
 """
 IDENTITY = {
     "study": "the same study and options",
@@ -187,34 +171,8 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
 
 def evaluation_keys(tables: Tables) -> JsonObject:
     """Those of a study's tables that affect evaluations."""
-    vehicle = tables["vehicle"]
-    search = tables["search"]
-    scenario = tables["scenario"]
-    searched = {}
-    if "search" in scenario:
-        searched["scenario"] = {**scenario, "search": _without_descriptions(scenario["search"])}
-    return {
-        **{
-            key: value for key, value in tables.items() if key not in KEYS_WITHOUT_EFFECT_ON_RESULTS
-        },
-        **searched,
-        "vehicle": {
-            **vehicle,
-            "characteristics": _without_descriptions(vehicle["characteristics"]),
-        },
-        "search": {
-            key: value
-            for key, value in search.items()
-            if key not in KEYS_WITHOUT_EFFECT_ON_EVALUATIONS
-        },
-    }
-
-
-def _without_descriptions(rows: JsonObject) -> JsonObject:
-    return {
-        name: {key: value for key, value in row.items() if key not in DESCRIPTION_KEYS}
-        for name, row in rows.items()
-    }
+    keys: JsonObject = with_effect(tables, Study)
+    return keys
 
 
 def identity_in(manifest: JsonObject) -> JsonObject:

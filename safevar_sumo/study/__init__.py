@@ -21,13 +21,18 @@ from safevar_sumo.study.file import (
     user_modules as user_modules,
     write_study as write_study,
 )
+from safevar_sumo.study.marks import (
+    WHOLE as WHOLE,
+    WITHOUT_EFFECT as WITHOUT_EFFECT,
+    keys_with as keys_with,
+    with_effect as with_effect,
+)
 from safevar_sumo.study.parameters import (
     FreeParameter as FreeParameter,
     free_parameters as free_parameters,
     searched as searched,
 )
 from safevar_sumo.study.schema import (
-    DESCRIPTION_KEYS as DESCRIPTION_KEYS,
     OBJECTIVES as OBJECTIVES,
     ORIGINAL_DEGREE as ORIGINAL_DEGREE,
     PYMOO as PYMOO,

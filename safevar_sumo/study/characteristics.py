@@ -10,18 +10,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError, check_name, one_of
+from safevar_sumo.study.marks import WITHOUT_EFFECT, Table
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
-Description = Annotated[str, Meta(max_length=200)]
+Description = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
 MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
-
-
-class Table(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a study file; a key that is unknown is a mistake."""
 
 
 def mistake(problem: str, legal: str) -> ValueError:

@@ -17,6 +17,16 @@ import tomli_w
 from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
+from safevar_sumo.study.marks import (
+    OF_MATRIX,
+    OF_SCENARIO,
+    OF_STUDY,
+    OF_SYSTEM,
+    OF_VEHICLE_AND_ADS,
+    PART_OF_SYSTEM,
+    WHOLE,
+    keys_with,
+)
 from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
@@ -33,12 +43,6 @@ from safevar_sumo.study.schema import (
 )
 from safevar_sumo.study.validation import convert_table
 
-WHOLE_TABLES = ("published", "repeatability", "spread", "model_error")
-"""Tables that a study inherits as a whole or not at all."""
-SYSTEM_KEYS = ("title", "published", "repeatability")
-"""Keys that describe one combination of vehicle, ADS, scenario, network, weather and matrix: a
-study does not inherit them from a study of another combination.
-"""
 SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
 
@@ -226,48 +230,41 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
 
 
 def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> StudyTables:
-    """Override a study's tables; a study of another system does not inherit `SYSTEM_KEYS`, and none
-    its wider study.
+    """Override a study's tables, but for those that the new study does not inherit: their marks in
+    the records say when.
     """
-    left_out = {"wider"}
+    # Keys about this one study, and keys about its scenario, if the overrides name another one.
+    left_out = {*keys_with(OF_STUDY, Study)}
     if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
-        left_out |= {"scenario", "matrix", "rating"}
+        left_out.update(keys_with(OF_SCENARIO, Study))
     inherited = {key: value for key, value in base.tables.items() if key not in left_out}
     tables = _merge(inherited, overrides)
-    changed_keys = [
+
+    # Keys about the parts of the system that differ now.
+    parts = [
         key
-        for key in ("weather", "vehicle", "ads", "scenario", "matrix")
+        for key in keys_with(PART_OF_SYSTEM, Study)
         if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
     ]
+    marks = [OF_SYSTEM] if parts else []
+    marks += [OF_VEHICLE_AND_ADS] if {"vehicle", "ads"} & {*parts} else []
+    marks += [OF_MATRIX] if "matrix" in parts else []
+    for key in {key for mark in marks for key in keys_with(mark, Study)} - overrides.keys():
+        tables.pop(key, None)
+
+    # A study without a title of its own is called by its name.
+    if parts or base.tables.get("title", "") == base.tables.get("name"):
+        tables["title"] = overrides.get("title", tables.get("name", ""))
     remarks = base.remarks
-    if base.tables.get("title", "") == base.tables.get("name"):  # it has no title of its own
-        tables["title"] = overrides.get("title", tables["name"])
-    if changed_keys:
-        tables = {
-            **{key: value for key, value in tables.items() if key not in SYSTEM_KEYS},
-            "title": tables.get("name", ""),
-            **{key: overrides[key] for key in SYSTEM_KEYS if key in overrides},
-        }
-        if "vehicle" in changed_keys or "ads" in changed_keys:
-            for key in {
-                "spread",
-                "model_error",
-            } - overrides.keys():  # they concern the parameters of both
-                tables.pop(key, None)
-        if "matrix" in changed_keys and "rating" not in overrides:
-            tables.pop("rating", None)
-        dropped = [
-            f"[{key}]"
-            for key, value in base.tables.items()
-            if isinstance(value, dict) and key not in tables
-        ]
-        if dropped:
-            differences = " and a different ".join(
-                "ADS" if key == "ads" else key for key in changed_keys
-            )
-            of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
-            text = f"{source}: has a different {differences} {of_base}"
-            remarks = (*remarks, text)
+    dropped = [
+        f"[{key}]"
+        for key, value in base.tables.items()
+        if parts and isinstance(value, dict) and key not in tables
+    ]
+    if dropped:
+        differences = " and a different ".join("ADS" if key == "ads" else key for key in parts)
+        of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
+        remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
     return StudyTables(source, tables, base.origin, remarks)
 
 
@@ -293,7 +290,7 @@ def _model_and_network(table: object) -> object:
 
 def _merge(base: Tables, overrides: Tables) -> Parameters:
     """Override `base` by `overrides`; another `model` or `distribution`, and the tables
-    `WHOLE_TABLES`, replace a whole table.
+    that are inherited as a whole, replace a whole table.
     """
     result = dict(base)
     for key, value in overrides.items():
@@ -303,7 +300,9 @@ def _merge(base: Tables, overrides: Tables) -> Parameters:
 
 def _refines(key: str, base_value: object, override: object) -> bool:
     """Whether an override changes single keys of the table that it overrides."""
-    if key in WHOLE_TABLES or not (isinstance(base_value, dict) and isinstance(override, dict)):
+    if key in keys_with(WHOLE, Study) or not (
+        isinstance(base_value, dict) and isinstance(override, dict)
+    ):
         return False
     return all(
         override.get(choice, base_value.get(choice)) == base_value.get(choice)

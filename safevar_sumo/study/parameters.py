@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 import msgspec
 from msgspec import Meta
 
-from safevar_sumo.study.characteristics import Table
+from safevar_sumo.study.marks import Table
 
 
 class FreeParameter(Table, frozen=True, kw_only=True):

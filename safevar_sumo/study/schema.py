@@ -18,11 +18,21 @@ from safevar_sumo.study.characteristics import (
     Domain,
     Limit,
     PositiveNumber,
-    Table,
     check_constraints,
     check_limits,
     check_variation,
     mistake,
+)
+from safevar_sumo.study.marks import (
+    OF_MATRIX,
+    OF_SCENARIO,
+    OF_STUDY,
+    OF_SYSTEM,
+    OF_VEHICLE_AND_ADS,
+    PART_OF_SYSTEM,
+    WHOLE,
+    WITHOUT_EFFECT,
+    Table,
 )
 from safevar_sumo.study.parameters import FreeParameter, searched
 
@@ -50,8 +60,6 @@ its scenario.
 """
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-DESCRIPTION_KEYS = ("meaning", "counterpart")
-"""Keys that describe a characteristic to people; no result depends on them."""
 
 
 class ModelTable(Table, frozen=True, kw_only=True):
@@ -175,12 +183,12 @@ class SearchTable(Table, frozen=True, kw_only=True):
     algorithms by name or label; a file has them in tables such as [search.nsga2].
     """
 
-    algorithms: Annotated[list[str], Meta(min_length=1)]
+    algorithms: Annotated[list[str], Meta(min_length=1), WITHOUT_EFFECT]
     population: Annotated[int, Meta(ge=2, le=100_000)]
-    evaluations: PositiveInt
-    runs: Annotated[int, Meta(ge=1, le=100_000)]
+    evaluations: Annotated[PositiveInt, WITHOUT_EFFECT]
+    runs: Annotated[int, Meta(ge=1, le=100_000), WITHOUT_EFFECT]
     seed: Seed
-    time_limit: Annotated[float, Meta(gt=0, le=86400)] = 300.0
+    time_limit: Annotated[float, Meta(gt=0, le=86400), WITHOUT_EFFECT] = 300.0
     objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(
         default_factory=lambda: list(OBJECTIVES)
     )
@@ -301,29 +309,32 @@ class Study(Table, frozen=True, kw_only=True):
     which limits are tried as well.
     """
 
-    # A new key that changes no result of a campaign also belongs in KEYS_WITHOUT_EFFECT_ON_RESULTS
-    # of results/manifest.py. Any other new key becomes part of the identity of results.
+    # A key without the mark WITHOUT_EFFECT is part of the identity of results.
     name: Name
-    title: str
-    scenario: ScenarioTable
-    weather: str | Weather
-    vehicle: VehicleTable
-    ads: ModelTable
+    title: Annotated[str, WITHOUT_EFFECT, OF_SYSTEM]
+    scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
+    weather: Annotated[str | Weather, PART_OF_SYSTEM]
+    vehicle: Annotated[VehicleTable, PART_OF_SYSTEM]
+    ads: Annotated[ModelTable, PART_OF_SYSTEM]
     metrics: MetricsTable
     search: SearchTable
-    matrix: MatrixTable | None = None
-    rating: RatingTable = RatingTable()
+    matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None
+    rating: Annotated[RatingTable, OF_SCENARIO, OF_MATRIX] = RatingTable()
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
-    published: dict[str, float] = {}
-    repeatability: dict[str, Annotated[float, Meta(gt=0, le=1e6)]] = {}
-    spread: dict[str, list[float]] = {}
-    model_error: dict[str, Annotated[float, Meta(ge=0, le=1e6)]] = {}
-    variation: dict[str, Distribution] = {}
-    correlations: list[Correlation] = []
+    published: Annotated[dict[str, float], WITHOUT_EFFECT, OF_SYSTEM, WHOLE] = {}
+    repeatability: Annotated[
+        dict[str, Annotated[float, Meta(gt=0, le=1e6)]], WITHOUT_EFFECT, OF_SYSTEM, WHOLE
+    ] = {}
+    spread: Annotated[dict[str, list[float]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE] = {}
+    model_error: Annotated[
+        dict[str, Annotated[float, Meta(ge=0, le=1e6)]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE
+    ] = {}
+    variation: Annotated[dict[str, Distribution], WITHOUT_EFFECT] = {}
+    correlations: Annotated[list[Correlation], WITHOUT_EFFECT] = []
     constraints: list[Constraint] = []
-    limits: dict[str, Limit] = {}
-    repair: RepairTable = RepairTable()
-    wider: str = ""
+    limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
+    repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
+    wider: Annotated[str, WITHOUT_EFFECT, OF_STUDY] = ""
     origin: Origin = Origin()
 
     def __post_init__(self) -> None:

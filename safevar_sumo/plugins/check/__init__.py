@@ -18,8 +18,7 @@ from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import Study, user_code
-from safevar_sumo.study.file import WHOLE_TABLES
+from safevar_sumo.study import WHOLE, Study, keys_with, user_code
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
@@ -83,7 +82,8 @@ def study_to_check(name: str) -> Study:
         If the study or the ADS cannot be loaded.
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
-    no_data: dict[str, Any] = {key: {} for key in WHOLE_TABLES}  # about the study's own ADS
+    # Data about the study's own ADS.
+    no_data: dict[str, Any] = {key: {} for key in keys_with(WHOLE, Study)}
     return (
         read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else read_study(name)
     )

@@ -1,0 +1,62 @@
+"""Marks on the fields of a study's records: what the key of a field affects, and what a study that
+`extends` another one inherits.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, get_args, get_origin
+
+import msgspec
+from msgspec import Meta, Struct
+
+
+class Table(Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of a study file; a key that is unknown is a mistake."""
+
+
+def _mark(name: str) -> Meta:
+    return Meta(extra={name: True})
+
+
+WITHOUT_EFFECT = _mark("without effect")
+"""No evaluation depends on it."""
+PART_OF_SYSTEM = _mark("part of system")
+"""It names a part of the system that is studied: a model and its network, a weather, a matrix."""
+OF_SYSTEM = _mark("of system")
+"""It describes one system: a study in which a part of it differs does not inherit it."""
+OF_VEHICLE_AND_ADS = _mark("of vehicle and ADS")
+"""It is about parameters of both: a study in which one of them differs does not inherit it."""
+OF_SCENARIO = _mark("of scenario")
+"""It is about one scenario: a study that names another one does not inherit it."""
+OF_MATRIX = _mark("of matrix")
+"""It is about one matrix: a study with another one does not inherit it."""
+OF_STUDY = _mark("of study")
+"""It is about one study: no other one inherits it."""
+WHOLE = _mark("whole")
+"""A study inherits it as a whole or not at all."""
+
+
+def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
+    """The keys of a record's fields that have a mark."""
+    return tuple(
+        field.name
+        for field in msgspec.structs.fields(record)
+        if mark in getattr(field.type, "__metadata__", ())
+    )
+
+
+def with_effect(value: Any, kind: Any) -> Any:
+    """A value of a type, as plain tables, without the keys on which no evaluation depends."""
+    if get_origin(kind) is Annotated:
+        return with_effect(value, get_args(kind)[0])
+    if get_origin(kind) is dict:
+        return {name: with_effect(inner, get_args(kind)[1]) for name, inner in value.items()}
+    if not (isinstance(kind, type) and issubclass(kind, Table)):
+        return value
+    kinds = {field.name: field.type for field in msgspec.structs.fields(kind)}
+    left_out = keys_with(WITHOUT_EFFECT, kind)
+    return {
+        key: with_effect(inner, kinds.get(key))
+        for key, inner in value.items()
+        if key not in left_out
+    }
