@@ -31,7 +31,7 @@ from measuring import Record, print_records, processor_seconds
 
 from safevar_sumo.campaign import evaluation, local
 from safevar_sumo.campaign.evaluation import Task, evaluate_batch, system_of
-from safevar_sumo.cli.program import main as run_program
+from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import largest_batch
@@ -107,7 +107,7 @@ def records_of(command: str) -> Iterator[Record]:
         sys.argv = ["safevar-sumo", *words]
         with redirect_stdout(StringIO()):
             try:
-                run_program()
+                run_command_line()
             except SystemExit as end:
                 if end.code not in (0, 3, None):
                     raise

@@ -35,7 +35,7 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.sumo.batch import observer_of
 from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.engine import open_world, sumo_options
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import copied_network, stage_network
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import SumoWorld
@@ -104,8 +104,8 @@ def bare(network: str, n: int, steps: int) -> tuple[float, float]:
 
 def warm(system: System, settings: FloatArray) -> float:
     """Processor seconds of an evaluation on a network that is loaded."""
-    evaluate(system, settings)
-    return processor_seconds(lambda: evaluate(system, settings))
+    drive_and_score(system, settings)
+    return processor_seconds(lambda: drive_and_score(system, settings))
 
 
 @contextmanager
@@ -133,7 +133,7 @@ def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterat
     network = stage_network(system.points[0].scenario)
     for n in populations:
         settings = settings_of(system, n)
-        steps = len(simulate(system, settings).trace.time)
+        steps = len(drive_worst(system, settings).trace.time)
         floors = [bare(network, n, steps) for _ in range(2)]
 
         def floor(
@@ -161,15 +161,15 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     """Against other ways to do the same, on the clock."""
     n, few = len(settings), settings[:SOCKET_SETTINGS]
     scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("ads")))
-    evaluate(system, settings)
+    drive_and_score(system, settings)
     program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
     command = [program, *sumo_options(copied_network(stage_network(system.points[0].scenario), 1))]
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(
-            lambda: clock_seconds(lambda: evaluate(system, settings)),
-            lambda: clock_seconds(lambda: [evaluate(system, one[None]) for one in few]),
-            lambda: clock_seconds(lambda: evaluate(scalar, settings)),
+            lambda: clock_seconds(lambda: drive_and_score(system, settings)),
+            lambda: clock_seconds(lambda: [drive_and_score(system, one[None]) for one in few]),
+            lambda: clock_seconds(lambda: drive_and_score(scalar, settings)),
             lambda: clock_seconds(lambda: through_socket(system, few, command)),
             repetitions=5,
         )

@@ -35,7 +35,7 @@ from safevar_sumo.reference.agreement import defined_pairs, measure_agreement, r
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -157,7 +157,7 @@ def simulate(study: Study, files: Sequence[ReferenceData]) -> list[Evaluations]:
     """
     blocks = [CharacteristicSet.of(study).original[np.newaxis], *(data.settings for data in files)]
     settings, places = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)
-    evaluations = evaluate(assemble(study), settings)
+    evaluations = drive_and_score(assemble(study), settings)
     ends = np.cumsum([len(block) for block in blocks])[:-1]
     return [evaluations.take(rows) for rows in np.split(places.ravel(), ends)]
 

@@ -17,7 +17,7 @@ import numpy as np
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.scenarios.declared import read_study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 
 FASTEST = 60.0
@@ -52,7 +52,7 @@ def main(path: str) -> None:
     worn = members.setting({**WORN, "impact_location": IMPACT_LOCATION})
     settings = np.tile(worn, (SPEEDS * TREADS, 1))
     settings[:, speed], settings[:, tread] = np.tile(speeds, TREADS), np.repeat(treads, SPEEDS)
-    evaluations = evaluate(system, settings)
+    evaluations = drive_and_score(system, settings)
     collided = evaluations.collided.reshape(TREADS, SPEEDS)
     unsafe_original = system.measuring.scoring.violation(evaluations).reshape(TREADS, SPEEDS)[0] > 0
     figure, ((axis,),) = new_figure("wear_joint: collisions over speed and tread", 1, 1, (6.4, 3.4))
@@ -87,11 +87,11 @@ def count_between(fastest: float) -> None:
     )
     drawn = rng.uniform(members.lower, members.upper, (VEHICLES, len(members)))
     vehicles = members.original + (drawn - members.original) * rng.uniform(0.2, 0.8, (VEHICLES, 1))
-    safe = vehicles[~evaluate(grid, vehicles).collided]
+    safe = vehicles[~drive_and_score(grid, vehicles).collided]
     encounters = sobol_settings(joint.characteristics, ENCOUNTERS)
     settings = np.tile(encounters, (len(safe), 1))
     settings[:, of_vehicle] = np.repeat(safe, ENCOUNTERS, axis=0)
-    evaluations = evaluate(joint, settings)
+    evaluations = drive_and_score(joint, settings)
     fails = evaluations.collided & (joint.measuring.scoring.violation(evaluations) == 0)
     found = int(fails.reshape(len(safe), -1).any(axis=1).sum())
     print(
@@ -119,11 +119,11 @@ def compare_lines(fastest: float) -> None:
     encounters = sobol_settings(joint.characteristics, ENCOUNTERS_ON_LINES)
     settings = np.tile(encounters, (len(vehicles), 1))
     settings[:, of_vehicle] = np.repeat(vehicles, ENCOUNTERS_ON_LINES, axis=0)
-    evaluations = evaluate(joint, settings)
+    evaluations = drive_and_score(joint, settings)
     fails = evaluations.collided & (joint.measuring.scoring.violation(evaluations) == 0)
     firsts = []
     for collided in (
-        evaluate(grid, vehicles).collided,
+        drive_and_score(grid, vehicles).collided,
         fails.reshape(len(vehicles), -1).any(axis=1),
     ):
         rows = collided.reshape(LINES, PARTS)

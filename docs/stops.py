@@ -17,7 +17,7 @@ import numpy as np
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.declared import read_study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles.wet_road import WET_FRICTION
 
@@ -44,7 +44,7 @@ def stops(speed: float, water: float, grip: float) -> FloatArray:
     system = assemble(study)
     settings = np.tile(system.characteristics.original, (len(TREADS), 1))
     settings[:, 0] = TREADS
-    return evaluate(system, settings).metrics["stopping_distance"]
+    return drive_and_score(system, settings).metrics["stopping_distance"]
 
 
 def main(path: str) -> None:

@@ -7,7 +7,7 @@ from .errors import (
     SafevarError as SafevarError,
     SimulationError as SimulationError,
 )
-from .metrics import Criterion as Criterion, Unsafe as Unsafe
+from .metrics import CriterionLike as CriterionLike, Unsafe as Unsafe
 from .questions.answer import Answer as Answer
 from .questions.ask import question as question
 from .questions.compare import compare as compare

@@ -13,7 +13,7 @@ def main() -> None:
     _put_installed_modules_first()
     from safevar_sumo import cli
 
-    cli.main()
+    cli.run_command_line()
 
 
 def _put_installed_modules_first() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
-from safevar_sumo.cli.program import COMMANDS, function_of
+from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
@@ -80,7 +80,7 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
     def create_and_check(answer: Answer, **values: Any) -> None:
         create(answer, **values)
         if answer.question in COMMANDS:
-            declared = contents_of(function_of(answer.question))
+            declared = contents_of(command_function(answer.question))
             assert declared is not None
             keys = Contents(
                 answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}

@@ -20,7 +20,7 @@ import pytest
 
 from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.cli.program import main
+from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
@@ -116,7 +116,7 @@ def run(*arguments: str, expect: int = 0) -> CommandOutput:
             os, "_exit", sys.exit
         )  # the program calls it if a thread still runs; this process must continue
         try:
-            main()
+            run_command_line()
         except SystemExit as end:
             code = end.code
     for one, handler in handlers.items():

@@ -90,7 +90,7 @@ def evaluate(
             system.check_feasible(requested, filtered=filtered)
     simulated = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
-        evaluations = evaluate_settings(loaded_study, simulated, pool, jobs, report_progress)
+        evaluations = evaluate_with_workers(loaded_study, simulated, pool, jobs, report_progress)
     groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
     frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
@@ -99,7 +99,7 @@ def evaluate(
     return frame.set_axis(index)
 
 
-def evaluate_settings(
+def evaluate_with_workers(
     study: Study,
     settings: FloatArray,
     pool: Pool | None = None,

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -17,7 +17,7 @@ from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.campaign.campaign import choose_engine, measure_speed
 from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.pool import open_pool
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -44,7 +44,7 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo import assemble, evaluate, settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import show_no_progress
@@ -151,13 +151,9 @@ def study(
         )
     if status:
         return summarise(load(directory))
-    search = as_written.search
-    given = {"runs": runs, "evaluations": evaluations, "seed": seed}
-    changes: JsonObject = {name: value for name, value in given.items() if value is not None}
-    if algorithms is not None:
-        names = [name.strip() for name in algorithms.split(",")]
-        changes["algorithms"] = [search.labels.get(name, name) for name in names]
-    changed = msgspec.structs.replace(as_written, search=msgspec.structs.replace(search, **changes))
+
+    # The study as it is searched, and its runs that are to be done.
+    changed = _with_options(as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed)
     loaded, system = load_for_search(changed)
     if unsafe is not None:
         study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
@@ -166,36 +162,53 @@ def study(
     keys = _select_runs(all_runs(loaded), only, shard)
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
+
+    # Measured or searched.
     if dry_run:
         with open_pool(jobs, cluster) as pool:
-            used, reason = choose_engine(system, engine)
-            task = Task(
-                study=loaded, engine=used, batch_size=batch or settings_per_batch(system, used)
-            )
-            return _forecast(loaded, len(keys), measure_speed(task, pool), f"{used}: {reason}")
-    options: dict[str, Any] = {
-        "jobs": jobs,
-        "cluster": cluster,
-        "only": keys,
-        "batch": batch,
-        "engine": engine,
-    }
+            return _measured(loaded, system, len(keys), engine, batch, pool)
     try:
-        results = run(loaded, directory, progress=not quiet, retry_failed=retry_failed, **options)
+        results = run(
+            loaded,
+            directory,
+            progress=not quiet,
+            retry_failed=retry_failed,
+            jobs=jobs,
+            cluster=cluster,
+            only=keys,
+            batch=batch,
+            engine=engine,
+        )
     except KeyboardInterrupt:
         warn(
             f"finished evaluations are kept in {directory}: run the same command again to continue"
         )
         raise
+    return _found(results, system, unsafe, jobs)
+
+
+def _found(results: Results, system: System, unsafe: str | None, jobs: int | None) -> Answer:
+    """What was found, and what to ask next."""
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
+    directory = str(results.directory)
     following = ", ".join(
-        question_command(name, str(directory)) + criterion for name in ("explain", "tolerance")
+        question_command(name, directory) + criterion for name in ("explain", "tolerance")
     )
     verdict = f"{reason or _verdict(results, case, system)} Next: {following}"
     return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
+
+
+def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
+    """The study with the numbers and algorithms of its search that the command states."""
+    search = study.search
+    changes: JsonObject = {name: value for name, value in numbers.items() if value is not None}
+    if algorithms is not None:
+        names = [name.strip() for name in algorithms.split(",")]
+        changes["algorithms"] = [search.labels.get(name, name) for name in names]
+    return msgspec.structs.replace(study, search=msgspec.structs.replace(search, **changes))
 
 
 def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
@@ -217,8 +230,13 @@ def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> lis
     return keys
 
 
-def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
-    """The estimated time of a search from its evaluations per second."""
+def _measured(
+    study: Study, system: System, runs: int, engine: str, batch: int | None, pool: Pool
+) -> Answer:
+    """The estimated time of a search, from a short measurement."""
+    used, reason = choose_engine(system, engine)
+    task = Task(study=study, engine=used, batch_size=batch or settings_per_batch(system, used))
+    rate = measure_speed(task, pool)
     evaluations = runs * study.search.evaluations
     seconds = evaluations / rate
     time = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
@@ -232,7 +250,7 @@ def _forecast(study: Study, runs: int, rate: float, engine: str) -> Answer:
         ),
         numbers={
             "runs": runs,
-            "engine": engine,
+            "engine": f"{used}: {reason}",
             "evaluations": evaluations,
             "evaluations_per_second": rate,
             "seconds": seconds,
@@ -245,7 +263,9 @@ def _verdict(results: Results, case: Case, system: System) -> str:
     """How many solutions of a case of the results are unsafe, and how little is enough."""
     names = list(system.characteristics.names)
     if not system.rater and not system.characteristics.scenario:
-        original = evaluate(assemble(case.study), system.characteristics.original[np.newaxis])
+        original = drive_and_score(
+            assemble(case.study), system.characteristics.original[np.newaxis]
+        )
         if case.unsafe.of(original)[0]:
             return (
                 f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is"
@@ -286,7 +306,9 @@ def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Eval
     be unsafe; None if it is safe with all of them.
     """
     for further in FURTHER_DIGITS:
-        printed = evaluate(system, as_printed(system.characteristics, setting, further)[np.newaxis])
+        printed = drive_and_score(
+            system, as_printed(system.characteristics, setting, further)[np.newaxis]
+        )
         if case.unsafe.of(printed)[0] and not system.measuring.scoring.violation(printed)[0]:
             return printed
     return None

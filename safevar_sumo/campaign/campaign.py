@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations
+from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
@@ -80,6 +80,7 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
+    # The directory, with the inputs of its results as they are now.
     use = check_code(study, pool)
     results = ResultsDirectory(
         directory, study, identity_of(study, system, use.modules), system.measuring.scoring
@@ -88,33 +89,25 @@ def run_campaign(
         warn(remark)
     engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
-    algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
-    results.manifest["titles"] = {name: one.title for name, one in algorithms.items() if one.title}
-    results.manifest["stop_by_themselves"] = [
-        name for name, one in algorithms.items() if one.stops_by_itself
-    ]
+    results.manifest |= _about_algorithms(study)
     task = Task(
         study=study,
         engine=engine_used,
         batch_size=batch_size or settings_per_batch(system, engine_used),
     )
+
+    # What the user should know before the search begins.
     show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])
     compile_vehicle(study, pool, progress)
-    if undeclared := [name for name in use.opened if name not in results.manifest["files"]]:
-        files = ", ".join(undeclared)
-        warn(
-            f"study {study.name!r}: user code reads {files}, which no `files` of the study names:"
-            " edits go unnoticed"
-        )
     no_verdict = ask_why_no_verdict(study, pool)
-    if no_verdict:
-        warn(f"study {study.name!r}: {no_verdict}")
     original = evaluate_original(task, pool)
-    if original.collided[0] and not is_rated(study):
-        words = Unsafe().breach_in_words(original)
-        warn(f"study {study.name!r}: the original vehicle itself {words}: no change is needed")
+    undeclared = [name for name in use.opened if name not in results.manifest["files"]]
+    for remark in _remarks(study, undeclared, no_verdict, original):
+        warn(f"study {study.name!r}: {remark}")
     results.begin(original)
+
+    # Each worker carries out a share of the runs.
     verifies = engine_used is Engine.RECORDED
     shares = [
         (
@@ -128,10 +121,36 @@ def run_campaign(
         runs += finished_runs
         if remark:
             warn(remark)
+
+    # Solutions are written when all runs are finished.
     runs.sort(key=lambda run: run.key)
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
     return Campaign(original, runs, system.measuring.scoring, no_verdict)
+
+
+def _remarks(
+    study: Study, undeclared: Sequence[str], no_verdict: str, original: Evaluations
+) -> Iterator[str]:
+    """What makes results uncertain or useless: files that user code reads and the study does not
+    name, a driving system that fails on an empty road, an original vehicle that collides.
+    """
+    if undeclared:
+        files = ", ".join(undeclared)
+        yield f"user code reads {files}, which no `files` of the study names: edits go unnoticed"
+    if no_verdict:
+        yield no_verdict
+    if original.collided[0] and not is_rated(study):
+        words = Unsafe().breach_in_words(original)
+        yield f"the original vehicle itself {words}: no change is needed"
+
+
+def _about_algorithms(study: Study) -> JsonObject:
+    """What a manifest says of the study's algorithms: titles, and which stop by themselves."""
+    algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
+    stopping = [name for name, algorithm in algorithms.items() if algorithm.stops_by_itself]
+    titles = {name: algorithm.title for name, algorithm in algorithms.items() if algorithm.title}
+    return {"titles": titles, "stop_by_themselves": stopping}
 
 
 def evaluate_original(task: Task, pool: Pool) -> Evaluations:

@@ -24,7 +24,7 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import MAX_COPIES, evaluate, evaluate_matrix
+from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score, evaluate_matrix
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
@@ -199,7 +199,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     with end_if_longer(task.study.search.time_limit):
         if task.selection != EVERYTHING:
             return _evaluate_parameters(task.selection.of(system), task, rows)
-        return evaluate(system, rows, task.engine)
+        return drive_and_score(system, rows, task.engine)
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
@@ -211,10 +211,12 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     if selection.each:
         return evaluate_matrix(system, settings, task.engine, each=True)
     if not values.size:
-        return evaluate(system, settings, task.engine, with_originals=False)
+        return drive_and_score(system, settings, task.engine, with_originals=False)
     if selection.arrays:
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
-        return replace(evaluate(system, settings, task.engine, with_originals=False), settings=rows)
+        return replace(
+            drive_and_score(system, settings, task.engine, with_originals=False), settings=rows
+        )
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
     groups = []
     rows_of_groups = []
@@ -224,7 +226,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
             task.study, dict(zip(selection.parameters, parameter_set, strict=True))
         )
         driven = replace(system, ads=assemble(study).ads)
-        evaluations = evaluate(driven, settings[group], task.engine, with_originals=False)
+        evaluations = drive_and_score(driven, settings[group], task.engine, with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
     return Evaluations.concatenate(groups).take(

@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, about, unknown_name
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import Failure, Journal, failures_of, run_name
+from safevar_sumo.results import FailedSetting, Journal, failed_settings, run_name
 from safevar_sumo.search import (
     ALGORITHMS,
     DESCRIPTIONS,
@@ -44,7 +44,7 @@ class RunResult(NamedTuple):
 
     key: RunKey
     solutions: Evaluations
-    failures: list[Failure]
+    failures: list[FailedSetting]
     simulated: int
     collisions: int
     invalid_tests: int
@@ -216,7 +216,7 @@ class Run:
         return RunResult(
             self.key,
             self.solutions,
-            failures_of(self.key, positions, requested),
+            failed_settings(self.key, positions, requested),
             simulated=len(requested),
             collisions=int(np.count_nonzero(requested.collided)),
             invalid_tests=int(np.count_nonzero(requested.outcome == Outcome.INVALID_TEST.value)),

@@ -31,10 +31,10 @@ from safevar_sumo.results import (
     JOURNALS,
     MANIFEST,
     Journal,
-    differences,
     identity_digest,
     journal_file,
     journal_head,
+    manifest_differences,
     manifest_of,
 )
 
@@ -122,7 +122,7 @@ def refuse_other_inputs(task: Task, share: Share) -> None:
     now = manifest_of(
         task.study, identity_of(task.study, system_of(task.study), share.manifest["files"])
     )
-    for _, text, _ in differences(share.manifest, now):
+    for _, text, _ in manifest_differences(share.manifest, now):
         raise InputError(
             f"study {task.study.name!r}",
             f"{text}: it was changed meanwhile, or a worker has another one",

@@ -2,4 +2,4 @@
 library.
 """
 
-from safevar_sumo.cli.program import main as main
+from safevar_sumo.cli.program import run_command_line as run_command_line

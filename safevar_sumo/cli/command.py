@@ -10,7 +10,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from rich.console import Console
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import check_writable
-from safevar_sumo.questions.answer import FORMATS, Answer, contents_of
+from safevar_sumo.questions.answer import FORMATS, Answer, Contents, contents_of
 from safevar_sumo.questions.ask import Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -74,16 +74,14 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         fail_if: tuple[str, ...],
         **values: Any,
     ) -> None:
+        # What the answer will not have is refused before it is computed.
         conditions = [_parse(text) for text in fail_if]
         if declared:
-            names_study = conditions and ... in declared.numbers  # as `simulate`
-            named = declared.with_options(values, names_in_study(values) if names_study else {})
-            for key, _, _ in conditions:
-                named.check_key(key)
-            if table is not None:
-                named.check_table(table)
+            _check_names(declared, values, [key for key, _, _ in conditions], table)
         if plot is not None:
             check_writable(plot, "plot", PICTURE_ENDINGS)
+
+        # Only the answer goes to standard output.
         form = "json" if as_json else form
         with nullcontext() if form == "text" else prints_to_standard_error():
             answer: Answer = call(**values)
@@ -93,16 +91,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             from safevar_sumo.questions.figures import save
 
             save(answer.figure(), plot, "plot")
-        failures = [
-            *answer.failures,
-            *(text for condition in conditions for text in _fulfilments(answer, *condition)),
-        ]
-        for sentence in failures:
-            click.echo(f"failed: {sentence}", err=True)
-        if failures:
-            click.get_current_context().exit(GATE_EXIT_CODE)
-        if answer.numbers.get("passed") is False:
-            click.get_current_context().exit(1)
+        _exit_on_failures(answer, conditions)
 
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
@@ -119,6 +108,32 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         callback=print_answer if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
+
+
+def _check_names(
+    declared: Contents, values: Mapping[str, Any], keys: Sequence[str], table: str | None
+) -> None:
+    """Refuse keys of conditions, and a table, that no answer of the command has."""
+    names_study = keys and ... in declared.numbers  # as `simulate`
+    named = declared.with_options(values, names_in_study(values) if names_study else {})
+    for key in keys:
+        named.check_key(key)
+    if table is not None:
+        named.check_table(table)
+
+
+def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float]]) -> None:
+    """End with an exit code if a limit is not kept, a condition holds, or a check has findings."""
+    failures = [
+        *answer.failures,
+        *(text for condition in conditions for text in _fulfilments(answer, *condition)),
+    ]
+    for sentence in failures:
+        click.echo(f"failed: {sentence}", err=True)
+    if failures:
+        click.get_current_context().exit(GATE_EXIT_CODE)
+    if answer.numbers.get("passed") is False:
+        click.get_current_context().exit(1)
 
 
 def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:

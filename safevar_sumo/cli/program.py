@@ -24,7 +24,7 @@ from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 COMMANDS_BY_GROUP = {
     "From a driving system to a decision": {
         "study": "api.study:study",
-        "simulate": "replay.simulate:simulate",
+        "simulate": "replay.simulate:show_simulation",
         "explain": "questions.explain:explain",
         "tolerance": "questions.tolerance:tolerance",
         "risk": "questions.risk:risk",
@@ -76,7 +76,7 @@ class LazyCommands(click.Group):
 
                 function: Callable[..., Any] = find_question(name)
             elif name in COMMANDS:
-                function = function_of(name)
+                function = command_function(name)
             else:
                 return None
             from safevar_sumo.cli.command import command_of
@@ -120,7 +120,7 @@ class LazyCommands(click.Group):
                 )
 
 
-def function_of(command: str) -> Callable[..., Any]:
+def command_function(command: str) -> Callable[..., Any]:
     """The function of a command, by its name."""
     module, _, name = COMMANDS[command].partition(":")
     return cast(
@@ -163,7 +163,7 @@ def commands() -> None:
     """
 
 
-def main() -> None:
+def run_command_line() -> None:
     """Run the program.
 
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a

@@ -27,7 +27,7 @@ from safevar_sumo.metrics.measures import (
     time_to_collision as time_to_collision,
 )
 from safevar_sumo.metrics.unsafe import (
-    Criterion as Criterion,
+    CriterionLike as CriterionLike,
     Unsafe as Unsafe,
     margin_of as margin_of,
 )

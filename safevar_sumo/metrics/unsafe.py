@@ -49,7 +49,7 @@ POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """
 
 
-class Bound(NamedTuple):
+class MetricBound(NamedTuple):
     """A measure, one of `COMPARISONS`, and a number: `drac > 6`."""
 
     measure: str
@@ -78,7 +78,7 @@ class Unsafe:
     points: float | None = None
     keep: float = 0.0
     contact: float = 0.0
-    bound: Bound | None = None
+    bound: MetricBound | None = None
     is_half: bool = field(default=False, compare=False, repr=False)
     """Whether `below` is half of the original's safety degree, the default if nothing collides."""
 
@@ -236,7 +236,7 @@ class Unsafe:
         return f"{verb} {left} m{end}, less than {self._keep_in_words} m"
 
     @classmethod
-    def parse(cls, criterion: Criterion) -> Unsafe:
+    def parse(cls, criterion: CriterionLike) -> Unsafe:
         """The criterion that `--unsafe` or an argument `unsafe` states: a text, or a number X for
         `below=X`.
 
@@ -267,7 +267,7 @@ class Unsafe:
             if (quantity, comparison) in (("points", "="), (RATING_POINTS.name, "<=")):
                 return cls(points=limit)
             if comparison in COMPARISONS:
-                return cls(bound=Bound(quantity, comparison, limit))
+                return cls(bound=MetricBound(quantity, comparison, limit))
         raise InputError("unsafe", repr(criterion), CRITERIA)
 
     @classmethod
@@ -337,7 +337,7 @@ def margin_of(study: Study, margin: float | None) -> float:
     return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if margin is None else margin
 
 
-Criterion = Unsafe | float | str
+CriterionLike = Unsafe | float | str
 """Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision",
 "below=X", "points=X" or a metric beyond a limit such as "drac > 6".
 """

@@ -26,7 +26,7 @@ from safevar_sumo.plugins.files import (
     digests_by_name as digests_by_name,
     file_by_name as file_by_name,
     files_in as files_in,
-    is_shipped as is_shipped,
+    is_of_shipped_network as is_of_shipped_network,
 )
 from safevar_sumo.plugins.lookup import (
     ImportPath as ImportPath,

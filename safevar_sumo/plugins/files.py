@@ -131,7 +131,7 @@ def file_by_name(name: str, folders: Sequence[str]) -> str:
     return file_beside(name, _naming_folders(folders))
 
 
-def is_shipped(name: str) -> bool:
+def is_of_shipped_network(name: str) -> bool:
     """Whether `digests` calls a file of a shipped network by this name."""
     return (NETWORKS / name).is_file()
 

@@ -25,6 +25,7 @@ from safevar_sumo.questions.tables import (
     Column as Column,
     Columns as Columns,
     Wide as Wide,
+    cell_text,
     columns_of,
     csv_cell,
     html_table,
@@ -34,7 +35,6 @@ from safevar_sumo.questions.tables import (
     reader_tables,
     tabulate as tabulate,
     terminal_tables,
-    text_of,
     with_interval as with_interval,
 )
 from safevar_sumo.records import JsonObject
@@ -273,7 +273,7 @@ class Answer:
         if self.study is not None:  # `list` has checked nothing
             print_text(
                 console,
-                "; ".join(f"{name}: {text_of(value)}" for name, value in self.numbers.items()),
+                "; ".join(f"{name}: {cell_text(value)}" for name, value in self.numbers.items()),
             )
 
     @property
@@ -350,7 +350,9 @@ class Answer:
         value = self.numbers[name]
         if not (isinstance(value, list | tuple) and int(rest) < len(value)):
             raise InputError(
-                "fail_if", f"the answer has no number {key!r}", f"{name}, which is {text_of(value)}"
+                "fail_if",
+                f"the answer has no number {key!r}",
+                f"{name}, which is {cell_text(value)}",
             )
         return [value[int(rest)]]
 

@@ -63,7 +63,7 @@ class Range(NamedTuple):
 
 Count = Annotated[int, Range(1, 100_000_000)]
 """A number of vehicles, solutions or attempts."""
-Share = Annotated[float, Range(0, 1, is_open=True)]
+Fraction = Annotated[float, Range(0, 1, is_open=True)]
 """A share such as a confidence."""
 Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""

@@ -16,7 +16,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
-from safevar_sumo.results import Failure, failure_lines, folders_of, load_runs
+from safevar_sumo.results import FailedSetting, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
 from safevar_sumo.vehicles import CharacteristicSet
@@ -67,7 +67,7 @@ class Case:
     evaluations: pd.DataFrame
     finished_runs: tuple[tuple[str, int], ...]
     has_runs: bool
-    failures: tuple[Failure, ...] = ()
+    failures: tuple[FailedSetting, ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
     stop_by_themselves: Collection[str] = ("safe_fuzzer",)
@@ -294,7 +294,7 @@ def build_case(
     evaluations: pd.DataFrame,
     finished: Sequence[tuple[str, int]],
     has_runs: bool = True,
-    failures: Sequence[Failure] = (),
+    failures: Sequence[FailedSetting] = (),
     scoring: Scoring = PUBLISHED_SCORING,
 ) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""

@@ -171,10 +171,10 @@ def check(name: str) -> Answer:
     name or package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME
     passes, 1 with findings, 2 if it cannot be loaded.
     """
-    from safevar_sumo.plugins.check import CHECKS, check as find, study_to_check  # loads SUMO
+    from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check  # loads SUMO
 
     study = study_to_check(name)
-    findings = find(study)
+    findings = check_study(study)
     rows = [
         (one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check])
         for one in findings

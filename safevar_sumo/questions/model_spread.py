@@ -15,7 +15,7 @@ from safevar_sumo.questions.evaluator import Evaluator, Found, side_by_side
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
-from safevar_sumo.sumo.matrix import at_point, evaluate
+from safevar_sumo.sumo.matrix import at_point, drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -138,7 +138,7 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
                 )
             )
         )
-    return [evaluate(system, settings) for system in systems]
+    return [drive_and_score(system, settings) for system in systems]
 
 
 def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found]) -> list[Found]:

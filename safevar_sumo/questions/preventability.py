@@ -27,7 +27,7 @@ from safevar_sumo.questions.tables import Column, Columns, with_interval
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
-from safevar_sumo.sumo.matrix import at_point, simulate
+from safevar_sumo.sumo.matrix import at_point, drive_worst
 from safevar_sumo.sumo.system import System
 
 REFERENCE_DRIVERS = "reference drivers in the same vehicle"
@@ -212,7 +212,7 @@ def approach_parameters(system: System) -> JsonObject | None:
     and holds that speed, so that both are at the same position when the danger begins. If the run
     begins at speed, the driver keeps that speed.
     """
-    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    trace = drive_worst(system, system.characteristics.original[np.newaxis]).trace
     speed = trace.speed[:, 0]
     is_braking = trace.brake[:, 0] > 0
     if speed[0] > 0 or not speed.any():

@@ -29,7 +29,7 @@ from safevar_sumo.questions.answer import (
     tabulate,
     with_interval,
 )
-from safevar_sumo.questions.ask import Count, Criterion, Share, question
+from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -83,7 +83,7 @@ def risk(
     evaluator: Evaluator,
     *,
     samples: Count = 10_000,
-    confidence: Share = 0.95,
+    confidence: Fraction = 0.95,
     unsafe: Criterion = None,
 ) -> Answer:
     """Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which

@@ -78,6 +78,8 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
+
+    # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
     vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
     evaluations = evaluator.evaluate(vehicles, "settings over the whole domain")
@@ -92,17 +94,9 @@ def rules(
         raise SimulationError(
             f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated"
         )
-    boxes = []
-    remark = ""
-    if is_unsafe.all() and len(training):
-        boxes = [np.repeat(UNLIMITED, len(characteristics), axis=1)]
-    elif min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
-        remark = (
-            f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N"
-            " draws more)."
-        )
-    else:
-        boxes = _find_boxes(training.settings, is_unsafe, characteristics)
+
+    # Rules are boxes in which unsafe vehicles are dense.
+    boxes, remark = _boxes(training.settings, is_unsafe, characteristics)
     rows = [
         (conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test))
         for box in boxes
@@ -110,6 +104,8 @@ def rules(
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
     table = tabulate("Where failures lie", COLUMNS, frame)
+
+    # The share of unsafe vehicles, and the rule that covers most of them.
     low, high = clopper_pearson(failures, total)
     drawn = (
         "drawn as [variation] says"
@@ -119,14 +115,8 @@ def rules(
     verdict = (
         f"{100 * failures / total:.2f} % of {total:,} vehicles {drawn} are unsafe "
         f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
+        f"{_rule_in_words(table, failures / total)}"
     )
-    denser = table[table["density_low"] > failures / total]
-    if len(denser):
-        rule = denser.iloc[0]
-        verdict += (
-            f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like"
-            f" that {100 * rule['density']:.0f} % are unsafe."
-        )
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -138,6 +128,20 @@ def rules(
     verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
     return Answer(
         question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
+    )
+
+
+def _rule_in_words(table: pd.DataFrame, share: float) -> str:
+    """The rule that covers most of the unsafe vehicles, if they are denser in it than their share
+    of all vehicles; else nothing.
+    """
+    denser = table[table["density_low"] > share]
+    if not len(denser):
+        return ""
+    rule = denser.iloc[0]
+    return (
+        f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like that"
+        f" {100 * rule['density']:.0f} % are unsafe."
     )
 
 
@@ -164,6 +168,21 @@ def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[
     for total in (int(is_inside.sum()), int(is_unsafe.sum())):
         values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
     return values
+
+
+def _boxes(
+    settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
+) -> tuple[list[FloatArray], str]:
+    """The boxes that become rules; none, and a remark, if too few vehicles differ."""
+    if is_unsafe.all() and len(settings):
+        return [np.repeat(UNLIMITED, len(characteristics), axis=1)], ""
+    if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
+        return _find_boxes(settings, is_unsafe, characteristics), ""
+    remark = (
+        f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N"
+        " draws more)."
+    )
+    return [], remark
 
 
 def _find_boxes(

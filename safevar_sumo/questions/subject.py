@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results import MANIFEST, differences, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, manifest_differences, manifest_of, read_manifest
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study, StudyLike, study_names
 
@@ -185,12 +185,14 @@ def case_at(case: Case, point: str) -> Case:
     InputError
         If the study has no such point.
     """
-    from safevar_sumo.sumo.matrix import at_point, evaluate
+    from safevar_sumo.sumo.matrix import at_point, drive_and_score
     from safevar_sumo.sumo.system import assemble
 
     study = at_point(case.study, point)
     system = assemble(study)
-    return case.simulated_as(study, system.measuring.scoring, evaluate(system, case.settings))
+    return case.simulated_as(
+        study, system.measuring.scoring, drive_and_score(system, case.settings)
+    )
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
@@ -210,7 +212,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     if "imported" in manifest:
         return []
     present = manifest_of(study, identity_of(study, assemble(study), manifest.get("files", {})))
-    changes = [text for _, text, matters in differences(manifest, present) if matters]
+    changes = [text for _, text, matters in manifest_differences(manifest, present) if matters]
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED
         named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")

@@ -115,7 +115,7 @@ def plain(value: Any) -> Any:
     return None if is_undefined else value
 
 
-def text_of(value: Any, number_format: str = ".4g") -> str:
+def cell_text(value: Any, number_format: str = ".4g") -> str:
     """A value for readers; `-` where undefined."""
     value = plain(value)
     if value is None:
@@ -126,13 +126,13 @@ def text_of(value: Any, number_format: str = ".4g") -> str:
         return f"{value:{number_format}}"
     if isinstance(value, dict):
         return (
-            ", ".join(f"{name} {text_of(inner, number_format)}" for name, inner in value.items())
+            ", ".join(f"{name} {cell_text(inner, number_format)}" for name, inner in value.items())
             or "-"
         )
     if isinstance(value, list):
         is_interval = len(value) == 2 and not isinstance(value[0], dict)
         separator = " to " if is_interval else "; "
-        return separator.join(text_of(inner, number_format) for inner in value) or "-"
+        return separator.join(cell_text(inner, number_format) for inner in value) or "-"
     return str(value)
 
 
@@ -211,7 +211,7 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         of_column = ends if is_end else [name]
         if len(frame) and frame[of_column].isna().all(axis=None):  # undefined in every row
             continue
-        texts = [text_of(value, column.number_format) for value in frame[name]]
+        texts = [cell_text(value, column.number_format) for value in frame[name]]
         texts = [words.get(text, text) for text in texts]
         if ends[0] in frame:
             pairs = frame[ends].itertuples(index=False)
@@ -234,7 +234,7 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
     """An interval, of which an end may be missing, for readers."""
-    texts = text_of(low, number_format), text_of(high, number_format)
+    texts = cell_text(low, number_format), cell_text(high, number_format)
     if low == high:
         return texts[0]
     forms = {(True, True): "-", (True, False): "up to {1}", (False, True): "from {0}"}

@@ -32,6 +32,6 @@ from safevar_sumo.records.evaluations import (
     ROUNDING as ROUNDING,
     CellResults as CellResults,
     Evaluations as Evaluations,
-    Results as Results,
+    ResultColumns as ResultColumns,
     differences as differences,
 )

@@ -14,7 +14,7 @@ from safevar_sumo.study import SAFETY_DEGREE
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
 """The arrays of `Evaluations` that all evaluations have, with one row for each setting."""
-Results = Mapping[str, npt.NDArray[np.generic]]
+ResultColumns = Mapping[str, npt.NDArray[np.generic]]
 """Results by name, one element for each setting."""
 ROUNDING = 1e-9
 """Largest accepted difference between a result in a recorded scene and in SUMO."""
@@ -74,7 +74,7 @@ class Evaluations:
         )
 
     @property
-    def results(self) -> Results:
+    def results(self) -> ResultColumns:
         """Outcomes and metrics by name."""
         return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
 
@@ -176,7 +176,7 @@ class Evaluations:
 
 
 def differences(
-    outputs: Results, others: Results, tolerance: float = 0.0
+    outputs: ResultColumns, others: ResultColumns, tolerance: float = 0.0
 ) -> Iterator[tuple[int, str]]:
     """Yield, for each result that differs, the first row where it does, and both values in
     words.

@@ -68,7 +68,7 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
         )
     data = data.take(here.valid)
     here = here.take(here.valid)
-    numbers = count_collisions(data, here)
+    numbers = agreement_counts(data, here)
     table = measure_agreement(data, here)
     measures = table.loc[
         table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]
@@ -111,7 +111,7 @@ def _draw(title: str, reference: ReferenceData, here: Evaluations, answer: Answe
     return figure
 
 
-def count_collisions(reference: ReferenceData, here: Evaluations) -> dict[str, int]:
+def agreement_counts(reference: ReferenceData, here: Evaluations) -> dict[str, int]:
     """Numbers of rows, and of those that collide here, in the reference, and in both."""
     return {
         "rows": len(here),

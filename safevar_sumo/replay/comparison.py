@@ -22,7 +22,7 @@ from safevar_sumo.results import UNKNOWN
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.bodies import Film
-from safevar_sumo.sumo.network import Network, built_network, stage_network
+from safevar_sumo.sumo.network import NetworkFiles, built_network, stage_network
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.verification import drive_again
 
@@ -97,7 +97,7 @@ class Comparison:
         ]
 
     @property
-    def network(self) -> Network:
+    def network(self) -> NetworkFiles:
         """The scenario's network, with the lanes that the scenario's parameters define."""
         return stage_network(self.point.scenario)
 
@@ -176,7 +176,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
     )
 
 
-def read_road(network: Network) -> tuple[LaneLine, ...]:
+def read_road(network: NetworkFiles) -> tuple[LaneLine, ...]:
     """Read the lanes of one copy of a network, as netconvert built it."""
     lanes = []
     for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):

@@ -22,7 +22,7 @@ from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.network import Network, built_network, run_program
+from safevar_sumo.sumo.network import NetworkFiles, built_network, run_program
 from safevar_sumo.sumo.system import assemble
 
 ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
@@ -135,7 +135,7 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     return actors
 
 
-def open_drive(network: Network) -> str:
+def open_drive(network: NetworkFiles) -> str:
     """The network as OpenDRIVE 1.4, by netconvert, without the time of the conversion.
 
     Raises

@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.api.evaluation import evaluate_settings
+from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
@@ -117,7 +117,7 @@ class Target(NamedTuple):
     sweep=[*OUTCOME_NAMES, ...],
     remarks=REMARKS,
 )
-def simulate(
+def show_simulation(
     source: str,
     *,
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
@@ -335,7 +335,7 @@ def _sweep(
     """A row for each setting of a sweep."""
     characteristics = system.characteristics
     settings = characteristics.filter(requested) if filtered else requested
-    evaluations = evaluate_settings(
+    evaluations = evaluate_with_workers(
         study, np.concatenate([characteristics.original[np.newaxis], settings])
     )
     contact = system.contact

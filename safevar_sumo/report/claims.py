@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.api.evaluation import evaluate_settings
+from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.errors import InputError, SafevarError, about
@@ -190,7 +190,7 @@ class Packed:
         names = self.case.characteristics.names
         solutions = self.case.solutions
         settings = self.case.settings
-        evaluations = evaluate_settings(
+        evaluations = evaluate_with_workers(
             self.case.study, settings, jobs=self._jobs, progress=self._progress
         )
         frame = evaluations_frame(names, [(("", 0), evaluations.take(range(1, len(settings))))])
@@ -304,7 +304,7 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]) ->
     return [*(counts[run] for run in runs), len(solutions), len(solutions.drop_duplicates())]
 
 
-def compare(study: str, claim: Claim) -> tuple[str, ...]:
+def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     """A row of `CLAIMS`: a claim, computed again; the lines shown are the first that differ."""
     try:
         here = claim.compute()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
-from safevar_sumo.plugins import code_files, file_by_name, is_shipped, only_from
+from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Jobs, with_criterion
 from safevar_sumo.questions.case import Case
@@ -34,7 +34,7 @@ from safevar_sumo.report.claims import (
     STUDY,
     Claim,
     Packed,
-    compare,
+    compare_claim,
     count_outcomes,
     count_solutions,
     csv_of,
@@ -54,7 +54,7 @@ from safevar_sumo.report.pack import (
 from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, read_manifest
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.network import OPTIONS_FILE, options_of
+from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
 
@@ -153,7 +153,7 @@ def _files_of_user(
     of networks, without which SUMO does not start, by their names in a pack.
     """
     places = study.origin.places
-    names = [name for name in named if not is_shipped(name)]
+    names = [name for name in named if not is_of_shipped_network(name)]
     for name in names:
         if Path(name).is_absolute():
             raise InputError(
@@ -162,7 +162,7 @@ def _files_of_user(
                 "a copy beside the study",
             )
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
-        view = options_of(Path(file_by_name(name, places))).get("gui-settings-file", "")
+        view = options_in(Path(file_by_name(name, places))).get("gui-settings-file", "")
         names += [str(Path(name).with_name(view))] if view else []
     paths = {name: Path(found) for name in names if (found := file_by_name(name, places))}
     modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
@@ -226,11 +226,12 @@ def verify(
         of_files = Claim(
             "files", json_bytes(description.files), lambda: json_bytes(digests_of(files))
         )
-        rows = [compare(names, of_files)]
+        rows = [compare_claim(names, of_files)]
         for place, packed in studies.items():
             with only_from(str(place / CODE)):
                 rows += [
-                    compare(packed.case.study.name, claim) for claim in packed.claims(place, search)
+                    compare_claim(packed.case.study.name, claim)
+                    for claim in packed.claims(place, search)
                 ]
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
@@ -287,7 +288,7 @@ def _unpack(
         if len(json_of(own_files[ANSWERS])) != len(described.questions):
             raise ValueError(f"{ANSWERS} answers other questions than {DESCRIPTION} names")
         for name in json_of(own_files[MANIFEST])["files"]:
-            if not (is_shipped(name) or f"{CODE}/{name}" in code):
+            if not (is_of_shipped_network(name) or f"{CODE}/{name}" in code):
                 raise ValueError(f"{name}, on which the results depend, is not in the pack")
         return Packed(described, own_files, [str(folder / CODE)] if code else [], jobs, progress)
     except (*MALFORMED, InputError) as error:

@@ -36,7 +36,7 @@ from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.questions.tolerance.by_parameter import usual_values
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.report.sections import ReportedStudy, commands, facts, replays, tested, trust
+from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, replays, tested, trust
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -125,6 +125,8 @@ def report(
         raise InputError(
             "point", "the research questions are about whole studies", "no `paper`, or no `point`"
         )
+
+    # The questions: to each of the results alone, and to all together.
     paths = [
         Path(check_text("results", getattr(source, "directory", source))) for source in results
     ]
@@ -132,13 +134,7 @@ def report(
     usual_joint = ["compare"] if len(cases) == 2 else []
     joint = [text for text in ask or usual_joint if parse_question(text)[0].others]
     alone = [text for text in ask if text not in joint]
-    later_changes = [
-        changes_since(path, case, as_it_is_now=as_it_is_now)
-        for path, case in zip(paths, cases, strict=True)
-    ]
-    for path, changes in zip(paths, later_changes, strict=True):
-        for change in changes:
-            warn(f"{path}: {change}")
+    later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     answer_question = answer_to if ask else answer_or_reason
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
@@ -147,9 +143,7 @@ def report(
     total = sum(map(len, asked)) + len(joint)
 
     def next_answer(text: str, chosen: slice) -> Answer:
-        """The answer to the next question, about these of the results; progress shows its own
-        number.
-        """
+        """The next answer, about these of the results."""
         question = with_criterion(text, unsafe)
         subjects = by_criterion if has_criterion(question, unsafe) else at_point
         show_part = partial(
@@ -157,10 +151,10 @@ def report(
         )
         return answer_question(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
+    # The answers, in the order of the page.
     with open_progress(progress) as show:
-        studies = []
-        for number, path in enumerate(paths):
-            study = ReportedStudy(
+        studies = [
+            ReportedStudy(
                 directory=path,
                 case=by_criterion[number],
                 versions=read_manifest(path)["versions"],
@@ -168,22 +162,42 @@ def report(
                 point=point or "",
                 later_changes=later_changes[number],
             )
-            studies.append(study)
+            for number, path in enumerate(paths)
+        ]
         shared = [next_answer(text, slice(None)) for text in joint]
         pictures = list[JsonObject]()
         if paper:
             show("tables and figures", 0, 1)
-            command = " ".join(
-                [PROGRAM_COMMAND, "tables", *(shlex.quote(str(path)) for path in paths)]
-            )
-            try:
-                pictures = [_picture(figure) for figure in draw_figures(cases).values()]
-                shared.append(replace(answer_questions(cases), command=command))
-            except InputError as error:  # no run is finished
-                shared.append(_no_answer("tables", cases[0], error))
+            pictures, tables = _research_questions(cases, paths)
+            shared.append(tables)
         page = make_page(studies, shared, pictures, show)
     write_whole(out, page)
     return out
+
+
+def _later_changes(
+    paths: Sequence[Path], cases: Sequence[Case], *, as_it_is_now: bool
+) -> list[list[str]]:
+    """The changes of files and versions since each of the results, of which the user is warned."""
+    later_changes = []
+    for path, case in zip(paths, cases, strict=True):
+        changes = changes_since(path, case, as_it_is_now=as_it_is_now)
+        for change in changes:
+            warn(f"{path}: {change}")
+        later_changes.append(changes)
+    return later_changes
+
+
+def _research_questions(
+    cases: Sequence[Case], paths: Sequence[Path]
+) -> tuple[list[JsonObject], Answer]:
+    """The figures and tables of the paper's research questions, if a run is finished."""
+    command = " ".join([PROGRAM_COMMAND, "tables", *(shlex.quote(str(path)) for path in paths)])
+    try:
+        pictures = [_picture(figure) for figure in draw_figures(cases).values()]
+        return pictures, replace(answer_questions(cases), command=command)
+    except InputError as error:
+        return [], _no_answer("tables", cases[0], error)
 
 
 def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = None) -> list[str]:
@@ -251,7 +265,7 @@ def make_page(
     progress: Progress = show_no_progress,
 ) -> str:
     """The page about studies, with answers and pictures about all of them."""
-    of_studies = chain(*map(commands, studies))
+    of_studies = chain(*map(page_commands, studies))
     of_shared = [
         (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
     ]

@@ -402,7 +402,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         )
 
 
-def commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
+def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it gives."""
     directory = str(study.directory)
     flag = " --as-it-is-now" if study.later_changes else ""

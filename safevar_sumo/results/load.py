@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class Failure(NamedTuple):
+class FailedSetting(NamedTuple):
     """A setting that could not be simulated: its algorithm, run, position in the run from 0, and
     why.
     """
@@ -44,19 +44,19 @@ class Failure(NamedTuple):
         return f"{self.algorithm}:{self.run}, evaluation {self.position}: {self.reason}"
 
 
-def failures_of(
+def failed_settings(
     key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations
-) -> list[Failure]:
+) -> list[FailedSetting]:
     """The settings of a run that could not be simulated."""
     rows = np.flatnonzero(evaluations.failed).tolist()
-    return [Failure(*key, positions[row], evaluations.reason(row)) for row in rows]
+    return [FailedSetting(*key, positions[row], evaluations.reason(row)) for row in rows]
 
 
-def failure_lines(failures: Sequence[Failure]) -> list[str]:
+def failure_lines(failures: Sequence[FailedSetting]) -> list[str]:
     """A line for each distinct reason: the first failure with this reason, and the number of
     further failures.
     """
-    failures_by_reason: dict[str, list[Failure]] = {}
+    failures_by_reason: dict[str, list[FailedSetting]] = {}
     for failure in failures:
         failures_by_reason.setdefault(failure.reason, []).append(failure)
     return [
@@ -89,7 +89,7 @@ class StoredResults(NamedTuple):
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
     finished: tuple[tuple[str, int], ...] = ()
-    failures: tuple[Failure, ...] = ()
+    failures: tuple[FailedSetting, ...] = ()
 
 
 def load_runs(directory: str | Path) -> StoredResults:
@@ -128,7 +128,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
-        failures += failures_of((algorithm, run), positions, evaluations)
+        failures += failed_settings((algorithm, run), positions, evaluations)
         if budget in content.results:
             solutions_of_runs.append(
                 ((algorithm, run), content.take_positions(content.results[budget]))

@@ -192,7 +192,7 @@ def identity_digest(manifest: JsonObject) -> str:
     return sha256(json.dumps({**layers, "versions": versions}, sort_keys=True).encode()).hexdigest()
 
 
-def differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
+def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of two manifests: of stored results, and of now.
 
     Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other

@@ -25,9 +25,9 @@ from safevar_sumo.results.manifest import (
     MANIFEST,
     RUNS,
     SOLUTIONS,
-    differences,
     disk_errors,
     make_directory,
+    manifest_differences,
     manifest_of,
     read_manifest,
     search_extent_of,
@@ -131,7 +131,7 @@ class ResultsDirectory:
         problem = "holds results of another study"
         if "imported" in stored:
             raise InputError(self.path, f"{problem}: they are imported", "another `out`")
-        for layer, text, _ in differences(stored, self.manifest):
+        for layer, text, _ in manifest_differences(stored, self.manifest):
             raise InputError(
                 self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}"
             )

@@ -32,7 +32,7 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, Roads, World
 from safevar_sumo.study import searched
 
-Positive = Annotated[float, Meta(gt=0, le=3600)]
+_Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
 """How far beyond the place where he turns a pedestrian may get by rounding errors [m]."""
 VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
@@ -113,12 +113,12 @@ class PedestrianCrossing(
     """
 
     network: str = "pedestrian_crossing"
-    duration: Positive = 9.5
+    duration: _Positive = 9.5
     turns_after: float | None = 0.7
-    lane_width: Positive = 3.5
+    lane_width: _Positive = 3.5
     distance: (
         Annotated[
-            Positive,
+            _Positive,
             searched(
                 6.0,
                 30.0,
@@ -129,11 +129,11 @@ class PedestrianCrossing(
         | None
     ) = None
     walking_speed: (
-        Annotated[Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None
+        Annotated[_Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None
     ) = None
     lateral_start: (
         Annotated[
-            Positive,
+            _Positive,
             searched(4.0, 13.0, "m", "start of the pedestrian, to the right of the lane's middle"),
         ]
         | None
@@ -285,10 +285,10 @@ class LeadVehicleStopped(
     """
 
     network: str = "lead_vehicle_stopped"
-    duration: Positive = 16.0
+    duration: _Positive = 16.0
     distance: (
         Annotated[
-            Positive,
+            _Positive,
             searched(
                 10.0, 75.0, "m", "gap at the start, from the front bumper to the parked vehicle"
             ),

@@ -77,13 +77,13 @@ others.
 """
 MAX_DIRECTIONS = 100_000
 """Largest number of reference directions, and of individuals."""
-Count = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
+DirectionCount = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
 TYPES: dict[str, Any] = {
-    "ref_dirs": Count | list[list[float]],
+    "ref_dirs": DirectionCount | list[list[float]],
     "ref_points": list[list[float]],
-    "pop_per_ref_point": Count,
-    "pop_size": Count,
-    "n_offsprings": Count,
+    "pop_per_ref_point": DirectionCount,
+    "pop_size": DirectionCount,
+    "n_offsprings": DirectionCount,
     "weights": list[float],
     "F": float | list[float],
 }

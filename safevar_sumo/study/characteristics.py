@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, check_name, one_of
 from safevar_sumo.study.marks import WITHOUT_EFFECT, Table
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
-Description = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
+ShortText = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
 MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
 
@@ -37,7 +37,7 @@ class Domain(Table, frozen=True, kw_only=True):
     original: float
     lower: float
     upper: float
-    meaning: Description = ""
+    meaning: ShortText = ""
 
     def __post_init__(self) -> None:
         if max(abs(self.original), abs(self.lower), abs(self.upper)) > MAX_MAGNITUDE:
@@ -57,7 +57,7 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
     """
 
     weight: PositiveNumber = 1.0
-    counterpart: Description = ""
+    counterpart: ShortText = ""
 
 
 def unit_text(unit: str, layout: str = " {}") -> str:

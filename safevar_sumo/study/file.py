@@ -27,7 +27,7 @@ from safevar_sumo.study.marks import (
     WHOLE,
     keys_with,
 )
-from safevar_sumo.study.scenario_file import MODEL, files_of, with_file
+from safevar_sumo.study.scenario_file import MODEL, files_of_scenario, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     PYMOO,
@@ -400,5 +400,5 @@ def data_files(study: Study) -> dict[str, str]:
     if study.scenario.model == MODEL:
         tests = () if study.matrix is None else study.matrix.tests
         with about(study.source):
-            paths |= files_of(study.scenario.parameters, tests, study.origin.places)
+            paths |= files_of_scenario(study.scenario.parameters, tests, study.origin.places)
     return paths

@@ -48,7 +48,7 @@ def path_of(name: str, places: Sequence[str]) -> str:
     )
 
 
-def files_of(
+def files_of_scenario(
     scenario: Parameters, tests: Sequence[MatrixTest], places: Sequence[str]
 ) -> dict[str, str]:
     """The paths of all files that a scenario from a file depends on at any point of a matrix, by

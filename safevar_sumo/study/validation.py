@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from types import NoneType, UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import msgspec
 from msgspec import Struct
@@ -52,54 +52,83 @@ NO_KEY = "origin"
 """Field of a study that no file may have."""
 
 
+class _Place(NamedTuple):
+    """Where a mistake is: its path, the value there and the type that it is meant to have, also as
+    declared; the types above; and the other values of the same table.
+    """
+
+    path: list[str | int]
+    value: Any
+    kind: Any
+    declared: list[Any]
+    siblings: dict[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The path and its value."""
+        return f"{_path_text(self.path)} = {_short_text(self.value)}"
+
+
+def _place(raw: Any, table: Any, prefix: str, location: str) -> _Place:
+    """The place that a message of msgspec names, such as `.search.runs` or `.tests[0]`."""
+    path: list[str | int] = [prefix] if prefix else []
+    value = raw
+    declared = [table]
+    siblings = dict[str, Any]()
+    for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
+        inner = _inner_type(_meant(declared[-1], value), name)
+        siblings = value if isinstance(value, dict) else {}
+        key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
+        path.append(key)
+        value = value[key]
+        declared.append(inner)
+    return _Place(path, value, _meant(declared[-1], value), declared, siblings)
+
+
 def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     """The error for a message of msgspec, which ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
-    path = [prefix] if prefix else []
-    value = raw
-    kinds = [table]
-    siblings = dict[str, Any]()
-    for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
-        inner = _inner_type(_meant(kinds[-1], value), name)
-        siblings = value if isinstance(value, dict) else {}
-        key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
-        path = [*path, key]
-        value = value[key]
-        kinds.append(inner)
-    kind = _meant(kinds[-1], value)
-    text = _path_text(path)
-    quoted = _short_text(value)
+    place = _place(raw, table, prefix, location)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
-        return _unknown_key(_path_text([*path, field[1]]), field[1], kind, table)
+        path = _path_text([*place.path, field[1]])
+        return _unknown_key(path, field[1], place.kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):
-        known = [
-            name
-            for name, other in siblings.items()
-            if isinstance(other, dict) and field[1] in other
-        ]
-        hint = did_you_mean(path[-1], known) if path else ""  # a mistyped table is a new one
-        needed = ", ".join(one.name for one in msgspec.structs.fields(kind) if one.required)
-        legal = f"{needed} for what is new here" + (f"; else {', '.join(known)}" if known else "")
-        return InputError("", f"{text}: {field[1]} is missing{hint}".removeprefix(": "), legal)
+        return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
-        return unknown_name("", f"{text} = {quoted}", value, filter(None, get_args(kind)))
+        return unknown_name("", place.text, place.value, filter(None, get_args(place.kind)))
     if problem.startswith("Invalid value"):  # of the key that tells which table is meant
-        tags = [one.__struct_config__.tag for one in get_args(kinds[-2])]
-        return unknown_name("", f"{text} = {quoted}", value, tags)
+        tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-2])]
+        return unknown_name("", place.text, place.value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
-        if expected[1] == "`object`" and _is_record(kind):
-            return InputError(
-                "", f"{text} = {quoted}", f"a table of {', '.join(kind.__struct_fields__)}"
-            )
-        for meta in getattr(kinds[-1], "__metadata__", ()):
-            if meta.pattern and meta.description:
-                return InputError("", f"{text} = {quoted}", meta.description)
-        legal = re.sub(
-            r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected[1]
-        )
-        return InputError("", f"{text} = {quoted}", legal.replace("`", "").replace(" | ", " or "))
+        return InputError("", place.text, _expected_in_words(place, expected[1]))
     problem, _, legal = problem.partition("\n")  # of a `__post_init__`
-    return InputError("", f"{text}: {problem}".removeprefix(": "), legal)
+    return InputError("", f"{_path_text(place.path)}: {problem}".removeprefix(": "), legal)
+
+
+def _missing_key(place: _Place, key: str) -> InputError:
+    """The error for a missing key: a table without it may have a mistyped name, and thus be taken
+    for a new one.
+    """
+    known = [
+        name for name, table in place.siblings.items() if isinstance(table, dict) and key in table
+    ]
+    hint = did_you_mean(place.path[-1], known) if place.path else ""
+    needed = ", ".join(field.name for field in msgspec.structs.fields(place.kind) if field.required)
+    legal = f"{needed} for what is new here" + (f"; else {', '.join(known)}" if known else "")
+    problem = f"{_path_text(place.path)}: {key} is missing{hint}".removeprefix(": ")
+    return InputError("", problem, legal)
+
+
+def _expected_in_words(place: _Place, expected: str) -> str:
+    """What msgspec expects of a value, in words."""
+    if expected == "`object`" and _is_record(place.kind):
+        return f"a table of {', '.join(place.kind.__struct_fields__)}"
+    for meta in getattr(place.declared[-1], "__metadata__", ()):
+        if meta.pattern and meta.description:
+            return str(meta.description)
+    names = r"\b(?:" + "|".join(WORDS) + r")\b"
+    legal = re.sub(names, lambda word: WORDS[word[0]], expected)
+    return legal.replace("`", "").replace(" | ", " or ")
 
 
 def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
@@ -110,10 +139,8 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     places = dict[str, str]()
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
-            places |= {
-                inner: f"{field.name}.{inner}"
-                for inner in getattr(field.type, "__struct_fields__", ())
-            }
+            inner_keys = getattr(_meant(field.type, {}), "__struct_fields__", ())
+            places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
     places |= {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
@@ -127,14 +154,14 @@ def _meant(kind: Any, value: Any) -> Any:
     if get_origin(kind) not in (Union, UnionType):
         return kind
     kinds = [
-        one
-        for one in get_args(kind)
-        if one is not NoneType and _is_table(one) == isinstance(value, dict)
+        member
+        for member in get_args(kind)
+        if member is not NoneType and _is_table(member) == isinstance(value, dict)
     ]
-    for one in filter(_is_record, kinds):
-        config = one.__struct_config__
+    for record in filter(_is_record, kinds):
+        config = record.__struct_config__
         if value.get(config.tag_field or "") == config.tag:
-            return one
+            return record
     return next(iter(kinds), kind)
 
 

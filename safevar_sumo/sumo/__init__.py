@@ -3,9 +3,9 @@
 from safevar_sumo.sumo.batch import is_recorded as is_recorded, reason_for_sumo as reason_for_sumo
 from safevar_sumo.sumo.engine import Engine as Engine
 from safevar_sumo.sumo.matrix import (
-    evaluate as evaluate,
+    drive_and_score as drive_and_score,
+    drive_worst as drive_worst,
     settings_per_batch as settings_per_batch,
-    simulate as simulate,
     simulate_all_points as simulate_all_points,
     vehicle_remarks as vehicle_remarks,
 )

@@ -89,37 +89,46 @@ def drive_all(
     InputError
         If a user's ADS fails, or takes longer than the time limit.
     """
-    on_road, vehicles = system.at_encounters(settings)
+    vehicles, encounters = system.cut(settings)
+    on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
-        stage = stage_of(system, settings)
+        stage = stage_of(system, encounters)
+
+        # In SUMO, among the other actors that it moves.
         if not is_recorded(system, engine):
-            with open_points_world(system, settings, stage) as sumo_world:
+            with open_points_world(system, encounters, stage) as sumo_world:
                 return drive(
                     on_road, vehicles, sumo_world, observer_of(scenario, sumo_world, stage), listen
                 )
+
+        # On a lane, among bodies on tracks, at all points at once.
         if stage is not None:
             lane = LaneWorld(stage, _start_speeds(on_road.points, len(settings)), stage.step)
             return drive(on_road, np.tile(vehicles, (len(system.points), 1)), lane, stage, listen)
-        world = _recorded_world(system, settings, scenario)
+
+        # In a scene that SUMO has played once.
+        world = _recorded_world(system, encounters, scenario)
         return drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
 
 
-def _recorded_world(system: System, settings: FloatArray, encounters: Scenario) -> RecordedWorld:
-    """The recorded scene of the system's only point for N settings, shape (N, n); a scene for each
-    of its `encounters` if the study searches them.
+def _recorded_world(
+    system: System, encounters: FloatArray, scenario_there: Scenario
+) -> RecordedWorld:
+    """The recorded scene of the system's only point for N encounters, shape (N, k); a scene for
+    each if the scenario differs there.
     """
     (point,) = system.points
     assert isinstance(point.scenario, WorldScenario)
     scene = system.scenes.of(point.scenario)
     assert isinstance(scene, Recording)
-    if encounters is point.scenario:
-        return RecordedWorld(scene, len(settings))
-    size = _vehicles_per_encounter(settings[:, ~system.characteristics.of_vehicle])
-    scenario = system.at_encounters(settings[::size])[0].scenario
+    if scenario_there is point.scenario:
+        return RecordedWorld(scene, len(encounters))
+    size = _vehicles_per_encounter(encounters)
+    scenario = system.at_encounters(encounters[::size]).scenario
     assert isinstance(scenario, WorldScenario)
-    return RecordedWorld(scenes_of_encounters(scene, scenario, len(settings) // size), size)
+    return RecordedWorld(scenes_of_encounters(scene, scenario, len(encounters) // size), size)
 
 
 def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> Observer:
@@ -130,24 +139,23 @@ def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> O
     return SceneObserver(scenario, world)
 
 
-def stage_of(system: System, settings: FloatArray) -> Stage | None:
-    """The bodies around N settings, shape (N, n), at every point; None if the scenario observes a
-    world itself.
+def stage_of(system: System, encounters: FloatArray) -> Stage | None:
+    """The bodies around N vehicles in their encounters, shape (N, k), at every point; None if the
+    scenario observes a world itself.
     """
     scenarios = [
         point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)
     ]
     if len(scenarios) < len(system.points):
         return None
-    group = np.repeat(np.arange(len(scenarios)), len(settings))
-    if len(
-        system.characteristics.scenario
-    ):  # an encounter that several vehicles meet is there once
-        encounters = settings[:, ~system.characteristics.of_vehicle]
+    group = np.repeat(np.arange(len(scenarios)), len(encounters))
+
+    # An encounter that several vehicles meet is there once.
+    if encounters.shape[1]:
         _, first, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
-        if len(first) == len(settings):
-            first = group = np.arange(len(settings))
-        scenario = system.at_encounters(settings[first])[0].scenario
+        if len(first) == len(encounters):
+            first = group = np.arange(len(encounters))
+        scenario = system.at_encounters(encounters[first]).scenario
         assert isinstance(scenario, TrackScenario)
         scenarios = [scenario]
     step = system.scenes.step_of(scenarios[0])
@@ -173,28 +181,28 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 
 
 def open_points_world(
-    system: System, settings: FloatArray, stage: Stage | None, start: Start = open_in_process
+    system: System, encounters: FloatArray, stage: Stage | None, start: Start = open_in_process
 ) -> AbstractContextManager[SumoWorld]:
-    """Start SUMO on a copy of the network of the system's only point for each of N settings, shape
-    (N, n).
+    """Start SUMO on a copy of the network of the system's only point for each of N encounters,
+    shape (N, k).
     """
     (point,) = system.points
     step = system.scenes.step
-    n = len(settings)
-    encounters = system.characteristics.scenario
+    n, n_searched = encounters.shape
+    names = system.characteristics.scenario.names
     scenarios = [point.scenario]
-    if len(encounters):
-        rows = settings[:, ~system.characteristics.of_vehicle].tolist()
+    if n_searched:
         scenarios = [
-            encounter(point, dict(zip(encounters.names, row, strict=True))).scenario for row in rows
+            encounter(point, dict(zip(names, values, strict=True))).scenario
+            for values in encounters.tolist()
         ]
     networks = stage_networks(scenarios)
     create: Callable[[Api, int], SumoWorld] = SumoWorld
     if stage is not None:
-        speeds = _start_speeds(system.at_encounters(settings)[0].points, n)
+        speeds = _start_speeds(system.at_encounters(encounters).points, n)
         create = partial(
             StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step)
         )
-    if len(encounters):
+    if n_searched:
         return open_varied_world(networks, step, create, start)
     return open_world(copied_network(networks[0], n), n, step, create, start)

@@ -22,12 +22,12 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
-from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World as ScenariosWorld
+from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World
 from safevar_sumo.scenarios.tracks import corners_of
 from safevar_sumo.vehicles import SumoType
 
 
-class Motion(NamedTuple):
+class VehicleStates(NamedTuple):
     """Where N vehicles under test are: their front bumpers, shape (N, 2) [m], their speeds, shape
     (N,) [m/s], and the speeds of those that hit somebody in this step, by vehicle number. Vehicles
     whose runs have ended keep their last values.
@@ -125,7 +125,7 @@ class Film(NamedTuple):
         return np.arctan2(self.motion[..., 3], self.motion[..., 2])
 
 
-class World(Protocol):
+class VehicleWorld(Protocol):
     """N vehicles under test: on a lane, in a recorded scene or in SUMO."""
 
     n: int
@@ -135,14 +135,14 @@ class World(Protocol):
     def frame(self) -> Frame:
         """The coordinates in which the vehicles' positions are along their lane."""
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
         """Put the vehicles onto the road and return their first motion; called once, first.
 
         Without `types` any speed is possible. With `keeps_drivers` SUMO's drivers keep the
         decelerations that the traffic file gives them.
         """
 
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         """Simulate a step in which the vehicles whose runs are open reach `speeds` [m/s], shape
         (N,).
         """
@@ -158,7 +158,7 @@ class World(Protocol):
         """Width of the vehicles under test [m]."""
 
 
-class SceneWorld(World, ScenariosWorld, Protocol):
+class SceneWorld(VehicleWorld, World, Protocol):
     """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as
     theirs.
     """
@@ -183,7 +183,7 @@ COLLISION_PLACES = (
 )
 
 
-class Contacts:
+class FirstContacts:
     """First contacts of N vehicles, `first`.
 
     In a Euro NCAP test, where `is_tested`, only contacts of the vehicle's front are collisions.
@@ -194,7 +194,9 @@ class Contacts:
         self._was_inside = np.zeros(n, dtype=bool)
         self.first = Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n))
 
-    def count(self, world: World, hits: Mapping[int, float], scene: Scene) -> dict[int, float]:
+    def count(
+        self, world: VehicleWorld, hits: Mapping[int, float], scene: Scene
+    ) -> dict[int, float]:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by
         vehicle number.
         """

@@ -21,6 +21,7 @@ from safevar_sumo.records import (
     TIME_DECIMALS,
     BoolArray,
     Command,
+    Encounter,
     FloatArray,
     Observation,
     Outcome,
@@ -29,7 +30,7 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
-from safevar_sumo.sumo.bodies import Contacts, Motion, World
+from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
@@ -48,7 +49,7 @@ TRUTHS = ("active", "visible")
 def drive(
     system: System,
     settings: FloatArray,
-    world: World,
+    world: VehicleWorld,
     observer: Observer,
     listen: Listener | None = None,
 ) -> SimulationRuns:
@@ -62,19 +63,22 @@ def drive(
     step = world.step_length
     n = len(settings)
     size = n // len(points)
+
+    # Vehicles, driving systems and what is noted of the runs, at the start.
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
     memory = ads.start(n, system.nominal, step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
-    contacts = Contacts(n, np.repeat([point.scenario.is_hit_in_front for point in points], size))
+    is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
+    contacts = FirstContacts(n, is_tested)
     outcomes = _Outcomes(n)
-    last_sample = np.round(
-        per_vehicle([point.scenario.duration / step for point in points], size)
-    ).astype(int)
+    durations = per_vehicle([point.scenario.duration / step for point in points], size)
+    last_sample = np.round(durations).astype(int)
     log = _Log(world, int(last_sample.max()) + 1)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
+            # What is around the vehicles now, and which runs end by it.
             time = sample * step
             speed = motion.speeds
             scene = observer.observe(motion, outcomes.is_open)
@@ -85,6 +89,7 @@ def drive(
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
             active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_sample)
 
+            # What the driving systems see, and what they command.
             observation = perception.observe(time, speed, scene)
             observation = observation._replace(throttle=state.throttle, brake=state.brake)
             observation, state = vehicle.sense(prepared, state, observation)
@@ -93,26 +98,35 @@ def drive(
             command, memory = ads.drive(observation, memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
-            log.write(
-                motion.fronts,
-                scene,
-                command,
-                speed=speed,
-                gear=state.gear,
-                active=active,
-                pedal=state.brake,
-            )
+            values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
+            log.write(motion.fronts, scene, command, **values)
             if not np.count_nonzero(outcomes.is_open):
                 break
 
+            # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
             state = vehicle.advance(prepared, state, command)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
-    encounter = observer.encounter(trace)
-    ended = outcomes.classify()
+    return _runs(
+        points, outcomes, robot, contacts, trace=trace, encounter=observer.encounter(trace)
+    )
+
+
+def _runs(
+    points: Sequence[Point],
+    outcomes: _Outcomes,
+    robot: DrivingRobot,
+    contacts: FirstContacts,
+    *,
+    trace: Trace,
+    encounter: Encounter,
+) -> SimulationRuns:
+    """The runs of N vehicles that have ended."""
     # In an encounter in which nothing happens, all but a collision says nothing.
+    ended = outcomes.classify()
+    size = len(ended) // len(points)
     is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (
         ended != Outcome.COLLISION
     )
@@ -133,10 +147,10 @@ class Fleet(NamedTuple):
 
     prepared: Prepared
     ads: Ads
-    motion: Motion
+    motion: VehicleStates
 
 
-def enter(system: System, settings: FloatArray, world: World) -> Fleet:
+def enter(system: System, settings: FloatArray, world: VehicleWorld) -> Fleet:
     """Put the vehicles of N settings, shape (N, n), onto the road."""
     vehicle = system.vehicle
     n = len(settings)
@@ -208,7 +222,7 @@ class _Log:
     positions on SUMO's plane an array of shape (T, N, 2) [m].
     """
 
-    def __init__(self, world: World, capacity: int) -> None:
+    def __init__(self, world: VehicleWorld, capacity: int) -> None:
         self.capacity = capacity
         self._samples = 0
         self._step = world.step_length

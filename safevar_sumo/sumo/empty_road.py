@@ -36,7 +36,7 @@ class Reason(StrEnum):
     STANDS = "stands"
 
 
-class Problem(NamedTuple):
+class EmptyRoadFault(NamedTuple):
     """What the original vehicle does wrong on an empty road, with a verb in front."""
 
     reason: Reason
@@ -48,7 +48,7 @@ def why_no_verdict(system: System) -> str:
     return sentence_on(find_problems(system), len(system.points))
 
 
-def find_problems(system: System) -> dict[str, Problem]:
+def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     """What keeps the original vehicle from the encounter, by the name of the point.
 
     At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If
@@ -77,7 +77,7 @@ def find_problems(system: System) -> dict[str, Problem]:
     }
 
 
-def sentence_on(problems: dict[str, Problem], n_points: int) -> str:
+def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
     """The first problem in a sentence, and at how many of the points it is there; "" without
     one.
     """
@@ -94,7 +94,7 @@ def sentence_on(problems: dict[str, Problem], n_points: int) -> str:
 
 def _problem(
     runs: SimulationRuns, test_speed: float | None, uneventful: str | None
-) -> Problem | None:
+) -> EmptyRoadFault | None:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road.
 
     Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
@@ -108,7 +108,7 @@ def _problem(
         values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
     )
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
-        return Problem(Reason.BRAKES, "brakes without an obstacle")
+        return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
     approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
@@ -116,7 +116,7 @@ def _problem(
     if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
         return None
     if gap[-1] <= 0 or (keeps_speed and is_alone):
-        return Problem(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
+        return EmptyRoadFault(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
     if (
@@ -124,7 +124,7 @@ def _problem(
         and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
     ):
         words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
-        return Problem(
+        return EmptyRoadFault(
             Reason.LATE,
             f"{words}, when it has come {distance:.1f}{of_needed} m at {speed[-1]:.1f} m/s",
         )
@@ -133,4 +133,4 @@ def _problem(
         " the brake"
     )
     words = f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"
-    return Problem(Reason.STANDS, words)
+    return EmptyRoadFault(Reason.STANDS, words)

@@ -17,7 +17,7 @@ from io import StringIO
 from pathlib import Path
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.sumo.network import CopiedNetwork, Network, options_of, varied_network
+from safevar_sumo.sumo.network import CopiedNetwork, NetworkFiles, options_in, varied_network
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -142,7 +142,7 @@ def open_world(
 
 @contextmanager
 def open_varied_world(
-    networks: Sequence[Network],
+    networks: Sequence[NetworkFiles],
     step: float | None = None,
     create: Callable[[Api, int], SumoWorld] = SumoWorld,
     start: Start = open_in_process,
@@ -192,7 +192,7 @@ def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
         "--xml-validation.net": "never",
         "--xml-validation.routes": "never",
     }
-    stated = options_of(files.options)
+    stated = options_in(files.options)
     own = own_options(stated) | {"step-length": repr(step_of(stated) if step is None else step)}
     return [*as_arguments(own), *(str(text) for option in options.items() for text in option)]
 

@@ -117,7 +117,7 @@ def vehicle_remarks(system: System) -> list[str]:
     ]
 
 
-def evaluate(
+def drive_and_score(
     system: System,
     settings: FloatArray,
     engine: Engine = Engine.RECORDED,
@@ -137,7 +137,10 @@ def evaluate(
         starts = range(0, len(settings), size)
         batches = [settings[start : start + size] for start in starts]
         return Evaluations.concatenate(
-            [evaluate(system, each, engine, with_originals=with_originals) for each in batches]
+            [
+                drive_and_score(system, each, engine, with_originals=with_originals)
+                for each in batches
+            ]
         )
     vehicles = settings
     if takes_pairs:  # a variant and the original take turns: they share scenes
@@ -219,7 +222,7 @@ def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]
     return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
-def simulate(system: System, settings: FloatArray) -> SimulationRuns:
+def drive_worst(system: System, settings: FloatArray) -> SimulationRuns:
     """Run the scenario once for every setting, shape (N, n).
 
     In a matrix, all settings run at the worst point of the last one: others may stand before it,

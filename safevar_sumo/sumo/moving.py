@@ -24,7 +24,7 @@ LEAST_SINE = 1e-9
 """Sine of an angle above which a body is rotated against the lane [-]."""
 NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
 """Who stands in for the bodies that other scenarios of the same batch have: far away."""
-Column = TypeVar("Column", FloatArray, BoolArray)
+Sampled = TypeVar("Sampled", FloatArray, BoolArray)
 BESIDE, IN_PATH = 1, 2
 """Levels of a body that moves beside the vehicle's path, and of one that is ever in it; that of
 scenery is 0.
@@ -142,7 +142,7 @@ def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:
     return ufunc.accumulate(column[::-1], axis=0)[::-1]
 
 
-def slim(column: Column) -> Column:
+def slim(column: Sampled) -> Sampled:
     """A column without the axes along which it does not vary."""
     if len(column) > 1 and (column[1:] == column[:1]).all():
         column = column[:1]
@@ -151,11 +151,11 @@ def slim(column: Column) -> Column:
     return column
 
 
-def row(column: Column, sample: int, group: IntArray | None) -> Column:
+def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
     """A column at a sample: one value for all vehicles, or one for each; `group` is the encounter
     of each vehicle.
     """
-    values: Column = column[sample if len(column) > 1 else 0]
+    values: Sampled = column[sample if len(column) > 1 else 0]
     return values[group] if group is not None and len(values) > 1 else values
 
 

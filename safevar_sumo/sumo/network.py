@@ -50,7 +50,7 @@ Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 """`XmlChanges` that can be hashed."""
 
 
-class Network(NamedTuple):
+class NetworkFiles(NamedTuple):
     """A network as its files are now.
 
     `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the
@@ -73,7 +73,7 @@ class Network(NamedTuple):
         return self.roads_file.endswith(NETWORK_ENDING)
 
 
-def open_network(network: str) -> Network:
+def open_network(network: str) -> NetworkFiles:
     """A network, given by its name in `sumo_nets/`, by its folder, or by a `.net.xml` file beside
     its traffic.
 
@@ -97,7 +97,7 @@ def open_network(network: str) -> Network:
     for name in names:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
-    return Network(
+    return NetworkFiles(
         folder, roads_file, tuple((name, _digest((folder / name).read_bytes())) for name in names)
     )
 
@@ -119,7 +119,7 @@ def is_network(path: Path) -> bool:
         return False
 
 
-def options_of(file: Path) -> dict[str, str]:
+def options_in(file: Path) -> dict[str, str]:
     """The options that a configuration of SUMO or netconvert sets."""
     return {
         element.tag: element.attrib["value"].strip()
@@ -139,7 +139,7 @@ def _roads_in(folder: Path) -> str:
     names = recipes or built
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
         names = [
-            name for name in names if name == options_of(folder / OPTIONS_FILE).get("net-file")
+            name for name in names if name == options_in(folder / OPTIONS_FILE).get("net-file")
         ] or names
     if len(names) != 1:
         problem = f"has {' and '.join(names) or 'no network'}"
@@ -156,7 +156,7 @@ def _sources_of(file: Path) -> list[str]:
     if file.name.endswith(NETWORK_ENDING):
         return []
     values = [
-        value for option, value in options_of(file).items() if SOURCE_OPTION.fullmatch(option)
+        value for option, value in options_in(file).items() if SOURCE_OPTION.fullmatch(option)
     ]
     return [name.strip() for value in values for name in value.split(",")]
 
@@ -169,7 +169,7 @@ class CopiedNetwork(NamedTuple):
     options: Path
 
 
-def copied_network(network: Network, n: int) -> CopiedNetwork:
+def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
     """At least `n` copies of a network, of which `n` have traffic.
 
     Raises
@@ -205,7 +205,7 @@ def copied_network(network: Network, n: int) -> CopiedNetwork:
 
 
 @contextmanager
-def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
+def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
     """A copy of one network for each of N traffics, whose file exists until the end; raises the
     errors of `copied_network`.
     """
@@ -219,7 +219,7 @@ def varied_network(networks: Sequence[Network]) -> Iterator[CopiedNetwork]:
         yield files._replace(traffic=file)
 
 
-def built_network(network: Network) -> Path:
+def built_network(network: NetworkFiles) -> Path:
     """The file of the network, which netconvert or the user built, with its changes; raises the
     errors of `copied_network`.
     """
@@ -238,7 +238,7 @@ def built_network(network: Network) -> Path:
 
 
 @cache
-def number_of_lanes(network: Network) -> int:
+def number_of_lanes(network: NetworkFiles) -> int:
     """Number of lanes of a network, junctions included; raises the errors of `copied_network`."""
     return built_network(network).read_bytes().count(b"<lane ")
 
@@ -248,7 +248,7 @@ def sumo_version() -> str:
     return version("eclipse-sumo")
 
 
-def cache_folder_name(network: Network, n: int, digests: Sequence[str]) -> str:
+def cache_folder_name(network: NetworkFiles, n: int, digests: Sequence[str]) -> str:
     """Name of the folder in the cache for `n` copies of a network whose files have these
     digests.
     """
@@ -288,14 +288,14 @@ def _code_digest() -> str:
     )
 
 
-def _road_digests(network: Network) -> list[str]:
+def _road_digests(network: NetworkFiles) -> list[str]:
     digests = [
         digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)
     ]
     return [*digests, repr(network.lane_changes)]
 
 
-def _run_netconvert(network: Network, file: Path) -> None:
+def _run_netconvert(network: NetworkFiles, file: Path) -> None:
     exit_code, errors = run_program(
         network.folder,
         "netconvert",
@@ -318,7 +318,7 @@ def _run_netconvert(network: Network, file: Path) -> None:
         )
 
 
-def stage_network(scenario: Scenario) -> Network:
+def stage_network(scenario: Scenario) -> NetworkFiles:
     """The scenario's network, with lanes and traffic changed by the scenario's parameters.
 
     Raises
@@ -332,7 +332,7 @@ def stage_network(scenario: Scenario) -> Network:
     return stage_networks([scenario])[0]
 
 
-def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
+def stage_networks(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """The networks of several scenarios, whose files are read once per network; raises the errors
     of `stage_network`.
     """
@@ -340,7 +340,7 @@ def stage_networks(scenarios: Sequence[Scenario]) -> list[Network]:
     return [_stage(scenario, networks[scenario.network]) for scenario in scenarios]
 
 
-def _stage(scenario: Scenario, network: Network) -> Network:
+def _stage(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
     network = network._replace(lane_changes=_frozen(scenario.lanes(_BuiltRoads(network))))
     return network._replace(traffic_changes=_frozen(scenario.actors(_BuiltRoads(network))))
 
@@ -355,7 +355,7 @@ def _frozen(changes: XmlChanges) -> Changes:
 class _BuiltRoads:
     """The lanes of a built network."""
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: NetworkFiles) -> None:
         self._network = network
 
     def lane(self, lane: str) -> Lane:
@@ -367,7 +367,7 @@ class _BuiltRoads:
 
 
 @lru_cache(maxsize=100)
-def _lane_shapes(network: Network) -> dict[str, str]:
+def _lane_shapes(network: NetworkFiles) -> dict[str, str]:
     return {
         lane.attrib["id"]: lane.attrib["shape"]
         for lane in parse_xml(built_network(network)).iter("lane")

@@ -20,13 +20,13 @@ from safevar_sumo.sumo.network import (
     NETWORK_KEY,
     OPTIONS_FILE,
     TRAFFIC_FILE,
-    Network,
+    NetworkFiles,
     built_network,
     cache_folder_name,
     copied_network,
     is_shipped,
     open_network,
-    options_of,
+    options_in,
     run_program,
 )
 
@@ -152,7 +152,7 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
             f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone"
         )
     options_file = network.path(OPTIONS_FILE)
-    stated = DEFAULT_OPTIONS | options_of(options_file)
+    stated = DEFAULT_OPTIONS | options_in(options_file)
     if "step-length" not in stated:
         remarks.append(
             f"{options_file} has no step-length: {STEP_LENGTH:g} s unless the study has"
@@ -188,11 +188,11 @@ def _is_same(stated: str, own: str) -> bool:
 
 
 @lru_cache(maxsize=100)
-def _check_files(network: Network) -> None:
+def _check_files(network: NetworkFiles) -> None:
     options = {
         "step-length": str(STEP_LENGTH),
         "route-files": TRAFFIC_FILE,
-        **options_of(network.path(OPTIONS_FILE)),
+        **options_in(network.path(OPTIONS_FILE)),
     }
     is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
     if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
@@ -270,7 +270,7 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
             raise InputError(file, problem, legal)
 
 
-def _warnings_file(network: Network) -> Path:
+def _warnings_file(network: NetworkFiles) -> Path:
     """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of
     `check_network`.
     """
@@ -278,13 +278,13 @@ def _warnings_file(network: Network) -> Path:
     return ensure_cached(f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network))
 
 
-def _try_network(network: Network, into: Path) -> None:
+def _try_network(network: NetworkFiles, into: Path) -> None:
     """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of
     two copies.
     """
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
-    own = own_options(options_of(network.path(OPTIONS_FILE)))
+    own = own_options(options_in(network.path(OPTIONS_FILE)))
     only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
     exit_code, messages = run_program(
         network.folder, "sumo", *files, *only_load, *as_arguments(own)
@@ -312,7 +312,7 @@ def _try_network(network: Network, into: Path) -> None:
     (into / WARNINGS_FILE).write_text(messages, encoding="utf-8")
 
 
-def _first_difference(network: Network) -> tuple[str, float]:
+def _first_difference(network: NetworkFiles) -> tuple[str, float]:
     """The first actor that moves differently in two copies, and the time [s]; "" and 0 if there is
     none.
 

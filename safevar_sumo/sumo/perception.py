@@ -21,7 +21,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Scene, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.study import Weather
-from safevar_sumo.sumo.bodies import Motion, SceneWorld
+from safevar_sumo.sumo.bodies import SceneWorld, VehicleStates
 
 OCCLUDED = {
     "gap": np.inf,
@@ -38,7 +38,7 @@ _UNSEEN = np.array([*OCCLUDED.values()])[:, np.newaxis]
 class Observer(Protocol):
     """Observes the obstacles of all vehicles."""
 
-    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
         """The scene now; must be called at every sample."""
 
     def encounter(self, trace: Trace) -> Encounter:
@@ -98,7 +98,7 @@ class SceneObserver:
         self._has_begun = False
         self._memory: ScenarioMemory = None
 
-    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
         if not self._has_begun:
             self._memory = self.world.begin(self._scenario)
             self._has_begun = True

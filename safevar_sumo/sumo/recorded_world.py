@@ -18,7 +18,7 @@ from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.sumo.bodies import Body, BodyPairs, Motion, distance_covered, find_overlaps
+from safevar_sumo.sumo.bodies import Body, BodyPairs, VehicleStates, distance_covered, find_overlaps
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.vehicles import SumoType
 
@@ -41,7 +41,7 @@ class _Moment(NamedTuple):
 
 
 class RecordedWorld:
-    """A recorded scene with `size` vehicles; a `World` in which other actors move as recorded.
+    """A recorded scene with `size` vehicles; a `VehicleWorld` in which others move as recorded.
 
     The scene may stand for K scenes with `size` vehicles in each: then its `start`, `speed` and
     tracks are arrays with one value for each (`encounters.py`).
@@ -83,11 +83,11 @@ class RecordedWorld:
         self._struck: dict[int, int] = {}
         """The actors that vehicles strike in this step, by vehicle."""
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
         """All vehicles have departed, and their types do not limit the commanded speeds."""
         return self._moved(np.ones(self.n, dtype=bool))
 
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a
         constant acceleration.
 
@@ -121,8 +121,8 @@ class RecordedWorld:
             self._lanes.positions(self._lane_position), speeds, self._lanes.meets_persons != 0
         )
 
-    def _moved(self, is_open: BoolArray) -> Motion:
-        return Motion(self._now.fronts, self._now.speeds, self._hits(is_open))
+    def _moved(self, is_open: BoolArray) -> VehicleStates:
+        return VehicleStates(self._now.fronts, self._now.speeds, self._hits(is_open))
 
     def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""

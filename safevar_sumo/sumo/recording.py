@@ -28,11 +28,11 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world, step_of
 from safevar_sumo.sumo.network import (
     OPTIONS_FILE,
-    Network,
+    NetworkFiles,
     copied_network,
     is_shipped,
     open_network,
-    options_of,
+    options_in,
     stage_network,
     sumo_version,
 )
@@ -120,7 +120,7 @@ class Scenes:
 
     def step_of(self, scenario: Scenario) -> float:
         """Time step of a scenario [s]."""
-        return self.step or step_of(options_of(open_network(scenario.network).path(OPTIONS_FILE)))
+        return self.step or step_of(options_in(open_network(scenario.network).path(OPTIONS_FILE)))
 
     def of(self, scenario: WorldScenario) -> Recording | str:
         """A scenario's scene, or the reason why SUMO must simulate it.
@@ -194,7 +194,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: WorldScenario, network: Network, step: float | None) -> Recording | str:
+def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)

@@ -25,12 +25,12 @@ from safevar_sumo.sumo.bodies import (
     TOUCH,
     Body,
     BodyPairs,
-    Motion,
+    VehicleStates,
     distance_between,
     distance_covered,
     find_overlaps,
 )
-from safevar_sumo.sumo.moving import TIE, Column, Moving, cast_of, row
+from safevar_sumo.sumo.moving import TIE, Moving, Sampled, cast_of, row
 from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
@@ -97,10 +97,10 @@ class Stage:
         self._sample = 0
         self._struck = np.full(self.n, NOBODY)
 
-    def _row(self, column: Column, sample: int | None = None) -> Column:
+    def _row(self, column: Sampled, sample: int | None = None) -> Sampled:
         return row(column, self._sample if sample is None else sample, self.group)
 
-    def observe(self, motion: Motion, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
         """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
         a body sees it.
         """
@@ -319,7 +319,7 @@ class Stage:
             apart = distance_between(track, front - self.length / 2, self.length, self.width)
         return apart, rate
 
-    def _table(self, column: Column, samples: slice) -> Column:
+    def _table(self, column: Sampled, samples: slice) -> Sampled:
         """A column at some samples, for each vehicle or for all of them."""
         values = column[samples] if len(column) > 1 else column
         return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
@@ -350,21 +350,21 @@ class LaneWorld:
         self._speed = start_speeds
         self._sample = 0
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
         return self._motion(np.ones(self.n, dtype=bool))
 
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         covered = distance_covered(self._speed, speeds, self.step_length)
         self._front = np.where(is_open, self._front + covered, self._front)
         self._speed = np.where(is_open, speeds, self._speed)
         self._sample += 1
         return self._motion(is_open)
 
-    def _motion(self, is_open: BoolArray) -> Motion:
+    def _motion(self, is_open: BoolArray) -> VehicleStates:
         hits = self._stage.hits(self._sample, self._front, self._speed, is_open)
         fronts = np.zeros((self.n, 2))
         fronts[:, 0] = self._front
-        return Motion(fronts, self._speed, hits)
+        return VehicleStates(fronts, self._speed, hits)
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         return self._stage.bodies(vehicles, self._front, self._speed)

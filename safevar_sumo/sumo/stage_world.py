@@ -18,10 +18,10 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
-from safevar_sumo.sumo.bodies import BodyPairs, Motion
+from safevar_sumo.sumo.bodies import BodyPairs, VehicleStates
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.moving import Column, row
-from safevar_sumo.sumo.network import Network, copied_network
+from safevar_sumo.sumo.moving import Sampled, row
+from safevar_sumo.sumo.network import NetworkFiles, copied_network
 from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
@@ -48,7 +48,7 @@ WAIT = 1e6
 
 
 @lru_cache(maxsize=100)
-def start_frame(network: Network, step: float | None) -> Frame:
+def start_frame(network: NetworkFiles, step: float | None) -> Frame:
     """The coordinates of the lane on which the vehicle under test departs, with their origin at its
     front.
     """
@@ -117,7 +117,7 @@ class StageWorld(SumoWorld):
     def frame(self) -> Frame:
         return self._lane.frame
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
         super().enter(types, keeps_drivers=keeps_drivers)
         return self._checked(self._lane.enter(types))
 
@@ -127,7 +127,7 @@ class StageWorld(SumoWorld):
         self._put()
         super()._depart()
 
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         self._sample += 1
         self._put()
         super().step(speeds, is_open)
@@ -179,11 +179,11 @@ class StageWorld(SumoWorld):
         values: list[float] = self._at_copies(column).tolist()
         return values
 
-    def _at_copies(self, column: Column) -> Column:
+    def _at_copies(self, column: Sampled) -> Sampled:
         values = row(column, self._sample, self._stage.group)
         return values if len(values) == self.n else np.repeat(values, self.n)
 
-    def _checked(self, motion: Motion) -> Motion:
+    def _checked(self, motion: VehicleStates) -> VehicleStates:
         """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor
         elsewhere.
         """

@@ -116,21 +116,25 @@ class System:
             scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
             return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
-    def at_encounters(self, settings: FloatArray) -> tuple[System, FloatArray]:
-        """The system at the encounters of N settings, shape (N, n): its only point, with arrays as
-        the parameters that the study searches; and the settings of the vehicles. Both are as they
-        were if the study searches none.
+    def cut(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of N settings, shape (N, n), the vehicles, shape (N, k), and the encounters that they
+        meet: values of the n - k parameters that the study searches.
         """
-        if not len(self.characteristics.scenario):
-            return self, settings
-        (point,) = self.points
         of_vehicle = self.characteristics.of_vehicle
-        columns = np.ascontiguousarray(settings[:, ~of_vehicle].T)
+        return settings[:, of_vehicle], settings[:, ~of_vehicle]
+
+    def at_encounters(self, encounters: FloatArray) -> System:
+        """The system at encounters, shape (N, n - k): its only point, with arrays as the parameters
+        that the study searches; the system itself if it searches none.
+        """
+        if not encounters.shape[1]:
+            return self
+        (point,) = self.points
+        columns = np.ascontiguousarray(encounters.T)
         values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
-        system = replace(
+        return replace(
             self.at(encounter(point, values)), characteristics=self.characteristics.vehicle
         )
-        return system, settings[:, of_vehicle]
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
@@ -228,60 +232,40 @@ def assemble(study: Study) -> System:
 
 
 def _assemble(study: Study) -> System:
-    # Each system has the code as it is now, and no state of another one.
+    # The models: each system has the code as it is now, and no state of another one.
     unload_user_modules()
     lookup = Lookup.of(study)
     vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
     ads = create_ads(study.ads, lookup)
     scenario = create_scenario(study.scenario, lookup)
     weather = weather_of(study.weather)
-    is_shipped_vehicle = study.vehicle.model in VEHICLES
     check_units(study, vehicle)
     check_plausible(study, vehicle)
-    if (
-        isinstance(ads, TraciController)
-        and not is_shipped_vehicle
-        and type(vehicle).sensors is Vehicle.sensors
-    ):
-        problem = (
-            f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of"
-            " TraCI bypasses sense"
-        )
-        expected = (
-            "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach,"
-            " scale), or None"
-        )
-        raise InputError("", problem, expected)
+    _check_sensors(study, vehicle, ads)
+
+    # The points at which settings are simulated, and what is measured there.
     rater = rater_of(study)
     matrix = matrix_points(expand_protocol(study, weather), lookup)
     has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
     measuring = measuring_of(study, lookup, has_stops=has_stops)
-    metrics = [metric.name for metric in measuring.scoring.metrics]
-    tables_of_metrics = {
-        "published": study.published,
-        "repeatability": study.repeatability,
-        "model_error": study.model_error,
-    }
-    for key, table in tables_of_metrics.items():
-        for name in table:
-            check_name("", f"{key}.{name} is no metric", name, metrics)
-    aggregate = WORST if study.matrix is None else study.matrix.aggregate
-    if aggregate != WORST:
-        name = aggregate.split()[0]
-        check_name("", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics)
+    _check_metrics(study, measuring)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network)
     if not (matrix or study.scenario.search):
         scenario.check()
+
+    # In a study that searches its scenario, the points are the original encounter.
     if study.scenario.search:
         points = matrix or (Point(scenario, weather),)
         check_domains(study, points)
         original = {name: domain.original for name, domain in study.scenario.search.items()}
         scenario, weather, *_ = encounter(points[0], original)
         matrix = tuple(encounter(point, original) for point in matrix)
+
+    # What the driving system knows of the original vehicle.
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
-    if not is_shipped_vehicle:
+    if study.vehicle.model not in VEHICLES:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(
         characteristics=region.characteristics,
@@ -298,10 +282,41 @@ def _assemble(study: Study) -> System:
         matrix=matrix,
         rater=rater,
         time_limit=study.search.time_limit,
-        aggregate=aggregate,
+        aggregate=WORST if study.matrix is None else study.matrix.aggregate,
     )
     if not study.scenario.search:
         return system
+
+    # An encounter counts only if the original vehicle keeps the margin there.
     limit = study.scenario.margin + system.contact
     scoring = msgspec.structs.replace(measuring.scoring, safe_original=limit)
     return replace(system, measuring=measuring._replace(scoring=scoring))
+
+
+def _check_sensors(study: Study, vehicle: Vehicle, ads: Ads) -> None:
+    """Refuse a user's vehicle without sensors beside a controller that reads SUMO: such a
+    controller would see everything.
+    """
+    has_none = study.vehicle.model not in VEHICLES and type(vehicle).sensors is Vehicle.sensors
+    if isinstance(ads, TraciController) and has_none:
+        problem = (
+            f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of"
+            " TraCI bypasses sense"
+        )
+        expected = (
+            "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach,"
+            " scale), or None"
+        )
+        raise InputError("", problem, expected)
+
+
+def _check_metrics(study: Study, measuring: Measuring) -> None:
+    """Refuse names of metrics that the study does not measure."""
+    metrics = [metric.name for metric in measuring.scoring.metrics]
+    for key in ("published", "repeatability", "model_error"):
+        for name in getattr(study, key):
+            check_name("", f"{key}.{name} is no metric", name, metrics)
+    if study.matrix is not None and study.matrix.aggregate != WORST:
+        aggregate = study.matrix.aggregate
+        name = aggregate.split()[0]
+        check_name("", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics)

@@ -25,7 +25,7 @@ from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_error_of, user_errors
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.bodies import World
+from safevar_sumo.sumo.bodies import VehicleWorld
 from safevar_sumo.sumo.traci_view import (
     OWN_LOOP,
     SensedTraffic,
@@ -58,7 +58,7 @@ class TraciController(Ads):
         self._world: SumoWorld
         self._sensors: Sensors
 
-    def in_world(self, world: World, sensors: Sensors) -> TraciController:
+    def in_world(self, world: VehicleWorld, sensors: Sensors) -> TraciController:
         """The controller in SUMO's world, with the vehicles' sensors in their weather."""
         assert isinstance(world, SumoWorld)
         controller = copy.copy(self)

@@ -36,7 +36,7 @@ from safevar_sumo.vehicles import Sensors
 Value = Any
 """An argument or a result of a function of TraCI."""
 Arguments = tuple[Value, ...]
-Values = dict[str, Value]
+ActorValues = dict[str, Value]
 """What TraCI's functions return of an actor, by function; its length, too."""
 Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id.
@@ -79,8 +79,8 @@ class Snapshot(NamedTuple):
     of other actors, by domain and name; `leader` is the leader with its gap [m].
     """
 
-    own: Values
-    actors: Mapping[str, dict[str, Values]]
+    own: ActorValues
+    actors: Mapping[str, dict[str, ActorValues]]
     leader: tuple[str, float] | None
 
 
@@ -123,7 +123,7 @@ class SensedTraffic:
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
-        actors: dict[str, dict[str, Values]] = {}
+        actors: dict[str, dict[str, ActorValues]] = {}
         for domain, functions in SENSED.items():
             getters = {
                 name: getattr(getattr(api, domain), name) for name in (*functions, "getLength")
@@ -149,7 +149,7 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     own = snapshot.own
     if not own or (reach == math.inf and scale == 1):
         return snapshot
-    actors: dict[str, dict[str, Values]] = {}
+    actors: dict[str, dict[str, ActorValues]] = {}
     for domain, members in snapshot.actors.items():
         actors[domain] = {}
         for name, values in members.items():
@@ -168,7 +168,7 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     return Snapshot(own, actors, (name, gap * scale))
 
 
-def _positions_in_scale(own: Values, values: Values, scale: float) -> Values:
+def _positions_in_scale(own: ActorValues, values: ActorValues, scale: float) -> ActorValues:
     """The positions of an actor, with distances from the vehicle itself multiplied by the sensors'
     scale.
     """

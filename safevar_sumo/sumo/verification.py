@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.sumo.batch import observer_of, open_points_world, stage_of
-from safevar_sumo.sumo.bodies import Contacts
+from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size, simulate_groups
@@ -44,15 +44,16 @@ def drive_again(
     trace = runs.trace
     n = len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
-    on_road, vehicles = system.at_encounters(settings)
+    vehicles, encounters = system.cut(settings)
+    on_road = system.at_encounters(encounters)
     point = on_road.points[0]
-    stage = stage_of(system, settings)
-    with user_errors(system.source), open_points_world(system, settings, stage, start) as world:
+    stage = stage_of(system, encounters)
+    with user_errors(system.source), open_points_world(system, encounters, stage, start) as world:
         motion = enter(on_road, vehicles, world).motion
         observer = observer_of(point.scenario, world, stage)
         is_open = np.ones(n, dtype=bool)
         frame = world.frame
-        contacts = Contacts(n, np.full(n, point.scenario.is_hit_in_front))
+        contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))
         for sample in range(len(trace.time)):
             watch(world)
             scene = observer.observe(motion, is_open)

@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame, lane_through
-from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, Motion
+from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, VehicleStates
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -82,8 +82,8 @@ class SumoWorld:
         for id_, value in zip(self.ids(VUT), values.tolist(), strict=True):
             set_value(id_, value)
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> Motion:
-        """Insert all actors; see `World.enter`.
+    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+        """Insert all actors; see `VehicleWorld.enter`.
 
         Raises
         ------
@@ -150,7 +150,7 @@ class SumoWorld:
                 "a network and traffic with the ids that the scenario names",
             ) from None
 
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> Motion:
+    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         for id_, copy in [*self.driving.items()]:
             if not is_open[copy]:
                 self.api.vehicle.remove(id_)
@@ -161,13 +161,13 @@ class SumoWorld:
         self.api.simulationStep()
         return self._motion(is_open)
 
-    def _motion(self, is_open: BoolArray) -> Motion:
+    def _motion(self, is_open: BoolArray) -> VehicleStates:
         self._speeds = self._speeds.copy()
         self._fronts = self._fronts.copy()
         copies = [*self.driving.values()]
         self._speeds[copies] = [*map(self._get_speed, self.driving)]
         self._fronts[copies] = [*map(self._get_position, self.driving)]
-        return Motion(self._fronts, self._speeds, self._hits(is_open))
+        return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.

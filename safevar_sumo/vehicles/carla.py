@@ -31,7 +31,7 @@ from safevar_sumo.vehicles.base import (
 if TYPE_CHECKING:
     from safevar_sumo.vehicles.carla_step import Car, CarlaState, Law
 
-Share = Annotated[float, Meta(gt=0, le=1)]
+_Share = Annotated[float, Meta(gt=0, le=1)]
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over
@@ -138,8 +138,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     throttle_fall: Positive = 10.0
     brake_rise: Positive = 6.0
     brake_fall: Positive = 10.0
-    shift_up: Share = 0.65
-    shift_down: Share = 0.5
+    shift_up: _Share = 0.65
+    shift_down: _Share = 0.5
     shift_latency: Positive = 2.0
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355

@@ -22,7 +22,7 @@ processor's first cache.
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
 NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
-Number = float | FloatArray
+FloatOrArray = float | FloatArray
 """A number of one vehicle; in records outside the compiled step those of N, shape (N,)."""
 
 
@@ -34,22 +34,22 @@ class Car(NamedTuple):
     after `shift_end` [s]. Below the speed `standstill` the tyres hold a braked vehicle.
     """
 
-    radius: Number
-    wheel_inertia: Number
-    wheel_damping: Number
-    brake_torque: Number
-    grip: Number
-    slip_stiffness: Number  # K / (3 |slip|), see `tyre_force`
-    clutch: Number
-    engine_limit: Number
-    damping_full: Number
-    damping_engaged: Number
-    damping_neutral: Number
-    shift_end: Number
-    air_drag: Number
-    speed_by_force: Number
-    speed_by_slope: Number
-    standstill: Number
+    radius: FloatOrArray
+    wheel_inertia: FloatOrArray
+    wheel_damping: FloatOrArray
+    brake_torque: FloatOrArray
+    grip: FloatOrArray
+    slip_stiffness: FloatOrArray  # K / (3 |slip|), see `tyre_force`
+    clutch: FloatOrArray
+    engine_limit: FloatOrArray
+    damping_full: FloatOrArray
+    damping_engaged: FloatOrArray
+    damping_neutral: FloatOrArray
+    shift_end: FloatOrArray
+    air_drag: FloatOrArray
+    speed_by_force: FloatOrArray
+    speed_by_slope: FloatOrArray
+    standstill: FloatOrArray
 
 
 class Law(NamedTuple):
@@ -87,33 +87,33 @@ class CarlaState(NamedTuple):
     gear is held.
     """
 
-    speed: Number
-    wheel_speed: Number
-    engine_speed: Number
-    gear: Number
-    target_gear: Number
-    since_shift: Number
-    throttle: Number
-    brake: Number
+    speed: FloatOrArray
+    wheel_speed: FloatOrArray
+    engine_speed: FloatOrArray
+    gear: FloatOrArray
+    target_gear: FloatOrArray
+    since_shift: FloatOrArray
+    throttle: FloatOrArray
+    brake: FloatOrArray
 
 
 class Gearbox(NamedTuple):
     """The gears of a `CarlaState` after a substep."""
 
-    gear: Number
-    target_gear: Number
-    since_shift: Number
+    gear: FloatOrArray
+    target_gear: FloatOrArray
+    since_shift: FloatOrArray
 
 
 class Speeds(NamedTuple):
     """The speeds of a `CarlaState` after a substep."""
 
-    speed: Number
-    wheel_speed: Number
-    engine_speed: Number
+    speed: FloatOrArray
+    wheel_speed: FloatOrArray
+    engine_speed: FloatOrArray
 
 
-def full_torque(car: Car, law: Law, engine_speed: Number) -> Number:
+def full_torque(car: Car, law: Law, engine_speed: FloatOrArray) -> FloatOrArray:
     """Engine torque at full throttle [N m]: linear between the points of the curve."""
     speed_share = engine_speed / car.engine_limit
     rising_line = law.torque_idle + law.torque_rise * speed_share
@@ -125,13 +125,15 @@ _full_torque = equation(full_torque)
 
 
 @equation
-def pedal_position(command: Number, pedal: Number, fall: float, rise: float) -> Number:
+def pedal_position(
+    command: FloatOrArray, pedal: FloatOrArray, fall: float, rise: float
+) -> FloatOrArray:
     """Position of a pedal that follows its command, with the largest fall and rise."""
     return pedal + np.minimum(np.maximum(command - pedal, -fall), rise)
 
 
 @equation
-def ratio_of(law: Law, gear: Number) -> Number:
+def ratio_of(law: Law, gear: FloatOrArray) -> FloatOrArray:
     """Overall ratio of a gear; 0 in neutral."""
     neutral, first, second, third, fourth = law.ratios
     low = first if gear == 1.0 else second
@@ -141,7 +143,7 @@ def ratio_of(law: Law, gear: Number) -> Number:
 
 
 @equation
-def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
+def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
     """Automatic gearbox; in a shift the gear is neutral."""
     speed_share = s.engine_speed / car.engine_limit
     is_ready = s.since_shift >= law.shift_latency
@@ -157,7 +159,7 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: Number) -> Gearbox:
 
 
 @equation
-def tyre_force(car: Car, law: Law, speed: Number, rim: Number) -> Number:
+def tyre_force(car: Car, law: Law, speed: FloatOrArray, rim: FloatOrArray) -> FloatOrArray:
     """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral
     slip).
 
@@ -174,7 +176,12 @@ def tyre_force(car: Car, law: Law, speed: Number, rim: Number) -> Number:
 
 @equation
 def roll(
-    car: Car, law: Law, s: CarlaState, gear: Number, throttle: Number, brake: Number
+    car: Car,
+    law: Law,
+    s: CarlaState,
+    gear: FloatOrArray,
+    throttle: FloatOrArray,
+    brake: FloatOrArray,
 ) -> Speeds:
     """Engine, clutch, wheels, tyres and body over one substep.
 
@@ -226,7 +233,7 @@ def roll(
 
 @equation
 def move(
-    car: Car, law: Law, s: CarlaState, throttle_command: Number, brake_command: Number
+    car: Car, law: Law, s: CarlaState, throttle_command: FloatOrArray, brake_command: FloatOrArray
 ) -> CarlaState:
     """The state of a vehicle one substep later."""
     throttle = pedal_position(throttle_command, s.throttle, law.throttle_fall, law.throttle_rise)

@@ -19,7 +19,7 @@ from pythonfmu3.builder import FmuBuilder as FmuBuilder3
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Nominal, Observation
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 
 SOURCE = '''
@@ -158,8 +158,8 @@ class Law(Ads):
     law = assemble(load_study("law.toml"))
     members = law.characteristics
     settings = np.random.default_rng(5).uniform(members.lower, members.upper, (12, len(members)))
-    expected = evaluate(law, settings)
-    results = evaluate(fmu, settings)
+    expected = drive_and_score(law, settings)
+    results = drive_and_score(fmu, settings)
     np.testing.assert_array_equal(results.outcome, expected.outcome)
     np.testing.assert_array_equal(results.f_safe, expected.f_safe)
     assert len({*expected.outcome}) > 1

@@ -18,7 +18,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import FloatArray, Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import seen
@@ -357,7 +357,7 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
     )
     system = assemble(study)
     for point, (kmh, *rest) in zip(system.points, product(*over.values()), strict=True):
-        trace = simulate(system.at(point), system.characteristics.original[np.newaxis]).trace
+        trace = drive_worst(system.at(point), system.characteristics.original[np.newaxis]).trace
         gaps = trace.gap[trace.active]
         closing = (trace.speed - trace.obstacle_speed)[trace.active]
         found = gaps.min() if gaps.min() > 0 else -closing[-1]

@@ -237,7 +237,7 @@ ENDS = {
     "ads/published.py": ("WorldOnRails.drive",),
     "sumo/perception.py": ("Perception.observe",),
     "sumo/recorded_world.py": ("RecordedWorld.enter", "RecordedWorld.step"),
-    "sumo/bodies.py": ("Contacts.count",),
+    "sumo/bodies.py": ("FirstContacts.count",),
     "sumo/drive.py": ("_Log.write", "_Log.trace", "_Outcomes.judge", "_Outcomes.classify"),
     "results/journal.py": ("Journal.append", "Journal.finish"),
     "results/store.py": ("evaluations_frame",),

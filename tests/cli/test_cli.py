@@ -21,7 +21,7 @@ from click.testing import CliRunner, Result
 from rich.console import Console
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.cli.program import COMMANDS, commands, function_of, main
+from safevar_sumo.cli.program import COMMANDS, command_function, commands, run_command_line
 from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
@@ -119,7 +119,7 @@ def test_a_gate_ends_with_code_3(
         patch("sys.argv", ["safevar-sumo", "simulate", "smoke", "--fail-if", condition]),
         pytest.raises(SystemExit) as end,
     ):
-        main()
+        run_command_line()
     assert end.value.code == code
     assert words in capfd.readouterr().err
 
@@ -127,7 +127,7 @@ def test_a_gate_ends_with_code_3(
 def test_a_gate_on_a_table_names_the_row(capfd: pytest.CaptureFixture[str]) -> None:
     typed = ["safevar-sumo", "list", "weathers", "--fail-if", "weathers.road_friction < 0.7"]
     with patch("sys.argv", typed), pytest.raises(SystemExit) as end:
-        main()
+        run_command_line()
     assert end.value.code == 3
     assert (
         capfd.readouterr().err
@@ -287,13 +287,15 @@ def test_a_question_with_one_parameter_is_refused(
     )
 
 
-@pytest.mark.parametrize("command", [name for name in COMMANDS if contents_of(function_of(name))])
+@pytest.mark.parametrize(
+    "command", [name for name in COMMANDS if contents_of(command_function(name))]
+)
 def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(
     command: str,
 ) -> None:
     """The subjects do not exist, and the message names what there is."""
     subjects = ["nothing"] * (2 if command in ("compare", "validate") else 1)
-    declared = contents_of(function_of(command))
+    declared = contents_of(command_function(command))
     assert declared is not None
     refused(
         command,
@@ -316,9 +318,9 @@ def test_every_command_that_gives_an_answer_declares_its_names() -> None:
     gives = [
         name
         for name in COMMANDS
-        if "Answer" in str(inspect.signature(function_of(name)).return_annotation)
+        if "Answer" in str(inspect.signature(command_function(name)).return_annotation)
     ]
-    assert [name for name in COMMANDS if contents_of(function_of(name))] == gives
+    assert [name for name in COMMANDS if contents_of(command_function(name))] == gives
 
 
 @pytest.mark.parametrize("key", ["nope", "sweep.nope", "drac", "mass"])

@@ -11,7 +11,7 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.reference.rows import package_filter
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, refused, run
@@ -30,7 +30,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         characteristics.lower, characteristics.upper, (40, 12)
     )
     settings[::2, :6] = characteristics.original[:6] + 0.001
-    result = evaluate(system, package_filter(characteristics, settings))
+    result = drive_and_score(system, package_filter(characteristics, settings))
     columns = {column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()}
     path = tmp_path_factory.mktemp("data") / "mine.csv"
     pd.DataFrame(settings, columns=list(characteristics.names)).assign(**columns).to_csv(

@@ -15,7 +15,7 @@ from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
 from tests.scenarios.ideal import met_at_once
 
@@ -60,7 +60,7 @@ def test_towards_who_crosses_only_the_way_along_the_path_counts(test: Any) -> No
 
 def test_in_the_published_scenario_too() -> None:
     system = assemble(load_study("sun"))
-    runs = simulate(system, system.characteristics.original[np.newaxis])
+    runs = drive_worst(system, system.characteristics.original[np.newaxis])
     assert measured(runs) == pytest.approx(along_the_path(runs))
 
 

@@ -15,7 +15,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import play
 from safevar_sumo.scenarios import OpenScenario
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import MAX_VEHICLES, evaluate, largest_batch
+from safevar_sumo.sumo.matrix import MAX_VEHICLES, drive_and_score, largest_batch
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of
 from tests.openscenario import writing
@@ -158,7 +158,7 @@ def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Pat
     settings = np.tile(members.original, (4, 1))
     settings[:, members.names.index("v")] = 3.0, 50.0, 99.0, 3.0
     settings[2:, members.names.index("treadDepth")] = 1.6
-    runs = evaluate(system, settings)
+    runs = drive_and_score(system, settings)
     assert (runs.outcome == "invalid-test").tolist() == [False, True, True, False]
     assert np.isnan(runs.f_safe[1:3]).all()
     assert (system.measuring.scoring.violation(runs) > 0).tolist() == [False, True, True, False]

@@ -11,7 +11,7 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import algorithm_of
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from tests.in_process import refused, run
 from tests.made_up import original_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
@@ -74,7 +74,7 @@ def test_an_ads_whose_attributes_cannot_be_set_is_told_in_two_lines(
 ) -> None:
     system = mine(f"{SCALAR}    {body}\n\n{DRIVE}")
     with pytest.raises(UserCodeError, match=place) as caught:
-        evaluate(system, original_of(system))
+        drive_and_score(system, original_of(system))
     assert len(str(caught.value).splitlines()) <= 2
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.plugins.check import check, study_to_check
+from safevar_sumo.plugins.check import check_study, study_to_check
 from tests.in_process import files_of, json_of, run
 
 SCALAR = """import random
@@ -113,9 +113,9 @@ class Defect(NamedTuple):
     got: str
 
 
-def planted(kind: str, check: str, module: str, where: str, line: str, got: str) -> Defect:
+def planted(kind: str, check_study: str, module: str, where: str, line: str, got: str) -> Defect:
     assert where in module, where
-    return Defect(kind, check, module.replace(where, line, 1).replace("BODY", "pass"), got)
+    return Defect(kind, check_study, module.replace(where, line, 1).replace("BODY", "pass"), got)
 
 
 ALONE, ORDER, AGAIN = (
@@ -235,7 +235,7 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tm
     defect = DEFECTS[name]
     (in_tmp / "mine.py").write_text(defect.module)
     (in_tmp / "mine.toml").write_text(STUDY_OF[defect.kind])
-    (finding,) = check(study_to_check("mine.toml"))
+    (finding,) = check_study(study_to_check("mine.toml"))
     assert finding.check == defect.check, finding
     assert defect.got in str(finding)
     file, _, line = finding.where.rpartition(":")
@@ -259,7 +259,8 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     )
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
     assert [
-        (finding.check, reason in finding.finding) for finding in check(study_to_check(subject))
+        (finding.check, reason in finding.finding)
+        for finding in check_study(study_to_check(subject))
     ] == [("reaction", True)]
 
 
@@ -278,7 +279,7 @@ def test_others_who_have_left_in_time_are_the_scenarios_matter(
     (in_tmp / "mine.toml").write_text(
         'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n'
     )
-    findings = check(study_to_check("mine.toml"))
+    findings = check_study(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
     assert all(
         "mine.py:4" in finding.where and "have left after" in finding.finding
@@ -295,7 +296,7 @@ def test_others_who_have_left_in_time_are_the_scenarios_matter(
 )
 def test_what_is_shipped_passes(study: str) -> None:
     """What is right of users is in the tutorials, whose studies begin with these checks."""
-    assert not check(load_study(study))
+    assert not check_study(load_study(study))
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:

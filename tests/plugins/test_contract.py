@@ -14,7 +14,7 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import differences
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import original_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
@@ -24,7 +24,7 @@ CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 
 def throttle(study: Path) -> float:
     system = assemble(load_study(str(study)))
-    evaluate(system, original_of(system))
+    drive_and_score(system, original_of(system))
     driver = system.ads.start(1, system.nominal, 0.05)[0]
     return float(driver.drive(None)[0])
 
@@ -165,7 +165,7 @@ ROWS = "\n".join(
 def failing(system: object) -> str:
     settings = np.repeat(original_of(system), 3, axis=0)  # type: ignore[attr-defined]
     with pytest.raises(UserCodeError) as caught:
-        evaluate(system, settings)  # type: ignore[arg-type]
+        drive_and_score(system, settings)  # type: ignore[arg-type]
     assert len(str(caught.value).splitlines()) <= 2
     return str(caught.value)
 
@@ -197,7 +197,7 @@ def test_ctrl_c_passes(mine: Mine) -> None:
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            evaluate(ctrl_c, original_of(ctrl_c))
+            drive_and_score(ctrl_c, original_of(ctrl_c))
     finally:
         signal.signal(signal.SIGINT, handler)
 
@@ -280,7 +280,7 @@ def vehicle(method: str, body: str) -> str:
 def test_a_vehicle_that_is_wrong(method: str, body: str, expected: str, mine: Mine) -> None:
     def tried() -> None:
         system = mine(vehicle(method, body), VEHICLE.format(ROWS))
-        evaluate(system, np.repeat(original_of(system), 3, axis=0))
+        drive_and_score(system, np.repeat(original_of(system), 3, axis=0))
 
     with pytest.raises(UserCodeError) as caught:
         tried()
@@ -355,8 +355,8 @@ def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
         "def drive(self, seen):\n", "def drive(self, seen):\n        np.seterr(all='raise')\n"
     )
     before = np.geterr()
-    expected = evaluate(system := mine(CONSTANT.format(0.2)), original_of(system))
-    found = evaluate(mine(strict), original_of(system))
+    expected = drive_and_score(system := mine(CONSTANT.format(0.2)), original_of(system))
+    found = drive_and_score(mine(strict), original_of(system))
     assert not [*differences(expected.results, found.results)]
     assert np.geterr() == before
 
@@ -370,7 +370,7 @@ def test_a_simulation_in_this_process_that_takes_longer_than_the_limit_names_the
     with pytest.raises(
         UserCodeError, match=r"longer than the time limit of 0\.2 s \(.*mine\.py:6\)"
     ):
-        evaluate(system, original_of(system))
+        drive_and_score(system, original_of(system))
 
 
 def test_user_code_that_catches_all_errors_ends_at_the_time_limit_too(mine: Mine) -> None:
@@ -381,4 +381,4 @@ def test_user_code_that_catches_all_errors_ends_at_the_time_limit_too(mine: Mine
     )
     system = mine(module, f"{ADS}[search]\ntime_limit = 0.2\n")
     with pytest.raises(UserCodeError, match="longer than the time limit"):
-        evaluate(system, original_of(system))
+        drive_and_score(system, original_of(system))

@@ -18,7 +18,7 @@ from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import Command, differences
 from safevar_sumo.results import load_runs
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
 from tests.in_process import files_of, json_of, run, searched
@@ -156,7 +156,7 @@ BRAKES = Pedals(
 """Full throttle, and hardly any for the light one of two."""
 
 
-LENGTH = len(simulate(replace(NATIVE, ads=BRAKES), HEAVY[np.newaxis]).trace.time)
+LENGTH = len(drive_worst(replace(NATIVE, ads=BRAKES), HEAVY[np.newaxis]).trace.time)
 """Samples until the heavy vehicle collides."""
 
 
@@ -198,9 +198,9 @@ def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_
     vehicle: Vehicle,
 ) -> None:
     system = replace(NATIVE, ads=BRAKES, vehicle=vehicle)
-    alone = evaluate(system, BOTH[:1])
-    together = evaluate(system, BOTH)
-    assert len(simulate(system, BOTH).trace.time) > LENGTH, "the other vehicle drives longer"
+    alone = drive_and_score(system, BOTH[:1])
+    together = drive_and_score(system, BOTH)
+    assert len(drive_worst(system, BOTH).trace.time) > LENGTH, "the other vehicle drives longer"
     assert not [*differences(together.take([0]).results, alone.results)]
     assert alone.collided.all()
 
@@ -211,4 +211,4 @@ def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
 ) -> None:
     for settings in (BOTH[:1], BOTH):
         with pytest.raises(InputError, match=r"speed (is nan|= -3\.0)"):
-            evaluate(replace(NATIVE, ads=BRAKES, vehicle=vehicle), settings)
+            drive_and_score(replace(NATIVE, ads=BRAKES, vehicle=vehicle), settings)

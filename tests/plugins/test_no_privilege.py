@@ -25,7 +25,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, free_parameters
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import ROOT, InlinePool, searched
@@ -50,7 +50,7 @@ def copied(model: Any, folder: Path) -> str:
 
 def results_of(study: Study) -> Mapping[str, np.ndarray]:
     system = assemble(study)
-    found: Mapping[str, np.ndarray] = evaluate(system, drawn(system, 8, 2)).results
+    found: Mapping[str, np.ndarray] = drive_and_score(system, drawn(system, 8, 2)).results
     return found
 
 
@@ -216,7 +216,7 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
             "smoke", metrics={"also": [*OPTIONAL_METRICS, *own]}, search={"objectives": objectives}
         )
     )
-    found = evaluate(system, drawn(system, 8, 2))
+    found = drive_and_score(system, drawn(system, 8, 2))
     for name in shipped:
         np.testing.assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
     np.testing.assert_array_equal(found.column("own_f_diff"), found.f_diff)
@@ -236,7 +236,7 @@ def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
     for models in (MODELS, own):
         monkeypatch.setattr("safevar_sumo.protocol.cells.MODELS", models)
         system = assemble(study)
-        points.append(evaluate(system, drawn(system, 2, 2)).column("rating_points"))
+        points.append(drive_and_score(system, drawn(system, 2, 2)).column("rating_points"))
     np.testing.assert_array_equal(*points)
     assert points[0].max() > 0
 

@@ -16,7 +16,7 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.research_questions.statistics import compare_samples
 from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
 
@@ -52,7 +52,7 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     answer = sv.compare(wear, earlier, samples=32, unsafe="collision", pool=POOL)
     names = list(wear.vehicle.characteristics)
     frame = answer.tables["settings"].sort_index()  # rows are numbered as they were simulated
-    runs = [evaluate(assemble(study), frame[names].to_numpy()) for study in (wear, earlier)]
+    runs = [drive_and_score(assemble(study), frame[names].to_numpy()) for study in (wear, earlier)]
     a, b = (one.collided for one in runs)
     assert frame["unsafe_in"].isin(["a", "both"]).tolist() == a.tolist()
     assert frame["unsafe_in"].isin(["b", "both"]).tolist() == b.tolist()

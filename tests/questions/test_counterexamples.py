@@ -25,7 +25,7 @@ from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool, refused
@@ -72,7 +72,7 @@ def drives(study: Study, tread: float, highest: float) -> tuple[FloatArray, Floa
     settings[:, columns] = np.stack(
         [np.full(speeds.size, tread), speeds.ravel(), places.ravel()], axis=1
     )
-    runs = evaluate(system, settings)
+    runs = drive_and_score(system, settings)
     return speeds.ravel(), runs.f_safe, runs.column(ORIGINAL_DEGREE)
 
 
@@ -87,7 +87,7 @@ def test_what_fails_first_fails_as_it_is_printed(searched: Study, rough: Answer)
     assert any(row["fails_at"] for row in rows)
     for row in rows:
         if row["fails_at"]:
-            runs = evaluate(system, np.array([[row["fails_at"][name] for name in names]]))
+            runs = drive_and_score(system, np.array([[row["fails_at"][name] for name in names]]))
             assert runs.f_safe[0] < rough.numbers["margin"]
             assert runs.column(ORIGINAL_DEGREE)[0] >= searched.scenario.margin
             speed = f"at {row['fails_at']['speed']:.10g} km/h"
@@ -313,6 +313,6 @@ def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> No
         and dict(point.parameters).get("speed") == float(said[3])
         and dict(point.parameters).get("impact_location") == float(said[4])
     ]
-    runs = evaluate(system.at(named[0]), system.characteristics.original[np.newaxis])
+    runs = drive_and_score(system.at(named[0]), system.characteristics.original[np.newaxis])
     assert -runs.f_safe[0] == pytest.approx(float(said[1]), abs=0.005)
     assert "with the study's own fit" in answer.tables["limits"].attrs["title"]

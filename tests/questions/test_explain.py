@@ -26,13 +26,13 @@ from safevar_sumo.questions.explain.causes import (
     causes_of_runs,
     count_distinct_causes,
     count_needed,
-    find_limits,
+    find_cause_limits,
     find_minimal_causes,
     select_affordable_rows,
 )
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
 from tests.in_process import InlinePool
@@ -129,7 +129,7 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
             assert abs(said - item.original) >= abs(value - item.original)
             assert said == pytest.approx(value, abs=10.0**-item.digits)
             printed = case.characteristics.setting({**leading["boundary"], item.name: said})
-            assert case.unsafe.of(evaluate(assemble(case.study), printed[np.newaxis]))[0]
+            assert case.unsafe.of(drive_and_score(assemble(case.study), printed[np.newaxis]))[0]
     share = f"{100 * leading['robust_share']:.0f} % of its neighbours are unsafe too"
     assert re.search(
         rf"^With .* the vehicle collides \(.*{share}; in {leading['fits_holding']} of {FITS} ",
@@ -199,7 +199,7 @@ def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once
 def limits(evaluator: Evaluator, *setting: float) -> Limits:
     """The limits of the only cause of a setting."""
     (causes,) = find_minimal_causes(evaluator, np.array([setting]), COLLISION)
-    (result,) = find_limits(evaluator, causes, COLLISION)
+    (result,) = find_cause_limits(evaluator, causes, COLLISION)
     return result
 
 

@@ -23,7 +23,7 @@ from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.manifest import identity_digest, manifest_of
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, refused, run, searched
 
@@ -203,7 +203,7 @@ def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody
     for name, row in rows.items():
         ends = row["together_low"], row["together_high"]
         settings[:, members.names.index(name)] = np.where(rng.random(len(settings)) < 0.5, *ends)
-    evaluations = evaluate(system, settings)
+    evaluations = drive_and_score(system, settings)
     counts = system.measuring.scoring.violation(evaluations) == 0
     assert counts.sum() > 4000
     assert (evaluations.collided & counts).sum() <= 1

@@ -25,7 +25,7 @@ from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import ROOT, InlinePool, files_of, refused, run
@@ -174,7 +174,7 @@ def unsafe_cars(study: Study, margin: float, settings: FloatArray) -> BoolArray:
     """
     are_unsafe = np.zeros(len(settings), dtype=bool)
     for fit, fitted in enumerate(studies_of_sets(study)[:FITS]):
-        found = evaluate(assemble(fitted), settings)
+        found = drive_and_score(assemble(fitted), settings)
         counts = found.metrics["original_safety_degree"] >= study.scenario.margin
         are_unsafe |= counts & (found.collided | ((found.f_safe < margin) & (fit == 0)))
     return are_unsafe

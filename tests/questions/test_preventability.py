@@ -30,7 +30,7 @@ from safevar_sumo.questions.preventability import (
 )
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool
 from tests.made_up import drawn, made_up_runs, original_of
@@ -231,11 +231,11 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     endings, unsafe_points = failure
     at = next(point for point in system.points if endings.startswith(f"At {point.name}: "))
     assert at.name in unsafe_points
-    original = evaluate(system.at(at), original_of(system)).f_safe[0]
+    original = drive_and_score(system.at(at), original_of(system)).f_safe[0]
     assert (
         endings == f"At {at.name}: the original stops, safety degree {original:.2f} m; this one"
         " collides at "
-        f"{-evaluate(system, weak).f_safe[0]:.2f} m/s."
+        f"{-drive_and_score(system, weak).f_safe[0]:.2f} m/s."
     )
 
 

@@ -30,7 +30,7 @@ from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.questions.repair.problem import Parameter, Promise, RepairProblem
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
-from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
 
@@ -388,10 +388,10 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
     values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
     settings = np.tile(system.characteristics.original, (3, 1))
-    together = evaluate(replace(system, ads=VariedAds(system.ads, names, values)), settings)
+    together = drive_and_score(replace(system, ads=VariedAds(system.ads, names, values)), settings)
     for row, one in enumerate(values):
         ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})
-        alone = evaluate(replace(system, ads=ads), settings[:1])
+        alone = drive_and_score(replace(system, ads=ads), settings[:1])
         assert not list(differences(together.take([row]).results, alone.results)), dict(
             zip(names, one, strict=True)
         )

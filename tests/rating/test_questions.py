@@ -17,7 +17,7 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import _verdict
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.plugins.check import check
+from safevar_sumo.plugins.check import check_study
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
@@ -54,7 +54,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_what_is_shipped_passes_the_check() -> None:
-    assert not check(load_study("euro_ncap_rating"))
+    assert not check_study(load_study("euro_ncap_rating"))
 
 
 @pytest.mark.slow

@@ -12,13 +12,13 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference.agreement import (
-    count_collisions,
+    agreement_counts,
     measure_agreement,
     rank_correlation,
     shipped_agreement,
 )
 from safevar_sumo.reference.rows import ReferenceData, read_reference
-from safevar_sumo.sumo import simulate
+from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -61,7 +61,7 @@ def test_every_number_is_what_it_says() -> None:
 
 def test_collisions_are_counted_on_each_side_and_on_both() -> None:
     there = reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6)
-    counts = count_collisions(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6))
+    counts = agreement_counts(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6))
     assert counts == {
         "rows": 6,
         "collisions_here": 4,
@@ -229,7 +229,7 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(
     read = load_study(study)
     system = assemble(read)
     settings = system.characteristics.original[np.newaxis]
-    here = score(system, settings, simulate(system, settings)).metrics
+    here = score(system, settings, drive_worst(system, settings)).metrics
     for name, share in within.items():
         assert here[name][0] == pytest.approx(read.published[name], rel=share), name
 
@@ -246,5 +246,5 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None
         characteristics.lower, characteristics.upper, (150, len(width))
     )
     effects = np.array([PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names])
-    here = score(system, settings, simulate(system, settings)).f_safe
+    here = score(system, settings, drive_worst(system, settings)).f_safe
     assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) > 0.55

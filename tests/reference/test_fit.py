@@ -24,7 +24,7 @@ from safevar_sumo.questions.model_spread import (
 from safevar_sumo.questions.tolerance import scans, tolerance
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
@@ -41,7 +41,7 @@ def data() -> ReferenceData:
     settings = np.random.default_rng(3).uniform(
         characteristics.lower, characteristics.upper, (24, 12)
     )
-    return ReferenceData(settings, dict(evaluate(system, settings).metrics))
+    return ReferenceData(settings, dict(drive_and_score(system, settings).metrics))
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     makes of it.
     """
     nearer = with_values(load_study("sun"), {GAP: 0.8 * OWN})
-    here = evaluate(assemble(nearer), data.settings)
+    here = drive_and_score(assemble(nearer), data.settings)
     error = np.abs(here.f_safe - data.metrics["safety_degree"]).mean()
     only = fit.Target([], {"safety_degree": 1.0}, original=0.0, rank=0.0, collisions=0.0)
     for unit in (1.0, 2.0):
@@ -202,7 +202,9 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     )
     setting = assemble(study).characteristics.setting({"tireFric": 1.3})[np.newaxis]
     alone = [
-        evaluate(assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting)
+        drive_and_score(
+            assemble(load_study("sun", ads={"parameters": {"brake_gap": gap}})), setting
+        )
         for gap in (OWN, OWN - 1, OWN + 1)
     ]
     (band,) = compute_model_spreads(study, setting)

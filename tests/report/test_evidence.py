@@ -509,5 +509,5 @@ def test_what_cannot_be_run_has_its_reason() -> None:
     def fail() -> bytes:
         raise InputError("model", "is not installed", "an extra")
 
-    row = claims.compare("mine", claims.Claim("answer", b"", fail))
+    row = claims.compare_claim("mine", claims.Claim("answer", b"", fail))
     assert row[2:] == ("cannot be run", "", "model: is not installed expected: an extra")

@@ -342,7 +342,7 @@ def test_a_study_is_carried_out_from_what_its_results_record(
     case: Any = SimpleNamespace(study=study, has_runs=True, solutions=np.empty(0))
     one = ReportedStudy(directory=Path("its results"), case=case, versions={}, answers=[])
     monkeypatch.setattr(ReportedStudy, "choices", {})
-    ((_, command),) = sections.commands(one)
+    ((_, command),) = sections.page_commands(one)
     python, option, script = shlex.split(command)
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
@@ -383,7 +383,7 @@ def test_an_answer_that_cannot_be_given_has_no_command() -> None:
     ]
     one = ReportedStudy(directory=Path("it"), case=case, versions={}, answers=missing)
     vars(one)["choices"] = {}
-    assert [*sections.commands(one)] == [("The answer rules", "rules it")]
+    assert [*sections.page_commands(one)] == [("The answer rules", "rules it")]
 
 
 @pytest.mark.slow

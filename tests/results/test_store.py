@@ -30,7 +30,7 @@ from safevar_sumo.results import (
     row_of_handle,
     solutions_frame,
 )
-from safevar_sumo.results.manifest import differences, identity_digest, read_manifest
+from safevar_sumo.results.manifest import identity_digest, manifest_differences, read_manifest
 from safevar_sumo.study import Study, tables_of
 from tests.campaign.formulas import with_search
 from tests.in_process import json_of, refused, run
@@ -170,7 +170,7 @@ def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_ke
     def changed(**layers: object) -> list[tuple[str, bool]]:
         return [
             (text, changes_simulations)
-            for _, text, changes_simulations in differences(stored, {**stored, **layers})
+            for _, text, changes_simulations in manifest_differences(stored, {**stored, **layers})
         ]
 
     assert changed(study={**tables, "new": False}, versions={"numpy": "2", "libsumo": "1"}) == [

@@ -12,7 +12,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
 from safevar_sumo.scenarios import Scenario
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 
 CARLA = assemble(load_study("sun"))
@@ -54,7 +54,7 @@ def driven(
     vehicle keeps its speed.
     """
     system = replace(system, scenario=scenario, matrix=(), ads=ads or Hold())
-    return simulate(
+    return drive_worst(
         system, system.characteristics.original[np.newaxis] if settings is None else settings
     )
 

@@ -23,7 +23,7 @@ from safevar_sumo.scenarios.euro_ncap import SpeedProfile
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.tracks import VUT_WIDTH
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import made_up_runs
 from tests.scenarios.holding import at_contact, driven
@@ -118,8 +118,8 @@ def test_a_turned_road_changes_nothing(
     )
     system = assemble(ours)
     settings = np.vstack([system.characteristics.original, system.characteristics.lower])
-    here = simulate(system, settings)
-    there = simulate(assemble(mine), settings)
+    here = drive_worst(system, settings)
+    there = drive_worst(assemble(mine), settings)
     assert here.outcome.tolist() == there.outcome.tolist()
     for name in ("gap", "lateral", "speed"):
         assert np.allclose(getattr(here.trace, name), getattr(there.trace, name), atol=0.02), name

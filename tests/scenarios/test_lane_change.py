@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.preventability import ANY
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
-from safevar_sumo.sumo.matrix import simulate, simulate_all_points
+from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.scenarios.holding import Hold, at_contact, driven
@@ -172,7 +172,7 @@ def test_what_cannot_be_is_refused_in_two_lines(name: str) -> None:
     model, parameters, message = REFUSED[name]
     scenario = {"model": model, "parameters": parameters}
     with pytest.raises(InputError, match=message) as caught:
-        simulate(assemble(load_study("wear", matrix=None, scenario=scenario)), ORIGINAL)
+        drive_worst(assemble(load_study("wear", matrix=None, scenario=scenario)), ORIGINAL)
     lines = str(caught.value).splitlines()
     assert lines[0].startswith("study 'wear': ")
     assert len(lines) == 2
@@ -232,7 +232,7 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
     driver = {"model": ads, "parameters": {}, "kind": "traci" if ":" in ads else ""}
     system = assemble(load_study("wear", matrix=None, scenario=scenario, ads=driver))
     vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
-    run = simulate(system, vehicles)
+    run = drive_worst(system, vehicles)
     assert not verify_in_sumo(system, vehicles)
     assert (run.trace.speed[0] == system.points[0].scenario.test_speed).all()
     assert (np.abs(run.test_speed_error) < 0.1).all()

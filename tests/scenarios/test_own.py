@@ -17,7 +17,7 @@ from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo import reason_for_sumo
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import json_of, run
@@ -89,7 +89,7 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
     """
     system = assemble(mine(in_tmp, SEARCH))
     settings = drawn(system, 6, 4)
-    found = evaluate(system, settings)
+    found = drive_and_score(system, settings)
     names = system.characteristics.scenario.names
     of_vehicle = system.characteristics.of_vehicle
     assert names == ("scooter", "gap")
@@ -100,7 +100,9 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
                 "wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}
             )
         )
-        both = evaluate(alone, np.stack([setting[of_vehicle], alone.characteristics.original]))
+        both = drive_and_score(
+            alone, np.stack([setting[of_vehicle], alone.characteristics.original])
+        )
         assert both.outcome[0] == found.outcome[row]
         assert both.f_safe.tolist() == [
             found.f_safe[row],
@@ -187,7 +189,7 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     system = assemble(load_study("native", scenario={"model": "own:Mine", "search": search}))
     assert "by distance" in reason_for_sumo(system)
     settings = drawn(system, 3, 4)
-    found = evaluate(system, settings)
+    found = drive_and_score(system, settings)
     for row, setting in enumerate(settings):
         parameters = {"distance": float(setting[-1])}
         alone = assemble(
@@ -195,7 +197,7 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
                 "native", scenario={"model": "lead_vehicle_stopped", "parameters": parameters}
             )
         )
-        assert evaluate(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
+        assert drive_and_score(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
 
 
 @pytest.mark.parametrize(
@@ -278,5 +280,5 @@ def test_bodies_that_cannot_move_so_are_refused_with_actor_time_and_what_is_expe
     (in_tmp / "own.py").write_text(f"{BODY}[{body}]\n")
     system = assemble(load_study("wear", matrix=None, scenario={"model": "own:Mine"}))
     with pytest.raises(InputError, match=message) as caught:
-        simulate(system, system.characteristics.original[np.newaxis])
+        drive_worst(system, system.characteristics.original[np.newaxis])
     assert len(str(caught.value).splitlines()) == 2

@@ -17,7 +17,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo import drive
-from safevar_sumo.sumo.bodies import Contacts
+from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import original_of
@@ -221,7 +221,9 @@ def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """In SUMO, persons move first. In a test, contacts of the side would not count."""
-    monkeypatch.setattr(drive, "Contacts", lambda n, _: Contacts(n, np.zeros(n, dtype=bool)))
+    monkeypatch.setattr(
+        drive, "FirstContacts", lambda n, _: FirstContacts(n, np.zeros(n, dtype=bool))
+    )
     scenario = Crossing(test="CPFA", speed=30, impact_location=-30)
     assert hit_at_any_time(scenario).count(Outcome.COLLISION) > 5
 

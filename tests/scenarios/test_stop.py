@@ -10,7 +10,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
-from safevar_sumo.replay.simulate import simulate
+from safevar_sumo.replay.simulate import show_simulation
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
@@ -70,7 +70,7 @@ def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> 
 
 
 def test_simulate_prints_the_stop_from_every_speed() -> None:
-    answer = simulate("stop", set=("treadDepth=1.6",))
+    answer = show_simulation("stop", set=("treadDepth=1.6",))
     points = answer.tables["points"]
     assert points["stopping_distance"].tolist() == pytest.approx(
         distances(stops("wet", 30, 50, 80, 100, 120), treadDepth=1.6)

@@ -17,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.scenarios.holding import Hold, driven
@@ -117,7 +117,7 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     }
     system = assemble(load_study(wear, scenario=scenario))
     assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2
-    run = simulate(system, system.characteristics.original[np.newaxis])
+    run = drive_worst(system, system.characteristics.original[np.newaxis])
     end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
     assert run.outcome[0] == Outcome.PASSED
     assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], (
@@ -199,7 +199,7 @@ def test_a_users_cut_in_is_the_same_in_sumo(gap: float, in_tmp: Path) -> None:
     scenario = {"model": "cut:CutIn", "parameters": {"gap": gap}}
     system = assemble(load_study("wear", matrix=None, scenario=scenario))
     vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
-    run = simulate(system, vehicles)
+    run = drive_worst(system, vehicles)
     assert not verify_in_sumo(system, vehicles)
     assert run.trace.gap[20] == pytest.approx(gap, abs=0.5), "when it begins to move over"
     assert set(run.outcome) <= {"collision", "passed", "timeout", "stopped"}

@@ -12,7 +12,7 @@ from safevar_sumo.records import FloatArray, Outcome, differences
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.drive import _Outcomes
-from safevar_sumo.sumo.matrix import evaluate, simulate
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import drawn
@@ -27,18 +27,20 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
 ) -> None:
     system = assemble(load_study(study))
     population = drawn(system, n, seed)
-    together = evaluate(system, population)
+    together = drive_and_score(system, population)
     some = data.draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True))
     for rows in (some, [0]):
         assert not [
-            *differences(together.take(rows).results, evaluate(system, population[rows]).results)
+            *differences(
+                together.take(rows).results, drive_and_score(system, population[rows]).results
+            )
         ]
 
 
 def test_the_original_vehicle_does_not_collide(
     any_system: System, request: pytest.FixtureRequest
 ) -> None:
-    original = evaluate(any_system, any_system.characteristics.original[np.newaxis])
+    original = drive_and_score(any_system, any_system.characteristics.original[np.newaxis])
     if request.node.callspec.id == "autoware_december":  # what docs/autoware.md is about
         assert original.outcome[0] == Outcome.COLLISION
         return
@@ -57,7 +59,7 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(
     ends = np.repeat(characteristics.original[np.newaxis], 2 * n, axis=0)
     ends[np.arange(n), np.arange(n)] = characteristics.lower
     ends[np.arange(n, 2 * n), np.arange(n)] = characteristics.upper
-    run = simulate(any_system, ends[any_system.region.feasible(ends)])
+    run = drive_worst(any_system, ends[any_system.region.feasible(ends)])
     assert set(run.outcome) <= {Outcome.STOPPED, Outcome.PASSED, Outcome.COLLISION, Outcome.TIMEOUT}
     assert np.all(run.trace.speed.max(axis=0) > 1.0)
 

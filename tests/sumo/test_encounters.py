@@ -23,7 +23,7 @@ from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.engine import Engine
-from safevar_sumo.sumo.matrix import evaluate, settings_per_batch
+from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import InlinePool, searched
@@ -121,7 +121,7 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
     joint = searched_study(case)
     system = assemble(joint)
     settings = drawn(system, 4, 3)
-    evaluations = evaluate(system, settings)
+    evaluations = drive_and_score(system, settings)
     names = system.characteristics.scenario.names
     of_vehicle = system.characteristics.of_vehicle
     for row, setting in enumerate(settings):
@@ -137,7 +137,7 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         )
         other = assemble(plain)
         both = np.stack([setting[of_vehicle], other.characteristics.original])
-        alone = evaluate(other, both)
+        alone = drive_and_score(other, both)
         assert alone.outcome[0] == evaluations.outcome[row]
         np.testing.assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(
@@ -152,9 +152,9 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
 def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     system = assemble(load_study("sun_joint"))
     settings = drawn(system, 30, 1)
-    together = evaluate(system, settings)
+    together = drive_and_score(system, settings)
     for row in (0, 7, 29):
-        alone = evaluate(system, settings[[row]])
+        alone = drive_and_score(system, settings[[row]])
         for name, values in together.results.items():
             np.testing.assert_array_equal(alone.results[name], values[[row]])
     beside = simulate(
@@ -163,7 +163,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )
-    in_sumo = evaluate(system, settings, Engine.LIBSUMO)
+    in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
     assert settings_per_batch(system, Engine.RECORDED) > len(settings)
@@ -179,7 +179,7 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     corners = product(*((one.lower, one.upper) for one in widest.values()))
     settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
     recorded, in_sumo = (
-        evaluate(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
+        drive_and_score(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
     np.testing.assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)

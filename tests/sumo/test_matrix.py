@@ -18,7 +18,7 @@ from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study
 from safevar_sumo.sumo.bodies import Body, find_touches
-from safevar_sumo.sumo.matrix import evaluate, simulate, simulate_all_points
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
@@ -54,9 +54,9 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     ]
     assert len(points) == 10
     for one in points[::3]:
-        alone = evaluate(SYSTEM.at(one.point), population)
+        alone = drive_and_score(SYSTEM.at(one.point), population)
         assert not [*differences(alone.results, one.evaluations.results)], one.point.name
-    whole = evaluate(SYSTEM, population)
+    whole = drive_and_score(SYSTEM, population)
     assert (
         whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
     )
@@ -78,7 +78,7 @@ def run(
     scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
 ) -> SimulationRuns:
     system = replace(system, scenario=scenario, ads=ads or HOLDS_HALF)
-    return simulate(system, original_of(system) if settings is None else settings)
+    return drive_worst(system, original_of(system) if settings is None else settings)
 
 
 def with_max_rpm(*values: float) -> FloatArray:
@@ -158,14 +158,14 @@ def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewh
         "stopped",
         "invalid-test",
     ]
-    evaluations = evaluate(steep, original)
+    evaluations = drive_and_score(steep, original)
     assert evaluations.outcome[0] == Outcome.INVALID_TEST
     assert not evaluations.valid[0]
     assert not evaluations.failed[0]
     assert np.isnan(evaluations.f_safe[0])
-    assert evaluate(replace(steep, ads=HOLDS_HALF), original).outcome[0] == Outcome.COLLISION, (
-        "at 10 km/h, where the speed is held"
-    )
+    assert (
+        drive_and_score(replace(steep, ads=HOLDS_HALF), original).outcome[0] == Outcome.COLLISION
+    ), "at 10 km/h, where the speed is held"
 
 
 def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> None:

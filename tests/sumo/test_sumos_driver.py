@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
 from tests.sumo.test_traci_controller import changed, system
@@ -114,7 +114,7 @@ def refuse_difference(
     """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its
     end.
     """
-    trace = simulate(runs, changed(runs)).trace
+    trace = drive_worst(runs, changed(runs)).trace
     n = np.count_nonzero(trace.active)
     bare = bare_sumo(traffic, step)
     assert n > 70
@@ -161,11 +161,11 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
 
 def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     runs = system("idle", CONTROLLERS)
-    run = simulate(runs, changed(runs))
+    run = drive_worst(runs, changed(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert run.trace.gap[run.trace.active][-1] < 2  # of the 2.5 m that he wants
     assert any("knows neither the delays of the vehicle" in remark for remark in runs.remarks)
-    close, far = (simulate(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    close, far = (drive_worst(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
     assert close > far + 1  # m/s: the study's headway is his
 
 
@@ -177,7 +177,7 @@ def braking(run: SimulationRuns) -> np.ndarray:
 
 def native(**characteristics: object) -> tuple[System, SimulationRuns]:
     runs = assemble(load_study("native", vehicle={**NO_DELAYS, "characteristics": characteristics}))
-    return runs, simulate(runs, changed(runs))
+    return runs, drive_worst(runs, changed(runs))
 
 
 def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_does(
@@ -202,7 +202,7 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
 
 def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> None:
     runs = assemble(load_study("native"))
-    by_tau = [braking(simulate(runs, changed(runs, tau=tau))) for tau in (0.5, 1.0, 1.5, 2.0)]
+    by_tau = [braking(drive_worst(runs, changed(runs, tau=tau))) for tau in (0.5, 1.0, 1.5, 2.0)]
     assert np.all(np.diff([one.max() for one in by_tau]) < -0.5)
     assert np.all(np.diff([one.mean() for one in by_tau]) < -0.3)
     lags = np.concatenate(
@@ -211,7 +211,7 @@ def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> No
             for lag in (0.1, 0.2, 0.4, 0.6)
         ]
     )
-    assert np.all(np.diff(simulate(runs, lags).collision_speed) > 0.3)
+    assert np.all(np.diff(drive_worst(runs, lags).collision_speed) > 0.3)
 
 
 def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
@@ -221,7 +221,7 @@ def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
         ).remarks
 
     runs = assemble(load_study("native", ads={"model": "idm"}))
-    fast, slow = (simulate(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    fast, slow = (drive_worst(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
     assert fast > slow + 1
     assert remarks("idm") == remarks("krauss") == []
     assert any("tau has no effect" in remark for remark in remarks("acc"))

@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.study import ModelTable
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
 from tests.in_process import run
@@ -98,7 +98,7 @@ def changed(of: System, **values: float) -> np.ndarray:
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
     Path("helper.py").write_text(HELPER)
     runs = system("step", USES_HELPER)
-    run = simulate(runs, changed(runs))
+    run = drive_worst(runs, changed(runs))
     assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
     assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, (
         "the import is for controllers alone"
@@ -133,7 +133,7 @@ def test_a_controller_reads_other_actors_through_the_sensors() -> None:
         "light": "day",
     }
     runs = system("step", LOOKS, weather=weather)
-    trace = simulate(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
+    trace = drive_worst(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
     leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[: len(trace.time)].T
     gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
     late = gap[: len(leader)]  # 3.5 steps, rounded to 4
@@ -170,7 +170,7 @@ class Reads:
 
 def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
     runs = system("Reads", SUBSCRIBES)
-    simulate(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
+    drive_worst(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
 
 
 REFUSED = [
@@ -216,7 +216,7 @@ def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
     script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
     runs = system("step", script)
     with pytest.raises(InputError) as caught:
-        simulate(runs, changed(runs))
+        drive_worst(runs, changed(runs))
     assert problem in str(caught.value)
     assert "my_controller.py:3" in str(caught.value)
 
@@ -292,7 +292,7 @@ def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -
 
 def test_the_vehicle_model_limits_a_commanded_acceleration() -> None:
     runs = system("Harsh")
-    run = simulate(runs, runs.characteristics.original[np.newaxis])
+    run = drive_worst(runs, runs.characteristics.original[np.newaxis])
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0  # more than SUMO's driver, who plans with 4.5 m/s^2
     assert run.outcome[0] == Outcome.STOPPED

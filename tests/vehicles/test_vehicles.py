@@ -18,7 +18,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, FloatArray, JsonObject
 from safevar_sumo.shipped import NETWORKS
-from safevar_sumo.sumo.matrix import simulate
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
@@ -280,7 +280,7 @@ def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path)
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
     traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
     system = assemble(load_study(study, scenario={"parameters": {"network": str(traffic.parent)}}))
-    trace = simulate(system, system.characteristics.original[np.newaxis]).trace
+    trace = drive_worst(system, system.characteristics.original[np.newaxis]).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, (
         "no jump in the first step, whatever the system commands"

@@ -26,7 +26,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
@@ -131,7 +131,7 @@ def stopping_distances(speed: float, water: float, grip: float, *treads: float) 
     tables = {"extends": "stop", "name": "one", "weather": weather, "matrix": {"tests": tests}}
     system = assemble(load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}}))
     settings = np.array([[tread, *[*HEALTHY.values()][1:]] for tread in treads])
-    return evaluate(system, settings).metrics["stopping_distance"]
+    return drive_and_score(system, settings).metrics["stopping_distance"]
 
 
 def simulated_stop(row: dict[str, str]) -> float:
@@ -309,7 +309,7 @@ def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(
             "matrix": {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]},
         }
     )
-    new, worn = evaluate(
+    new, worn = drive_and_score(
         assemble(study),
         np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]]),
     ).metrics["ave_dece"]
@@ -449,8 +449,8 @@ def test_a_study_without_them_drives_as_with_none() -> None:
     without = assemble(load_study("wear", matrix=None))
     settings = drawn(without, 6, 2)
     more = np.concatenate([settings, np.zeros((6, 2))], axis=1)
-    ours = evaluate(with_them, more)
-    theirs = evaluate(without, settings)
+    ours = drive_and_score(with_them, more)
+    theirs = drive_and_score(without, settings)
     assert ours.f_safe.tolist() == theirs.f_safe.tolist()
     angled = with_them.characteristics.original.copy()
     angled[with_them.characteristics.names.index("sensorAngle")] = 2.5

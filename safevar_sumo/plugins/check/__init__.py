@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
-from safevar_sumo.plugins.check.trials import Failure, try_algorithm, try_simulations
+from safevar_sumo.plugins.check.trials import FailedCheck, try_algorithm, try_simulations
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code
@@ -89,7 +89,7 @@ def study_to_check(name: str) -> Study:
     )
 
 
-def check(study: Study) -> list[Finding]:
+def check_study(study: Study) -> list[Finding]:
     """Check the user code of a study."""
     findings = list(find_defects(study))
     if findings:
@@ -138,7 +138,7 @@ def find_defects(study: Study) -> Iterator[Finding]:
 
 
 def _first_defect(
-    study: Study, names: Mapping[str, str], failures: Iterator[Failure]
+    study: Study, names: Mapping[str, str], failures: Iterator[FailedCheck]
 ) -> Iterator[Finding]:
     """The first of the failures of user code, or the error that it raises; `names` are its names by
     their keys.

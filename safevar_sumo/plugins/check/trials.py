@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
-from safevar_sumo.records import FloatArray, Results, differences
+from safevar_sumo.records import FloatArray, ResultColumns, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import is_recorded
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet, region_of
@@ -30,10 +30,10 @@ MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget, and largest population, of an algorithm's runs."""
-Rows = npt.NDArray[np.intp]
+_Rows = npt.NDArray[np.intp]
 
 
-class Failure(NamedTuple):
+class FailedCheck(NamedTuple):
     """A failed check: the actual result, the expected one, and the input that shows it."""
 
     check: str
@@ -42,7 +42,7 @@ class Failure(NamedTuple):
     input: str = ""
 
 
-def try_simulations(study: Study) -> Iterator[Failure]:
+def try_simulations(study: Study) -> Iterator[FailedCheck]:
     """Simulate a study with the original vehicle, the corners of the domains and random
     settings.
     """
@@ -56,9 +56,9 @@ def try_simulations(study: Study) -> Iterator[Failure]:
         )
     )
 
-    def load() -> Callable[[Rows], Results]:
+    def load() -> Callable[[_Rows], ResultColumns]:
         system = _system(study)
-        return lambda rows: evaluate(system, settings[rows]).results
+        return lambda rows: drive_and_score(system, settings[rows]).results
 
     yield from _try(load, region.characteristics, settings)
     system = _system(study)
@@ -68,16 +68,16 @@ def try_simulations(study: Study) -> Iterator[Failure]:
         except InputError as error:
             found, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
-            yield Failure("contract", found, reacts, setting)
+            yield FailedCheck("contract", found, reacts, setting)
 
 
-def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
+def try_algorithm(study: Study, name: str) -> Iterator[FailedCheck]:
     """Let an algorithm search twice, the second time after another run."""
     outputs = _search(study, name, seeds=(1,))
     repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
-        yield Failure(
+        yield FailedCheck(
             "repetition",
             f"{len(repeated)} settings instead of {len(outputs)} in another run",
             expected,
@@ -85,14 +85,14 @@ def try_algorithm(study: Study, name: str) -> Iterator[Failure]:
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
         difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
-        yield Failure("repetition", f"{difference} in another run", expected)
+        yield FailedCheck("repetition", f"{difference} in another run", expected)
 
 
 def _try(
-    load: Callable[[], Callable[[Rows], Results]],
+    load: Callable[[], Callable[[_Rows], ResultColumns]],
     characteristics: CharacteristicSet,
     settings: FloatArray,
-) -> Iterator[Failure]:
+) -> Iterator[FailedCheck]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     run = load()
     all_rows = np.arange(len(settings))
@@ -114,7 +114,9 @@ def _try(
             {name: values[rows] for name, values in outputs.items()}, other_outputs
         ):
             changes = _changes(characteristics, settings[rows[row]])
-            yield Failure(check, f"{difference} {circumstance}", "the same, to the bit", changes)
+            yield FailedCheck(
+                check, f"{difference} {circumstance}", "the same, to the bit", changes
+            )
 
 
 def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:
@@ -169,7 +171,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     problem = Problem(
         characteristics=system.characteristics,
-        original=evaluate(system, system.characteristics.original[np.newaxis]),
+        original=drive_and_score(system, system.characteristics.original[np.newaxis]),
         population=min(study.search.population, MAX_POPULATION),
         evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
         region=system.region,
@@ -184,7 +186,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         try:
             settings.append(next(search))
             while True:
-                settings.append(search.send(evaluate(system, settings[-1])))
+                settings.append(search.send(drive_and_score(system, settings[-1])))
         except StopIteration as end:
             settings.append(end.value.settings)
     return np.concatenate(settings)

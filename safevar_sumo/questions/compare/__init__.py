@@ -7,7 +7,7 @@ domain, near to where the systems begin to fail.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, NamedTuple
@@ -109,6 +109,7 @@ def compare(
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
+    # Both studies, in one common domain and by one criterion.
     study = evaluator.study
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
@@ -116,9 +117,10 @@ def compare(
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
-    stated = [one.parse_criterion(unsafe) for one in evaluators if unsafe is not None]
-    originals = [one.evaluate_original() for one in evaluators]
-    criteria = _criteria(subjects, evaluators, originals, stated, margin)
+    originals = [each.evaluate_original() for each in evaluators]
+    criteria = _criteria(subjects, evaluators, originals, unsafe, margin)
+
+    # The same settings in both.
     pairs, outside = pairs_of(subjects, common, criteria, samples)
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
@@ -126,33 +128,23 @@ def compare(
     tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
+
+    # What differs: settings, limits, the original vehicles, safety degrees or points.
     limits_table = limits_of_both(evaluators, criteria, within)
-    originals_numbers, originals_difference = compare_originals(
-        evaluators, originals, criteria, titles[0]
+    of_originals, difference = compare_originals(evaluators, originals, criteria, titles[0])
+    differences = (
+        compare_counts(counts, titles[0]),
+        compare_limits(limits_table, evaluator.characteristics.vehicle.members),
+        difference,
+        compare_values("rating" if is_rating else "safety degree", tested.p, tested.a12),
     )
-    difference = Difference.joined(
-        [
-            compare_counts(counts, titles[0]),
-            compare_limits(limits_table, evaluator.characteristics.vehicle.members),
-            originals_difference,
-            compare_values("rating" if is_rating else "safety degree", tested.p, tested.a12),
-        ]
-    )
+    difference = Difference.joined(differences)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
-        "unsafe": str(criteria[0]),
-        "margin": criteria[0].keep,
-        "settings": sum(counts.values()),
-        **counts,
-        "p": tested.p,
-        "a12": tested.a12,
-        "better_in": len(difference.better),
-        "worse_in": len(difference.worse),
-        "limits_grown": int(limits_table["change"].isin([GROWN, BOTH]).sum()),
-        "limits_shrunk": int(limits_table["change"].isin([SHRUNK, BOTH]).sum()),
+        **_numbers(criteria[0], counts, tested, difference, limits_table["change"]),
         "outside": outside,
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
-        **originals_numbers,
+        **of_originals,
     }
     refusals = reasons_against(evaluators, titles)
     sentences = [
@@ -174,6 +166,28 @@ def compare(
     )
 
 
+def _numbers(
+    criterion: Unsafe,
+    counts: Mapping[str, int],
+    tested: _PairedTest,
+    difference: Difference,
+    changes_of_limits: pd.Series[str],
+) -> JsonObject:
+    """What was compared, and in how much B is better and worse."""
+    return {
+        "unsafe": str(criterion),
+        "margin": criterion.keep,
+        "settings": sum(counts.values()),
+        **counts,
+        "p": tested.p,
+        "a12": tested.a12,
+        "better_in": len(difference.better),
+        "worse_in": len(difference.worse),
+        "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
+        "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
+    }
+
+
 def _titles(evaluators: Sequence[Evaluator]) -> tuple[str, ...]:
     """What sentences call A and B: the names of their studies if they differ."""
     names = tuple(one.study.name for one in evaluators)
@@ -184,12 +198,13 @@ def _criteria(
     subjects: Sequence[Study | Case],
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
-    stated: Sequence[Unsafe],
+    unsafe: str | None,
     margin: float | None,
 ) -> list[Unsafe]:
     """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its
     bodies touch.
     """
+    stated = [each.parse_criterion(unsafe) for each in evaluators if unsafe is not None]
     if stated:
         criterion = stated[0]
     elif margin is not None:

@@ -15,7 +15,7 @@ from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_fits import Ranges, conclusions_across_fits
+from safevar_sumo.questions.explain.across_fits import conclusions_across_fits
 from safevar_sumo.questions.explain.causes import BOUNDARIES, SUBSETS, count_needed
 from safevar_sumo.questions.explain.failures import (
     TO_EXPLAIN,
@@ -23,7 +23,7 @@ from safevar_sumo.questions.explain.failures import (
     choose_failures,
     find_failures,
 )
-from safevar_sumo.questions.explain.margins import MARGINS, find_margins
+from safevar_sumo.questions.explain.margins import MARGINS, margins_table
 from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS
 from safevar_sumo.questions.explain.robustness import robustness_in_words
 from safevar_sumo.questions.explain.tables import (
@@ -33,8 +33,8 @@ from safevar_sumo.questions.explain.tables import (
     SOLUTION_COLUMNS,
     causes_table,
     distinct_table,
+    failures_frame,
     moved_table,
-    solutions_frame,
     statistics_tables,
 )
 from safevar_sumo.questions.model_spread import FITS_AT_ONCE
@@ -59,7 +59,7 @@ from safevar_sumo.questions.words import (
     number_of,
     share_in_words,
 )
-from safevar_sumo.records import BoolArray, JsonObject, Outcome
+from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -124,52 +124,43 @@ def explain(
     """
     evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES, BORDERS)
     study = evaluator.study
+
+    # The failures, and the minimal causes of a sample of them.
     population = find_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
-    # Of an unsafe original no change is a cause; in another encounter it may be safe.
-    is_unsafe_original = not study.scenario.search and bool(
-        population.unsafe.of(population.original)[0]
+    is_caused = _has_causes(population, study)
+    of_chosen, of_sample = (
+        [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
     )
-    if is_unsafe_original:
-        causes = {row: [] for row in causes}
     changed = evaluator.characteristics.changed(runs.settings[sample])
-    needed = count_needed(
-        evaluator.characteristics, changed, [causes[row] for row in sample], len(population.rows)
-    )
-    needed = needed.head(0) if is_unsafe_original else needed
+    needed = count_needed(evaluator.characteristics, changed, of_sample, len(population.rows))
+    needed = needed if is_caused else needed.head(0)
+
     # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
     verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
-    of_chosen = [causes[row] for row in reasons]
-    holding = list[BoolArray]()
-    ranges = Ranges()
-    if fits and study.spread and len(runs):
-        shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-        holding, ranges = conclusions_across_fits(
-            evaluator, fits, runs, population.unsafe, of_chosen, *shares
-        )
-    solutions = solutions_frame(population, evaluator, reasons)
+
+    # The same conclusions with the other parameter sets of the vehicle model.
+    shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
+    holding, ranges = conclusions_across_fits(evaluator, fits, population, of_chosen, *shares)
+
+    # Tables, numbers and the verdict.
+    solutions = failures_frame(population, evaluator, reasons)
     tables = {
         "causes": causes_table(population, evaluator, holding, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(
             needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)
         ),
-        "margins": tabulate(
-            "By the margin of the original", MARGINS, find_margins(population, evaluator, limit)
-        ),
+        "margins": margins_table(population, evaluator, limit),
         "moved": moved_table(evaluator, of_chosen),
-        "distinct_causes": distinct_table(evaluator, [causes[row] for row in sample]),
+        "distinct_causes": distinct_table(evaluator, of_sample),
     }
     numbers = {
         **_counts(population, subject),
         "analysed": len(sample),
         "explained": len(solutions),
-        **(
-            dict.fromkeys(COLLISION_NUMBERS)
-            if is_rated(study)
-            else _collision_numbers(verdicts, collisions)
-        ),
+        **_collision_numbers(study, verdicts, collisions),
         "fits": len(holding),
         "unsafe_in_fits": ranges.get(("unsafe", "")),
     }
@@ -177,17 +168,24 @@ def explain(
     sentences = [
         _verdict(evaluator, population, kind, len(holding), tables["causes"]),
         _avoided_in_words(verdicts),
+        *(counted_in_words(study, len(population.left_out)) if kind == DRAWN else []),
+        *constraints_in_words(study),
     ]
-    sentences += counted_in_words(study, len(population.left_out)) if kind == DRAWN else []
-    verdict = " ".join([*filter(None, sentences), *constraints_in_words(study)])
     return Answer(
         question="explain",
         study=study,
-        verdict=verdict,
+        verdict=" ".join(filter(None, sentences)),
         numbers=numbers,
         tables=tables,
         draw=draw_needed,
     )
+
+
+def _has_causes(population: Population, study: Study) -> bool:
+    """Whether changes can be causes: of an unsafe original none is, but in another encounter it may
+    be safe.
+    """
+    return bool(study.scenario.search or not population.unsafe.of(population.original)[0])
 
 
 def _counts(population: Population, subject: Study | Case) -> JsonObject:
@@ -210,10 +208,12 @@ def _counts(population: Population, subject: Study | Case) -> JsonObject:
     }
 
 
-def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
+def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) -> JsonObject:
     """The numbers of all collisions, of those judged that some driver avoids, and that even full
-    braking does not.
+    braking does not; none in a rated study.
     """
+    if is_rated(study):
+        return dict.fromkeys(COLLISION_NUMBERS)
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
     return dict(

@@ -18,6 +18,7 @@ from safevar_sumo.questions.explain.causes import (
     find_minimal_causes,
     settings_of,
 )
+from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.model_spread import across
 from safevar_sumo.questions.preventability import avoided_shares, judge_sample
 from safevar_sumo.questions.sampling import Interval
@@ -114,15 +115,18 @@ def ranges_across_fits(
 def conclusions_across_fits(
     evaluator: Evaluator,
     fits: int,
-    evaluations: Evaluations,
-    unsafe: Unsafe,
+    population: Population,
     causes: Sequence[Sequence[Cause]],
     needed: pd.Series[float],
     avoided: pd.Series[float],
 ) -> tuple[list[BoolArray], Ranges]:
     """Whether each cause is one, with each of the first `fits` sets, and the result of
-    `ranges_across_fits`.
+    `ranges_across_fits`; nothing without sets or settings.
     """
+    unsafe = population.unsafe
+    evaluations = population.evaluations
+    if not (fits and evaluator.study.spread and len(evaluations)):
+        return [], {}
     evaluator = evaluator.for_study(evaluator.study, verified=0)  # as those of the sets
     flat = [cause for group in causes for cause in group]
     holding = across(evaluator, fits, lambda each: are_causes(each, flat, unsafe))

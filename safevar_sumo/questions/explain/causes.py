@@ -264,7 +264,9 @@ class Limits(NamedTuple):
     end: BoundaryState
 
 
-def find_limits(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> list[Limits]:
+def find_cause_limits(
+    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
+) -> list[Limits]:
     """Find the limits of causes."""
     if not causes:
         return []

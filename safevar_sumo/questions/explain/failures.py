@@ -27,7 +27,7 @@ from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import evaluate, simulate_all_points, worst_points
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import System
 
 Reasons = dict[int, str]
@@ -293,7 +293,7 @@ def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointCo
     comparisons = []
     for setting, loss in zip(settings, losses, strict=True):
         point = system.matrix[int(np.argmax(loss))]
-        evaluations = evaluate(system.at(point), np.stack([original, setting]))
+        evaluations = drive_and_score(system.at(point), np.stack([original, setting]))
         worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
         comparisons.append((_endings_in_words(system, point.name, evaluations), worse_cells))
     return comparisons

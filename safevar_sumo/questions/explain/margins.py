@@ -9,14 +9,18 @@ import pandas as pd
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes, settings_of
+from safevar_sumo.questions.explain.causes import (
+    find_cause_limits,
+    find_minimal_causes,
+    settings_of,
+)
 from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.explain.robustness import (
     MIN_ROBUST_SHARE,
     find_smallest_robust_failure,
     robust_shares,
 )
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE
 
@@ -37,7 +41,7 @@ MARGINS: Columns = {
 }
 
 
-def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd.DataFrame:
+def margins_table(population: Population, evaluator: Evaluator, limit: int) -> pd.DataFrame:
     """A row of `MARGINS` for each margin; none unless the study searches its scenario, and where a
     user names solutions.
     """
@@ -67,7 +71,8 @@ def find_margins(population: Population, evaluator: Evaluator, limit: int) -> pd
                     **cause,
                 }
             )
-    return pd.DataFrame(rows, columns=[*MARGINS])
+    frame = pd.DataFrame(rows, columns=[*MARGINS])
+    return tabulate("By the margin of the original", MARGINS, frame)
 
 
 def _with_margin(evaluator: Evaluator, margin: float) -> Evaluator:
@@ -100,5 +105,5 @@ def _smallest_cause(
     best = int(np.argmax(shares))
     if shares[best] < MIN_ROBUST_SHARE:
         return {}
-    (limits,) = find_limits(evaluator, [causes[best]], unsafe)
+    (limits,) = find_cause_limits(evaluator, [causes[best]], unsafe)
     return {"boundary": limits.boundary, "robust_share": float(shares[best])}

@@ -13,7 +13,7 @@ from safevar_sumo.questions.explain.across_fits import Ranges
 from safevar_sumo.questions.explain.causes import (
     Cause,
     count_distinct_causes,
-    find_limits,
+    find_cause_limits,
     settings_of,
 )
 from safevar_sumo.questions.explain.failures import (
@@ -106,7 +106,7 @@ DISTINCT_COLUMNS: Columns = {
 }
 
 
-def solutions_frame(population: Population, evaluator: Evaluator, reasons: Reasons) -> pd.DataFrame:
+def failures_frame(population: Population, evaluator: Evaluator, reasons: Reasons) -> pd.DataFrame:
     """A row of `SOLUTION_COLUMNS` for each chosen failure."""
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
@@ -156,7 +156,7 @@ def causes_table(
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
-    limits = find_limits(evaluator, causes, unsafe)
+    limits = find_cause_limits(evaluator, causes, unsafe)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:
         at_original = [cause._replace(encounter={}) for cause in causes]

@@ -29,7 +29,7 @@ from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import find_limits, find_minimal_causes
+from safevar_sumo.questions.explain.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
@@ -223,7 +223,7 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     evenly_spaced = np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)
     causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
     parts: dict[tuple[object, ...], dict[str, float]] = {}
-    for limits, cause in zip(find_limits(driver, causes, unsafe), causes, strict=True):
+    for limits, cause in zip(find_cause_limits(driver, causes, unsafe), causes, strict=True):
         # Of equal causes in many encounters only the first counts.
         kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
         parts.setdefault(kind, limits.boundary | cause.encounter)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Jobs, Range, Share
+from safevar_sumo.questions.ask import Fraction, Jobs, Range
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -66,7 +66,7 @@ REMARKS: Columns = {"table": "table", "remark": "what is missing or left out the
 def tables(
     *results: Results | str | Path,
     algorithm: str = "",
-    alpha: Share = ALPHA,
+    alpha: Fraction = ALPHA,
     causes: Annotated[int, Range(0, 100_000)] = 0,
     all: bool = False,
     figures: Path | None = None,

@@ -16,6 +16,7 @@ import pandas as pd
 import scipy
 from numpy.typing import ArrayLike
 
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
@@ -36,7 +37,6 @@ EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = (
     "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
 )
-Interval = tuple[float, float]
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
 
