@@ -50,6 +50,8 @@ class WholeTable(Table):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         if self._title_line:
             yield self._title_line  # rich breaks a title where its table ends
+
+        # Widths that columns need for their longest word and for all text.
         sizes = []
         count = len(self.columns)
         for column in self.columns:
@@ -62,6 +64,8 @@ class WholeTable(Table):
                 (max(one.minimum for one in measures), max(one.maximum for one in measures))
             )
             column.overflow = "fold"
+
+        # If not all fits, the space is shared.
         words, whole = (sum(size) for size in zip(*sizes, strict=True))
         space = options.max_width - count - 1  # beside the lines
         if whole + 2 * count > space:
@@ -150,6 +154,8 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
     if progress is not True:
         yield progress or show_no_progress
         return
+
+    # A bar on a terminal, lines elsewhere.
     console = console or Console(stderr=True)
     pace = _Pace()
     ended = Event()

@@ -124,6 +124,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
+
+        # Without a threat it holds its speed; once it has intervened, it no longer accelerates.
         cruise_speed, cruise_trim = memory.cruise or cruise_at(nominal, seen, self.cruise_speed)
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
@@ -132,8 +134,12 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim
         )
         throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
+
+        # A braking stage presses the brake, partly or fully.
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
         command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
+
+        # It warns before it brakes.
         warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > NO_BRAKING)
         return command, memory._replace(
             cruise=(cruise_speed, cruise_trim),
@@ -154,11 +160,15 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         speed = seen.speed
         obstacle_speed = seen.obstacle_speed
+
+        # How hard the obstacle has braked since the last step.
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(
             seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0
         )
         obstacle_deceleration = lost_speed / memory.step
+
+        # The braking distance until speeds are equal, or until both stand.
         obstacle_stop = (
             obstacle_speed
             * obstacle_speed
@@ -170,6 +180,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             closing_speed * closing_speed / (2 * deceleration),
             np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0),
         )
+
+        # A braking stage begins below its gap.
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
         stage_at_gap = np.where(
@@ -178,6 +190,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             np.where(seen.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING),
         )
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
+
+        # It ends when nobody approaches any more who blocks the way.
         is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
         still_blocks = is_ahead & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
         is_standing = speed <= 0

@@ -144,6 +144,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from
         its first position `perception_time` ago or earlier.
         """
+        # Where the obstacle was at first sight, and whether it was in the way then.
         is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
         lateral = np.where(is_sighted, seen.lateral, 0.0)
         is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
@@ -151,6 +152,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         is_in_corridor = np.abs(lateral) <= self.corridor + seen.obstacle_width / 2
         appears_in_way = is_in_corridor & (memory.stray_time < 0)
         appeared_in_way = np.where(is_first_sight, appears_in_way, memory.appeared_in_way)
+
+        # Since when it has strayed from there.
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
         strayed = (deviation - self.stray) / np.maximum(np.abs(seen.lateral_speed), LEAST_DIVISOR)

@@ -47,6 +47,8 @@ class Fmu:
     def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
         self.code = code
         self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
+
+        # The model description, read from the unpacked FMU.
         expected = (
             "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
         )
@@ -63,12 +65,16 @@ class Fmu:
             raise InputError(
                 "", f"{table.model}: {type(error).__name__}: {error}", expected
             ) from None
+
+        # What this package cannot simulate is refused.
         kind = self._model.coSimulation
         if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
             raise InputError("", f"{table.model} is another FMU", expected)
         if ("acceleration" in table.outputs) == bool({"throttle", "brake"} & table.outputs.keys()):
             expected = "throttle, brake or both; alternatively acceleration"
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
+
+        # Its variables by the quantities that they take or hold.
         observed = [name for name in (*Observation._fields, "detected") if name in UNITS]
         self.inputs = {
             key: self._variable("input", key, name, observed) for key, name in table.inputs.items()
@@ -88,6 +94,8 @@ class Fmu:
         """
         key = f"ads.{causality}s.{quantity}"
         check_name("", f"{key}: there is no such quantity", quantity, quantities)
+
+        # The variable by its name.
         variables = {
             one.name: one for one in self._model.modelVariables if one.causality == causality
         }
@@ -96,6 +104,8 @@ class Fmu:
                 "", f"{key} = {name!r}: no real {causality} of the FMU", name, variables
             )
         variable = variables[name]
+
+        # Its unit is the quantity's SI unit, if it states one.
         unit = (
             (variable.unit or getattr(variable.declaredType, "unit", None) or "")
             .replace("^", "")
@@ -111,6 +121,7 @@ class Fmu:
         """A new instance at the beginning of its time."""
         from fmpy.simulation import instantiate_fmu
 
+        # An FMU with a step of its own takes the study's.
         kind = self._model.coSimulation
         experiment = self._model.defaultExperiment
         own = getattr(kind, "fixedInternalStepSize", None)
@@ -120,10 +131,13 @@ class Fmu:
             raise InputError(
                 "", f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s"
             )
+        # An FMU in Python imports its own modules, not namesakes.
         for file in Path(self._folder.name, "resources").glob("*.py"):
             sys.modules.pop(
                 file.stem, None
             )  # an FMU in Python imports its own modules, not namesakes
+
+        # Initialised with the parameters of the study.
         slave = instantiate_fmu(
             self._folder.name, self._model, "CoSimulation", logger=lambda *_: None
         )

@@ -84,6 +84,8 @@ def evaluate(
     """
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
+
+    # Settings that may be simulated, after the filter of small changes.
     requested, index = _read_settings(settings, characteristics, beyond)
     if not beyond:
         with about("settings"):
@@ -91,6 +93,8 @@ def evaluate(
     simulated = characteristics.filter(requested) if filtered else requested
     with open_progress(progress) as report_progress:
         evaluations = evaluate_with_workers(loaded_study, simulated, pool, jobs, report_progress)
+
+    # A row for each setting, with the index of the user's rows.
     groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
     frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
@@ -125,10 +129,12 @@ def _read_settings(
 
     names = list(characteristics.names)
     if isinstance(settings, Sequence):
+        # Several settings as a table.
         settings = plain_values(settings)
     if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
+        # A table may leave out characteristics; an array has all.
         if isinstance(settings, pd.DataFrame):
             for name in settings.columns:
                 check_name("settings", f"column {name!r} is no characteristic", name, names)
@@ -146,6 +152,8 @@ def _read_settings(
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         raise InputError("settings", str(error), SETTINGS_FORMAT) from None
+
+    # The first illegal value is refused.
     is_legal = [
         row.is_legal(values, beyond=beyond)
         for row, values in zip(characteristics, array.T, strict=True)

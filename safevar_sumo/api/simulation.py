@@ -62,6 +62,7 @@ def trace_frame(
     """
     import pandas as pd  # takes longer to load than the simulation
 
+    # What the simulation logged.
     trace = runs.trace
     ttc = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
     columns = {
@@ -76,6 +77,8 @@ def trace_frame(
         "lateral [m]": trace.lateral,
         "lateral speed [m/s]": trace.lateral_speed,
     }
+
+    # Until the end of this vehicle's run.
     active = trace.active[:, 0]
     frame = pd.DataFrame(
         {
@@ -83,6 +86,8 @@ def trace_frame(
             **{name: column[active, 0] for name, column in columns.items()},
         }
     )
+
+    # What its driving system saw at the same times.
     observed = pd.DataFrame(
         [
             {

@@ -234,9 +234,12 @@ def _measured(
     study: Study, system: System, runs: int, engine: str, batch: int | None, pool: Pool
 ) -> Answer:
     """The estimated time of a search, from a short measurement."""
+    # The speed on this machine.
     used, reason = choose_engine(system, engine)
     task = Task(study=study, engine=used, batch_size=batch or settings_per_batch(system, used))
     rate = measure_speed(task, pool)
+
+    # The time that follows for all evaluations.
     evaluations = runs * study.search.evaluations
     seconds = evaluations / rate
     time = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
@@ -262,6 +265,8 @@ def _measured(
 def _verdict(results: Results, case: Case, system: System) -> str:
     """How many solutions of a case of the results are unsafe, and how little is enough."""
     names = list(system.characteristics.names)
+
+    # An original vehicle that is unsafe itself needs no change.
     if not system.rater and not system.characteristics.scenario:
         original = drive_and_score(
             assemble(case.study), system.characteristics.original[np.newaxis]
@@ -271,6 +276,8 @@ def _verdict(results: Results, case: Case, system: System) -> str:
                 f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is"
                 " needed."
             )
+
+    # The solution with the fewest changes, as it is printed, must be unsafe, too.
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
         return "No solution."
@@ -292,6 +299,8 @@ def _verdict(results: Results, case: Case, system: System) -> str:
         values = printed.settings[0]
         ending = ending_in_words(str(printed.outcome[0]), float(printed.f_safe[0]), system.contact)
         bounded = pd.Series({name: column[0] for name, column in printed.metrics.items()})
+
+    # How it ends, and what it changes.
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
     elif case.unsafe.bound:
@@ -328,6 +337,8 @@ def summarise(results: Results) -> Answer:
     if not case.has_runs:
         problem = "holds imported solutions, which have no runs"
         raise InputError(results.directory, problem, "results of the command `study`")
+
+    # A row for each algorithm: what was simulated, and its solutions.
     finished = Counter(name for name, _ in results.finished)
     rows = []
     for name in study.search.labels:
@@ -342,12 +353,16 @@ def summarise(results: Results) -> Answer:
         best = feasible["f_safe"].min()
         ends = (collisions, *counts, best, len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
+
+    # The study's metrics are columns, too.
     metrics = {
         metric.name: Column(metric.unit, "mean over solutions", ".2f")
         for metric in case.scoring.metrics
     }
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     tables = {"algorithms": table}
+
+    # Tests that none of so few runs can pass are folded, with a remark.
     untold = list[str]()
     with suppress(UnanswerableError):
         tables |= answer_questions([case], names=RUN_TESTS).tables

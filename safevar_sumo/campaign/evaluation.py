@@ -114,6 +114,8 @@ def carry_out(
     """
     try:
         return pool.map(function, jobs, look)
+
+    # Two workers died at the same work, probably in user code.
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
         work = ", ".join(
@@ -204,6 +206,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
     """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
+    # The settings, and values of the driving system's parameters.
     selection = task.selection
     n = len(system.characteristics)
     settings = rows[:, :n]
@@ -212,11 +215,15 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         return evaluate_matrix(system, settings, task.engine, each=True)
     if not values.size:
         return drive_and_score(system, settings, task.engine, with_originals=False)
+
+    # A driving system that takes an array for each parameter drives all at once.
     if selection.arrays:
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
         return replace(
             drive_and_score(system, settings, task.engine, with_originals=False), settings=rows
         )
+
+    # Any other one drives once for each set of values.
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
     groups = []
     rows_of_groups = []

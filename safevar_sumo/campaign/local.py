@@ -53,6 +53,8 @@ class ProcessWorker:
     def cause_of_death(self, error: BaseException) -> str:
         if not isinstance(error, BrokenExecutor):
             return ""
+
+        # The last words of the worker name the line of user code.
         words = (
             self._last_words.read_text(encoding="utf-8", errors="replace")
             if self._last_words.exists()

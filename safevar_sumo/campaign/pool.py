@@ -94,6 +94,7 @@ class Pool:
         WorkerLostError
             If another worker dies of the same job.
         """
+        # Numbers of jobs that wait, workers without a job, and jobs under way.
         results = dict[int, Any]()
         deaths = Counter[int]()
         waiting = deque(range(len(jobs)))
@@ -103,12 +104,16 @@ class Pool:
         while len(results) < len(jobs):
             if self._is_abandoned.is_set():
                 raise AbandonedError
+
+            # Every idle worker gets a job.
             while waiting and idle:
                 place = idle.popleft()
                 number = waiting.popleft()
                 future = self._begin(place, function, jobs[number])
                 under_way[future] = place, number
                 future.add_done_callback(ended.put)
+
+            # Wait for a job to end, and look around now and then.
             try:
                 future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
             except Empty:
@@ -116,6 +121,8 @@ class Pool:
                 continue
             place, number = under_way.pop(future)
             idle.appendleft(place)
+
+            # A job that killed its worker waits again, a few times.
             error = future.exception()
             if error is None:
                 results[number] = future.result()
@@ -134,6 +141,7 @@ class Pool:
         """The results of functions that give jobs to a pool, each in a thread with some of the
         workers; when one raises an error, the others end.
         """
+        # Each thread has a part of the workers.
         count = min(len(functions), self.workers)
         if count < 2:
             return [function(self) for function in functions]
@@ -149,6 +157,7 @@ class Pool:
             finally:
                 free.put(part)
 
+        # The first error ends all of them.
         with ThreadPoolExecutor(count) as threads:
             futures = [threads.submit(copy_context().run, call, function) for function in functions]
             try:

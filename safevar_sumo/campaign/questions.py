@@ -65,10 +65,13 @@ def evaluate_all(
     simulated in SUMO, until `verified` ones of the study have been. `done` is called with the
     number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO.
     """
+    # User code is checked once for each study.
     packed_study = msgspec.msgpack.encode(study)
     if packed_study not in pool.verified:
         check_code(study, pool)
         pool.verified[packed_study] = 0
+
+    # Equal settings are simulated once, in batches for the workers.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
     task = Task(study=study, batch_size=batches.best, selection=selection)
@@ -81,6 +84,7 @@ def evaluate_all(
         for number in ended:
             done(len(jobs[number][1]))
 
+    # Some results from recorded scenes are repeated in SUMO.
     evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
     sample_size = min(verified - pool.verified[packed_study], len(distinct_settings))
     if batches.are_recorded and sample_size > 0 and selection == EVERYTHING:

@@ -65,6 +65,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         its parameters.
     """
     with about(study.source):
+        # Tables of parameters belong to an algorithm.
         search = study.search
         name = search.labels.get(label, label)
         key = f"search.{label}"
@@ -88,6 +89,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
                 raise unknown_name(
                     "", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
                 )
+
+        # The class: one of pymoo, of this package, or the user's own.
         lookup = Lookup.of(study)
         if PYMOO + name in PYMOO_ALGORITHMS:
             raise InputError("", f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
@@ -98,6 +101,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             member = lookup.class_of(
                 {**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm
             )
+
+        # The algorithm with its parameters.
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
         algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
         return algorithm
@@ -165,6 +170,7 @@ class Run:
         """
         answer = None  # starts a generator
         while not (self._missing or self._has_ended):
+            # The search gets what it asked for, and asks for more.
             if len(self._request):
                 answer = self._content.evaluations.take(
                     [self._row_of[setting.tobytes()] for setting in self._request]
@@ -176,6 +182,8 @@ class Run:
                 self.solutions = end.value
                 self._has_ended = True
                 break
+
+            # What is neither in the journal nor in memory is missing.
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)

@@ -50,6 +50,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a
     condition of --fail-if holds, and 1 if its number `passed` is false. A text is printed, too.
     """
+    # Arguments and options as the signature has them.
     signature = inspect.signature(function)
     positional = [one for one in signature.parameters.values() if one.kind is not one.KEYWORD_ONLY]
     options = [option for option in options_of(function) if option.name not in LIBRARY_ONLY]
@@ -96,6 +97,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
+    # The command, with the options of every answer.
     declared = contents_of(function)
     gives_answer = "Answer" in str(signature.return_annotation)
     return click.Command(

@@ -170,11 +170,14 @@ def run_command_line() -> None:
     limit is not kept) or 130 (interrupted).
     """
     # Without its file and line.
+    # Warnings are lines; a signal to end is an interruption; a crash has its line.
     warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
         faulthandler.enable()  # if compiled code crashes, its line is printed
+
+    # Every error is one or two lines and an exit code.
     try:
         code = commands.main(standalone_mode=False, prog_name=PROGRAM)
         sys.stdout.flush()

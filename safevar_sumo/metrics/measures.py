@@ -173,6 +173,8 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     bodies: it is shorter by the share of both widths that lanes are wider.
     """
     trace = runs.trace
+
+    # Where both are in the last sample of the run.
     number = np.count_nonzero(trace.active, axis=0)
     at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
     speed, gap, lateral, lateral_speed, obstacle_width = (
@@ -185,6 +187,8 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
             trace.obstacle_width,
         )
     )
+
+    # Who leaves the shared place last, and how far the other one is from it.
     apart = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     crossing = np.abs(lateral_speed)
     leaves = (lateral * lateral_speed > 0) & (gap > 0)

@@ -214,6 +214,8 @@ class Unsafe:
         3.21 m/s`, `stops 0.04 m short, less than 0.30 m`.
         """
         degree = float(vehicle.f_safe[0])
+
+        # In the unit of the criterion: points, a metric, or a safety degree.
         if self.points is not None:
             return (
                 f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
@@ -229,6 +231,8 @@ class Unsafe:
             unit = "m" if degree >= 0 else "m/s"
             text = _on_its_side(degree, self.below, "g", 3)
             return f"has safety degree {text} {unit}, below {self.below:.3g} {unit}"
+
+        # Otherwise a collision, or a distance that is too small.
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"
         left = _on_its_side(degree - self.contact, self.keep, "f", 2)
@@ -249,6 +253,8 @@ class Unsafe:
             return criterion
         if criterion == COLLISION:
             return cls()
+
+        # A measure, a comparison and a number.
         parts = re.fullmatch(r"\s*([A-Za-z]\w*)\s*(<=|>=|<|>|=)\s*(\S+)\s*", str(criterion))
         quantity, comparison, text = (
             ("below", "=", criterion)
@@ -261,6 +267,8 @@ class Unsafe:
             limit = float(text)
         except (TypeError, ValueError):
             limit = math.nan
+
+        # A safety degree, points, or any metric of the study.
         if math.isfinite(limit):
             if (quantity, comparison) in (("below", "="), (SAFETY_DEGREE, "<")):
                 return cls(below=limit)

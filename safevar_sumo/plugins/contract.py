@@ -249,12 +249,15 @@ class Returned(NamedTuple):
         self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]
     ) -> UserValue:
         """The result after the check."""
+        # One object, or a tuple of several.
         values = (result,) if len(self.parts) <= 1 else result
         if len(self.parts) > 1 and not (
             isinstance(result, tuple | list) and len(result) == len(self.parts)
         ):
             names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
             raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
+
+        # Each attribute has the shape of the argument, and legal numbers.
         shape = None if self.like is None or not self.parts else _shape_of(arguments[self.like])
         for columns, value in zip(self.parts, values, strict=False):
             for name, legal in columns.items():
@@ -298,6 +301,7 @@ def checked_class(code: UserCode, base: type) -> type:
 
         return method
 
+    # Methods that the class has of its own are checked.
     methods = {
         name: checked_method(name, returned)
         for name, returned in getattr(base, "RETURNS", {}).items()

@@ -96,6 +96,8 @@ class Lookup:
         expected = (
             f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
         )
+
+        # A module, a colon and a name.
         module_name, colon, attribute = name.partition(":")
         if colon and module_name.endswith(".py"):
             dotted = module_name.removesuffix(".py").replace("/", ".")
@@ -108,6 +110,8 @@ class Lookup:
             and all(part.isidentifier() for part in module_name.split("."))
         ):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
+
+        # The module is loaded, and has the name.
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
         this_process.named_files.add(file_of_module(module_name))
@@ -176,12 +180,16 @@ class Lookup:
         if name.partition(".")[0] == "__main__":
             problem = f"{key}: other processes cannot import from __main__"
             raise InputError("", problem, "a module in a file of its own")
+
+        # Modules beside the study come before those of the working directory.
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
         modules_before = set(sys.modules)
         dont_write_bytecode = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
+
+        # What fails at the import is an error of user code.
         try:
             with (
                 user_errors(subject()),

@@ -74,6 +74,8 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
     if not this_process.is_listening:
         sys.addaudithook(_listen)  # for the life of this process
         this_process.is_listening = True
+
+    # What is loaded and opened in the block.
     use = Use({}, [])
     before = set(sys.modules)
     opened = this_process.opened = set[str]()
@@ -81,6 +83,8 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
         yield use
     finally:
         this_process.opened = None
+
+    # Modules in the study's folders, and other files that were opened.
     loaded = sys.modules.keys() - before
     this_process.modules |= loaded
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]

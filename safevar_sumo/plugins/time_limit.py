@@ -78,6 +78,7 @@ def _raise_error(time_limit: float, what: str) -> Iterator[None]:
             frame = frame.f_back
         raise _TimeIsUp(SimulationError(f"{problem}, search.time_limit"))
 
+    # The timer and its handler are as before at the end.
     previous_handler = signal.signal(signal.SIGALRM, refuse)
     previous_timer = signal.setitimer(signal.ITIMER_REAL, time_limit)
     try:

@@ -59,6 +59,7 @@ class DrivingRobot:
         state: VehicleState,
         step: float,
     ) -> None:
+        # The test speed of each vehicle; NaN without a test.
         n = len(state.speed)
         speeds = [
             np.nan if speed is None else speed
@@ -71,6 +72,8 @@ class DrivingRobot:
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
+
+        # The robot controls the speed with the pedals of the start.
         self._prepared = prepared
         self._vehicle = vehicle
         self._start_pedal = state.throttle - state.brake
@@ -84,6 +87,8 @@ class DrivingRobot:
         robot drove; NaN without a test.
         """
         self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
+
+        # When a system acts too early for the test.
         self._depends_until = np.concatenate(
             [np.broadcast_to(point.scenario.depends_until, n // len(points)) for point in points]
         )
@@ -103,23 +108,31 @@ class DrivingRobot:
         if not self._is_needed:
             return command, state
         self._is_needed = not self._has_braked.all()  # this is the last call that it is needed for
+
+        # How far the speed has strayed from the test speed, relative to the tolerance.
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
         is_larger = is_open & (error_share > self._error_share)
         np.copyto(self.error, error, where=is_larger)
         np.copyto(self._error_share, error_share, where=is_larger)
+
+        # The robot drives until the system brakes or lets go of the accelerator.
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
         self._is_driving = ~self._has_braked & (
             system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
+
+        # Until then the motion of others may still depend on the vehicle.
         time = self._sample * self._step
         self._sample = self._sample + 1
         acts = (
             is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
         )
         np.copyto(self.acted_early, time, where=acts)
+
+        # A controller with a proportional and an integral part holds the speed.
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(
             np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN

@@ -89,11 +89,14 @@ class Rater:
 
     def points(self, results: CellResults) -> Points:
         """Points of M vehicles."""
+        # A red cell that is required leaves nothing.
         protocol = self.protocol
         colours = colours_of(self.protocol, results)
         layers = _which_layers_hold(protocol, colours)
         fails = (colours[:, protocol.required_cells] != GREEN).any(axis=1)
         tests = {}
+
+        # The share of robustness layers that hold, then points of each matrix.
         for test, matrices in protocol.tests.items():
             claimed = self.claims.get(test, ())
             test_layers = protocol.layers_of(test)

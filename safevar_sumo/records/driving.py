@@ -326,6 +326,7 @@ class SimulationRuns:
         the step counts: `collision_speed` minus the obstacle's speed.
         """
         trace = self.trace
+        # In the last active sample and the one before.
         vehicles = np.arange(len(self.collision_speed))
         last_sample = (
             len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
@@ -337,6 +338,8 @@ class SimulationRuns:
         speed_after = speed[last_sample, vehicles]
         gap_before = trace.gap[sample_before, vehicles]
         gap_after = trace.gap[last_sample, vehicles]
+
+        # Contact within the step, at the speed that an even deceleration leads to there.
         gap_closes = (
             (gap_before > -TOUCH_OVERLAP)
             & np.isfinite(gap_before)
@@ -352,6 +355,8 @@ class SimulationRuns:
         at_contact = np.minimum(
             np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed
         )
+
+        # Otherwise the speed at the end of the step.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.asarray(
             np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)

@@ -152,6 +152,7 @@ class Evaluations:
         There are `cells` only if all batches have them; the worst point of a batch without
         `worst_points` is the first.
         """
+        # Rows of all batches.
         columns = {
             name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS
         }
@@ -163,6 +164,8 @@ class Evaluations:
         metrics = {
             name: np.concatenate([batch.column(name) for batch in batches]) for name in names
         }
+
+        # Cells of a rating, and worst points, if all or some batches have them.
         cells = [batch.cells for batch in batches if batch.cells is not None]
         all_cells = None
         if len(cells) == len(batches):

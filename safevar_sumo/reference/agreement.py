@@ -59,6 +59,7 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
     reference
         The CSV file.
     """
+    # The reference's settings, simulated here.
     study = evaluator.study
     data = read_reference(reference, evaluator.characteristics)
     here = evaluator.evaluate(data.settings, "settings", ignore_constraints=True)
@@ -68,6 +69,8 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
         )
     data = data.take(here.valid)
     here = here.take(here.valid)
+
+    # How the values agree.
     numbers = agreement_counts(data, here)
     table = measure_agreement(data, here)
     measures = table.loc[

@@ -90,6 +90,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell
         without a number in range.
     """
+    # A table of texts.
     try:
         lines = pd.read_csv(
             path, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
@@ -103,6 +104,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         raise InputError(
             path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows"
         ) from None
+
+    # Columns by their names, whatever their spelling.
     by_plain_name = {_plain_name(str(column)): str(column) for column in table}
     columns = {name: by_plain_name.get(_plain_name(name), name) for name in characteristics.names}
     columns |= {
@@ -121,6 +124,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         column for column in columns.values() if counts[_plain_name(column)] > 1
     ):
         raise InputError(path, f"has more than one column for {doubled}", "each column once")
+
+    # Settings within the domains.
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
         for name, column in columns.items()
@@ -137,6 +142,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         )
     if skipped := np.count_nonzero(~is_in_domain):
         warn(f"{path}: {skipped} rows with values outside the domains are left out")
+
+    # The paper's metrics: a collision has no TET and TIT.
     metrics = {
         name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS
     }
@@ -224,18 +231,23 @@ def import_published(
         If the study or a file cannot be used, no file is given, or the original vehicle's safety
         degree is unknown.
     """
+    # The files of the algorithms.
     loaded_study = read_study(study)
     directory = Path(out)
     given = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
     files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
+
+    # The original vehicle's metrics, from the study or as given.
     metrics = {
         name: {**loaded_study.published, **_read_metrics(original)}.get(name) for name in METRICS
     }
     if metrics[SAFETY_DEGREE] is None:
         problem = "the study has no published values of the original vehicle"
         raise InputError(study, problem, "them as `original`, at least the safety degree")
+
+    # The solutions, as a directory of results.
     characteristics = CharacteristicSet.of(loaded_study)
     solutions = {
         algorithm: evaluations_of(read_reference(path, characteristics), characteristics)
@@ -250,6 +262,7 @@ def _read_metrics(original: Mapping[str, float] | Sequence[str]) -> dict[str, fl
     """Metrics by name, of which the form METRIC=NUMBER also knows the titles; raises InputError if
     a number is none, or outside its range.
     """
+    # Words and numbers of the form METRIC=NUMBER.
     texts = (
         [f"{name}={value}" for name, value in original.items()]
         if isinstance(original, Mapping)

@@ -91,6 +91,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
+    # A road that fills the width, and a panel with readings above it.
     height = round(WIDTH * scene.height / scene.width / 2) * 2
     figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
     axis = figure.add_axes(
@@ -101,6 +102,8 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
         ylim=(scene.bottom, scene.bottom + scene.height),
     )
     axis.spines[:].set_visible(False)
+
+    # What is drawn once.
     _draw_road(axis, scene)
     bodies = [(body, *_draw_body(axis, body, scene)) for body in scene.bodies]
     clock = figure.text(0.014, 0.98, "", fontsize=18, color=TEXT_COLOUR, va="top")
@@ -165,6 +168,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
     """
     from matplotlib.patches import Circle, Rectangle
 
+    # A person is a circle.
     length = body.length
     width = body.width
     if body.is_person:
@@ -179,6 +183,8 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
                 )
             )
         ], []
+
+    # A vehicle is a rectangle; the original one is an outline beneath the other.
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     is_beneath = body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1
 
@@ -203,6 +209,8 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
             "linestyle": "--",
         }
         return [draw(-length, -width / 2, length, width, zorder=4, **style)], []
+
+    # Body, windscreen, edge, and brake lights.
     patches = [
         draw(-length, -width / 2, length, width, color=colour, alpha=0.9),
         draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, color="white", alpha=0.56),
@@ -263,6 +271,7 @@ def animation_page(scene: FlatScene) -> str:
 
 def player_data(scene: FlatScene) -> JsonObject:
     """The data of the template `player`, under `played` those of its script. y points down."""
+    # Both drives, and the moments at which something happens.
     comparison = scene.comparison
     trace = scene.comparison.runs.trace
     drives = []
@@ -286,6 +295,8 @@ def player_data(scene: FlatScene) -> JsonObject:
                 "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
             }
         )
+
+    # What the picture shows, in words; the road; and all positions over time.
     vehicles = " and ".join(
         f"the {drive['name']} vehicle, which {drive['verdict']}" for drive in drives
     )

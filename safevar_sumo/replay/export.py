@@ -112,6 +112,8 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     row = comparison.rows[-1]
     actors = []
     end = comparison.moments[row].end + 1
+
+    # A body that is there, by its middle.
     time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
     for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
         x = track.x[:end, row]
@@ -127,6 +129,8 @@ def poses_of(comparison: Comparison) -> list[Poses]:
             to_middle = 0.0
         x = x - to_middle * np.cos(heading)
         y = y - to_middle * np.sin(heading)
+
+        # The vehicle under test is Ego.
         time_of, x, y, heading = (values[is_present] for values in (time, x, y, heading))
         actor = Poses(name, kind, track.length, track.width, time_of, x, y, heading)
         if name == VUT:
@@ -193,6 +197,7 @@ def carla_scene(
     """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings
     counter-clockwise) and pedals.
     """
+    # What the vehicle is, where it starts, what its pedals do, and how others move.
     row = comparison.rows[-1]
     trace = comparison.runs.trace
     vut, *others = poses_of(comparison)
@@ -251,6 +256,7 @@ def export(
         If results were computed with other files or versions, simulate with the present ones and
         say so.
     """
+    # The solution's vehicle, and its simulation.
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
     target = load_target(directory, solution, [], as_it_is_now, point)
@@ -282,6 +288,7 @@ def write_files(
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
     "openscenario".
     """
+    # The road, and what drives on it.
     files = {ROAD: open_drive(comparison.network)}
     if to == "carla":
         scene = carla_scene(comparison, physics, handle)

@@ -68,6 +68,7 @@ def show_in_gui(
     SimulationError
         If SUMO cannot load the network, or its window was closed before the end.
     """
+    # The window pauses where vehicles are nearest, and at the end.
     runs = comparison.runs
     samples = count()
     pauses = {moments.nearest for moments in comparison.moments} | {

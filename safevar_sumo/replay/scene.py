@@ -120,11 +120,14 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
     """Lay out a comparison for drawing, with the actors that ever come near the vehicle under
     test.
     """
+    # Seen along the direction in which the vehicle under test starts.
     vut = comparison.tracks[VUT]
     turn = vut.heading[0, 0]
     rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     start = np.array([vut.x[0, 0], vut.y[0, 0]])
     sample_count = max(moments.end for moments in comparison.moments) + 1
+
+    # Bodies that ever come near it.
     bodies = []
     for name, track in comparison.tracks.items():
         for row, moments in enumerate(comparison.moments):
@@ -149,6 +152,8 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
                     heading,
                 )
                 bodies.append(body)
+
+    # The road in the same coordinates.
     lanes = (lane._replace(line=(lane.line - start) @ rotation.T) for lane in comparison.road)
     road = sorted(lanes, key=lambda lane: LANE_KINDS.index(lane.kind))
     view = _choose_view(bodies, sample_count)

@@ -172,6 +172,7 @@ def show_simulation(
         If results were computed with other files or versions, simulate with the present ones and
         say so.
     """
+    # What is simulated: a study or a solution, with changes.
     choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
     chosen = [name for name, given in choices.items() if given]
     target = load_target(source, solution, chosen, as_it_is_now, point)
@@ -183,10 +184,14 @@ def show_simulation(
         requested = _combine(values, target.setting(system), system)
         if changes and not beyond:  # what a study or results hold has been checked
             system.check_feasible(requested, filtered=filtered, switch="--beyond")
+
+    # Files that cannot be written are refused first.
     if trace is not None:
         check_writable(trace, "trace", (".csv",), but=SOLUTIONS)
     if animate is not None:
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
+
+    # Several values of a characteristic are a sweep.
     is_sweep = any(len(options) > 1 for options in values.values())
     if is_sweep:
         if trace or animate or gui or spread:
@@ -195,6 +200,8 @@ def show_simulation(
             )
             raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
         return _sweep(target.study, system, requested, list(values), filtered)
+
+    # One setting beside the original vehicle.
     simulation = simulate_with_original(target.study, system, requested[0], filtered=filtered)
     if target.row and not changes and point is None:  # results belong to the whole matrix
         _warn_of_differences(target, target.row, simulation)
@@ -214,6 +221,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix.
     """
+    # What was reset by the filter, or came too early.
     study = target.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks(system)
@@ -223,6 +231,8 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         for name, value in simulation.reset_values.items()
     )
     remarks += _acted_early(system, setting)
+
+    # Values and results of both vehicles.
     original = simulation.original.numbers
     simulated = simulation.numbers
     units = {"outcome": "", **simulation.units}
@@ -231,6 +241,8 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         "characteristics": _characteristics(simulation),
         "results": tabulate("Results", RESULTS, results),
     }
+
+    # The verdict; of a matrix with the points at which it fails.
     verdict = [simulation.no_verdict, *_verdict(simulation)]
     if system.rater is not None:
         verdict.append(
@@ -244,6 +256,8 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
         failing = [row["point"] for row in points if row["outcome"] == Outcome.COLLISION]
         verdict.append(points_in_words(failing, len(points)))
+
+    # The model's own uncertainty.
     if with_spread:
         remarks += remarks_on_sets(study)
         vehicles = {
@@ -290,11 +304,14 @@ def load_target(
     InputError
         If there is no such study, directory, solution or point, or two options choose a solution.
     """
+    # At most one solution is chosen.
     wanted = [*chosen, *([] if solution is None else [f"solution {solution}"])]
     if len(wanted) > 1:
         raise InputError(
             "solution", f"{' and '.join(wanted)} both choose a solution", "one of them"
         )
+
+    # The study, of results as it is recorded there, at a point.
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=bool(wanted))
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
@@ -302,6 +319,8 @@ def load_target(
     study = whole if point is None else at_point(whole, point)
     if isinstance(subject, Study) or not wanted:
         return Target(study, source)
+
+    # The solution, by its handle or the choice.
     subject.require_solutions()
     with about(source):
         handle = (
@@ -333,6 +352,7 @@ def _sweep(
     study: Study, system: System, requested: FloatArray, names: list[str], filtered: bool
 ) -> Answer:
     """A row for each setting of a sweep."""
+    # All settings, and the original vehicle first.
     characteristics = system.characteristics
     settings = characteristics.filter(requested) if filtered else requested
     evaluations = evaluate_with_workers(
@@ -340,6 +360,8 @@ def _sweep(
     )
     contact = system.contact
     no_verdict = why_no_verdict(system)
+
+    # A column for each characteristic that varies, and for each metric.
     frame = pd.DataFrame(settings, columns=list(characteristics.names))[names]
     columns = {
         item.name: Column(item.unit, "value", "g") for item in characteristics if item.name in names
@@ -359,6 +381,8 @@ def _sweep(
         "gap": evaluations.gaps(contact),
     }
     frame = frame.assign(**{name: column[1:] for name, column in values.items()})
+
+    # What a reader should know of the settings.
     collisions = int(evaluations.collided[1:].sum())
     resets = np.count_nonzero((settings != requested).any(axis=1))
     remarks = [*_remarks(system), degree_note(contact)]

@@ -92,6 +92,7 @@ class Packed:
         jobs: int | None,
         progress: Progress,
     ) -> None:
+        # The study as its manifest says, and its claims.
         self.packed = packed
         self.files = files
         self._places = places
@@ -107,13 +108,19 @@ class Packed:
             if "scoring" in self.manifest
             else None
         )
+
+        # The solutions of its runs, of which no row is missing or new.
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
+
+        # Evaluations are known by the numbers of their outcomes alone.
         outcomes = packed.outcomes
         codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
         evaluations = pd.DataFrame(
             {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
         )
+
+        # The case that questions are asked about.
         original = self.manifest["original"]
         scoring = scoring or PUBLISHED_SCORING
         self.case = build_case(

@@ -120,6 +120,7 @@ def _pack_study(
     progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
+    # The results, without what belongs to this machine.
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
     if not case.has_runs:
@@ -129,6 +130,8 @@ def _pack_study(
     study = case.study
     manifest = read_manifest(directory)
     manifest.pop("folders", None)  # of this machine
+
+    # The questions, by the criterion that the user gave.
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
     questions = list(dict.fromkeys(asked))
@@ -137,6 +140,8 @@ def _pack_study(
     described = PackedStudy(
         folder, questions, runs, count_outcomes(case), count_solutions(case.solutions, runs), unsafe
     )
+
+    # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
     packed = Packed(
@@ -152,6 +157,7 @@ def _files_of_user(
     """The user's files that the results depend on, the files of the user's questions, and the views
     of networks, without which SUMO does not start, by their names in a pack.
     """
+    # Files by the names that the results give them.
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
     for name in names:
@@ -161,10 +167,14 @@ def _files_of_user(
                 "lies outside the study's folders, so that no pack can hold it",
                 "a copy beside the study",
             )
+
+    # Views without which SUMO does not start.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
         view = options_in(Path(file_by_name(name, places))).get("gui-settings-file", "")
         names += [str(Path(name).with_name(view))] if view else []
     paths = {name: Path(found) for name in names if (found := file_by_name(name, places))}
+
+    # Modules of the user's questions, with what they import.
     modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
     folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
     for path in code_files(modules, places):
@@ -205,6 +215,7 @@ def verify(
     InputError
         If the pack is damaged, of another version, or holds user code and `run_code` is false.
     """
+    # The studies of the pack, and files that belong to none.
     path = Path(pack).absolute()
     description, files = read_pack(path)
     with temporary_folder() as folder, open_progress(progress) as show:
@@ -219,9 +230,13 @@ def verify(
         }
         if unknown := files.keys() - known:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
+
+        # Its code runs only if the user trusts it.
         if not run_code and (code := [name for packed in studies.values() for name in packed.code]):
             problem = f"`verify` would run code of the pack: {', '.join(code)}"
             raise InputError(path, problem, "`run_code=True`, if you trust it")
+
+        # The files, then each claim of each study.
         names = ", ".join(packed.case.study.name for packed in studies.values())
         of_files = Claim(
             "files", json_bytes(description.files), lambda: json_bytes(digests_of(files))
@@ -233,6 +248,8 @@ def verify(
                     compare_claim(packed.case.study.name, claim)
                     for claim in packed.claims(place, search)
                 ]
+
+    # How many are the same.
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
     return Answer(
@@ -267,6 +284,7 @@ def _unpack(
     InputError
         If it is damaged.
     """
+    # The files of this study.
     prefix = f"{described.folder}/"
     own_files = {
         name.removeprefix(prefix): content
@@ -274,6 +292,8 @@ def _unpack(
         if name.startswith(prefix)
     }
     code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
+
+    # Exactly the files of a study, readable, as the description says.
     try:
         if wrong := FILES ^ (own_files.keys() - code.keys()):
             raise ValueError(

@@ -87,6 +87,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         If the file is no pack, damaged, too large, written by another version, or holds paths that
         leave it or other files than its description names.
     """
+    # The archive, and its description.
     try:
         with zipfile.ZipFile(path) as archive:
             _check_entries(path, archive.infolist())
@@ -109,10 +110,14 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         described = msgspec.json.decode(files.pop(DESCRIPTION), type=Description)
     except (msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
+
+    # The files that the description names.
     for name in sorted(files.keys() ^ described.files.keys()):
         _refuse(
             path, f"{name} {f'is not named in {DESCRIPTION}' if name in files else 'is missing'}"
         )
+
+    # Results of other versions may differ.
     here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
     other = [
         f"{name} {described.versions.get(name)}"
@@ -130,6 +135,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     """Refuse entries before any of them is unpacked."""
+    # No entry may leave the folder, and none is a link.
     names = [entry.filename for entry in entries]
     for entry in entries:
         name = entry.filename
@@ -145,6 +151,8 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             _refuse(path, f"the path {name!r} leaves the pack")
         if stat.S_ISLNK(entry.external_attr >> UNIX_MODE_SHIFT):
             _refuse(path, f"{name!r} is a symbolic link")
+
+    # Neither too many files nor too much data.
     if len(names) > MAX_FILES or len(names) != len(set(names)):
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
     if (size := sum(entry.file_size for entry in entries)) > MAX_BYTES:

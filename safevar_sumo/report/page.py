@@ -265,6 +265,7 @@ def make_page(
     progress: Progress = show_no_progress,
 ) -> str:
     """The page about studies, with answers and pictures about all of them."""
+    # Commands that give the numbers of the page.
     of_studies = chain(*map(page_commands, studies))
     of_shared = [
         (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
@@ -287,6 +288,7 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
     """One study for the template. On its front stand all verdicts, the first of them with its first
     table; answers to the same question follow it with theirs.
     """
+    # All answers to the first question lead.
     anchor = f"study-{number}"
     answers = study.answers
     trusted = trust(study)

@@ -171,6 +171,7 @@ class ReportedStudy:
 
 def tested(study: ReportedStudy) -> Answer:
     """The tested vehicle, driving system and scenario, and the search."""
+    # Vehicle, driving system and scenario, each in a sentence.
     case = study.case
     models = [
         f"{title}: {name_and_sentence(known, table.model)}"
@@ -180,6 +181,8 @@ def tested(study: ReportedStudy) -> Answer:
             ("Scenario", SCENARIOS, case.study.scenario),
         )
     ]
+
+    # Pre-crash types, domains and remarks.
     tags = pre_crash_sentence(study.system.points)
     rows = [
         (item.name, item.unit, item.original, item.lower, item.upper, item.threshold, item.words)
@@ -207,6 +210,7 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
     """What a signature under the page is about, each with its name: the results, how they were
     computed, and of the first answer the scope, the fits and the attack.
     """
+    # Which results, and by which versions.
     numbers = {
         name: value for answer in study.answers[:1] for name, value in answer.numbers.items()
     }
@@ -214,6 +218,8 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         ("Results", f"{study.directory.name}, seed {study.case.study.search.seed}"),
         ("Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())),
     ]
+
+    # How the limits were tested.
     if numbers.get("fits_tried"):
         rows.append(("Fits", f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"))
     if numbers.get("attacked") and numbers.get("at_most") is not None:
@@ -223,6 +229,8 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         rows.append(
             ("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}")
         )
+
+    # What moves limits alone, and how far the parameter sets differ.
     tables = study.answers[0].tables if numbers else {}
     if "uncertainty" in tables:
         rows.append(
@@ -304,6 +312,7 @@ def trust(study: ReportedStudy) -> Answer:
     """How far the results agree with published data and with other fitted vehicle models, and what
     they leave out.
     """
+    # Agreement with published simulations.
     case = study.case
     tables = dict[str, pd.DataFrame]()
     fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
@@ -324,6 +333,8 @@ def trust(study: ReportedStudy) -> Answer:
             f" {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing"
             " was compared with a real car."
         )
+
+    # What other parameter sets would give.
     if case.study.spread:
         settings = np.vstack([case.characteristics.original, study.chosen_settings])
         spreads = compute_model_spreads(case.study, settings, study.point)
@@ -335,12 +346,16 @@ def trust(study: ReportedStudy) -> Answer:
             )
         ]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
+
+    # The original vehicle beside its published metrics.
     published = [
         (name, value, here, 100 * (here / value - 1) if value else math.nan)
         for name, value in case.study.published.items()
         if not math.isnan(here := case.original.get(name, math.nan))
     ]
     tables["original"] = tabulate("The original vehicle, published and here", PUBLISHED, published)
+
+    # Settings without a result.
     counts = Counter(case.evaluations["outcome"])
     missing = [
         f"{counts[outcome]} of {len(case.evaluations)} settings {words}."
@@ -357,10 +372,13 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
     each set of changed characteristics.
     """
+    # The chosen solutions.
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
     for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
         settings[handle] = setting
+
+    # Causes that answers name, each set of changed characteristics once.
     changes: dict[tuple[str, ...], tuple[Mapping[str, float], Mapping[str, float]]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
@@ -372,6 +390,8 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     for row, encounter in causes:
         name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
+
+    # Each is simulated again, and compared with what was recorded.
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))

@@ -251,6 +251,8 @@ def _read(
     positions = list[int]()
     batches = []
     results = {}
+
+    # The first line says to which run the journal belongs.
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
     is_older = stated is None and owner.get("format") == FORMAT_WITHOUT_CHECKSUMS
@@ -260,6 +262,8 @@ def _read(
     elif lines and not is_own:
         legal = "the manifest.json and journals of one study, as it was run; or another `out`"
         raise InputError(path, "belongs to another study, version or run, or is no journal", legal)
+
+    # Each line is a batch of evaluations or the run's solutions, with a checksum.
     size = len(first) if lines or owner == head else 0
     checksum = None if is_older else zlib.crc32(first.rstrip())
     for text in lines:
@@ -328,6 +332,7 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     """The batch of evaluations in a line; raises an error if its columns are wrong or have
     different lengths.
     """
+    # Numbers by column, one for each setting.
     if len({len(values) for values in line.values()}) > 1:
         raise ValueError
     columns = {

@@ -100,6 +100,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     InputError
         If the directory holds no results, or a file in it is damaged or belongs to another study.
     """
+    # Imported solutions have no journals.
     folder = Path(directory)
     manifest = read_manifest(folder)
     study = manifest["study"]
@@ -107,6 +108,8 @@ def load_runs(directory: str | Path) -> StoredResults:
     if "imported" in manifest:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
+
+    # Every run has a journal.
     evaluations_of_runs = []
     solutions_of_runs = []
     all_positions = []
@@ -133,6 +136,8 @@ def load_runs(directory: str | Path) -> StoredResults:
             solutions_of_runs.append(
                 ((algorithm, run), content.take_positions(content.results[budget]))
             )
+
+    # Tables of all runs.
     if not has_checksums:
         warn(
             f"{folder}: has journals of an earlier version, without checksums: altered lines go"

@@ -254,6 +254,7 @@ def read_manifest(directory: Path) -> JsonObject:
     InputError
         If there is no manifest, or it is damaged, was edited, or is of another format.
     """
+    # The manifest, in whatever format it is.
     file = directory / MANIFEST
     try:
         manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
@@ -273,6 +274,8 @@ def read_manifest(directory: Path) -> JsonObject:
         raise InputError(
             file, problem, "the file as it was, or no file: the same command then writes it again"
         ) from None
+
+    # Results in another format are those of another release.
     if format_number != FORMAT:
         raise InputError(
             directory,

@@ -162,6 +162,7 @@ def evaluations_frame(
     """
     import pandas as pd
 
+    # All columns, even without runs.
     all_runs = list(runs)
     metrics = dict.fromkeys(
         [*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)]

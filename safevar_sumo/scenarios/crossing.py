@@ -96,11 +96,14 @@ class _Start(NamedTuple):
         InputError
             If the target cannot reach the impact location in time.
         """
+        # The target's side, speed and place of impact.
         lateral_start = test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
         side = 1.0 if test.parameter("side") == "near" else -1.0
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         direction = (FROM_RIGHT if side > 0 else FROM_LEFT).turned(test.heading)
+
+        # A target that starts at its speed, or accelerates from standstill.
         if lateral_start is None:
             if test.acceleration_distance is not None:
                 raise InputError(
@@ -119,6 +122,8 @@ class _Start(NamedTuple):
                 TIME_TO_IMPACT, np.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP
             )
             profile = SpeedProfile.with_arrival(distance, time - test.lead, speed, run_up)
+
+        # Where it meets the vehicle.
         extent = direction.extent(BODIES[test.parameter("target")])
         return cls(side, direction, extent, side * impact_lateral, distance, time, profile)
 

@@ -225,11 +225,14 @@ class OpenScenario(TrackScenario):
     def _track(
         self, scenes: Sequence[Played], bodies: Sequence[Moved], samples: FloatArray, every: int
     ) -> Track:
+        # One body of the same size in all encounters.
         name = bodies[0].name
         shape = bodies[0].shape
         if len({(body.name, body.shape.length, body.shape.width) for body in bodies}) > 1:
             problem = f"the body of {name} depends on a searched parameter"
             raise InputError("scenario.search", problem, "values of it in the matrix")
+
+        # Places relative to where Ego starts, along its direction.
         place, facing, speed = (
             np.stack([_sampled(getattr(body, column), samples / every) for body in bodies], axis=1)
             for column in ("place", "facing", "speed")
@@ -237,11 +240,15 @@ class OpenScenario(TrackScenario):
         ahead = np.array([scene.start.facing for scene in scenes])
         place = np.round((place - [scene.start.place for scene in scenes]) / ahead, DIGITS)
         facing = np.round(facing / ahead, DIGITS + 3)
+
+        # At the end of its scene it goes on straight.
         beyond = np.maximum(
             samples[:, np.newaxis] - [every * (len(body.speed) - 1) for body in bodies], 0.0
         )
         facing = facing / np.abs(facing)
         place = place + beyond * STEP * speed * facing
+
+        # A deleted body has no size and moves away.
         which = self._different[1]
         length: Quantity = shape.length
         width: Quantity = shape.width

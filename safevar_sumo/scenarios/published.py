@@ -207,11 +207,14 @@ class PedestrianCrossing(
         )
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
+        # Where the pedestrian is, and how fast he crosses.
         vehicle_positions = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(
             vehicle_positions
         )
         lateral_speed = (lateral - memory.last_lateral) / step
+
+        # He turns round once.
         if self.turns_after is not None:
             turns_now = ~memory.has_turned & (
                 lateral + step * lateral_speed > self.turns_after + ROUNDING
@@ -219,6 +222,8 @@ class PedestrianCrossing(
             if turns_now.any():
                 world.turn_back(PEDESTRIAN, np.flatnonzero(turns_now).tolist())
                 memory = memory._replace(has_turned=memory.has_turned | turns_now)
+
+        # The run is over when he has left the lane, or the vehicle has passed.
         front = memory.frame.along(vehicle_positions)
         moves_away = lateral * lateral_speed > 0
         over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)

@@ -105,6 +105,8 @@ class Track(NamedTuple):
                 f"a body of the kind {kind!r} has no size",
                 f"a size, or {one_of(BODIES)}",
             )
+
+        # A standing body faces along the lane.
         length, width = size or BODIES[kind]
         speed = np.sqrt(np.square(vx) + np.square(vy))
         moves = speed > 0

@@ -78,6 +78,8 @@ def check_search(
             quoted(search),
             "a generator: a method that yields settings and returns its result",
         )
+
+    # Every request is checked, and within the budget.
     yielded = set[bytes]()
     budget = problem.evaluations
     answer = None
@@ -94,6 +96,7 @@ def check_search(
 
 
 def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int) -> FloatArray:
+    # A matrix of legal values.
     characteristics = problem.characteristics
     shape = (
         f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
@@ -104,6 +107,8 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
     for characteristic, values in zip(characteristics, output.T, strict=True):
         legal = Legal(characteristic.lower, characteristic.upper)
         code.check_numbers("search", characteristic.name, values, (len(output),), legal)
+
+    # Filtered and feasible settings.
     settings: FloatArray = output.astype(float)
     if (characteristics.filter(settings) != settings).any():
         raise code.wrong(

@@ -72,6 +72,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = 6.0
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+        # Random settings, generation by generation.
         ranges = _Ranges(problem)
         generations = []
         scores = []
@@ -81,14 +82,20 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
             evaluated = yield ranges.draw(min(self.generation, problem.evaluations - used), rng)
             used += len(evaluated)
             generations.append(evaluated)
+
+            # Did the lowest score fall? If it has not for long, the search ends.
             scores.append(_scores(evaluated, problem.scoring, self.safety_weight))
             lowest_in_generation = np.nanmin(scores[-1], initial=np.inf)
             is_improved = lowest_in_generation < lowest_score or used <= self.warm_up
             unimproved = 0 if is_improved else unimproved + 1
             lowest_score = min(lowest_score, lowest_in_generation)
+
+            # Ranges narrow to the best settings of the last generations.
             if used >= self.warm_up and len(generations) % self.generations_between_updates == 0:
                 ranges.narrow(Evaluations.concatenate(generations[last_update:]))
                 last_update = len(generations)
+
+        # The best settings of all generations.
         best = np.argsort(np.concatenate(scores), kind="stable")[: self.kept]
         solutions = Evaluations.concatenate(generations).take(best)
         return solutions.take(problem.scoring.valid(solutions))

@@ -114,6 +114,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         randomness = _Randomness(self.name, rng)
+
+        # What is left of the budget, and all that was evaluated.
         left = problem.evaluations
         seen = [problem.original.take([])]
         with randomness:
@@ -123,6 +125,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 
             algorithm = self.begin(problem, randomness.seed)
             optimum = Population()
+
+        # Ask, evaluate what is new, and tell.
         while left > 0 and algorithm.has_next():
             with randomness:
                 asked = algorithm.ask()
@@ -144,6 +148,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                     optimum = filter_optimum(
                         Population.merge(optimum, batch), least_infeasible=True
                     )
+
+        # What the algorithm found, as evaluated.
         every = Evaluations.concatenate(seen)
         rows = {setting.tobytes(): row for row, setting in enumerate(every.settings)}
         result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
@@ -158,6 +164,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         InputError
             Naming the arguments without which pymoo would not fail.
         """
+        # What the study gives.
         given = {
             name: value
             for name in self.__struct_fields__
@@ -168,9 +175,13 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         if size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
             raise InputError("", f"{key}.pop_size = {size}", legal)
+
+        # A search of a formula fails at once if a value is wrong.
         is_tried = bool(given) or problem.population < SMALL_POPULATION
         if not is_tried or not (failure := self._failure(problem)):
             return
+
+        # Which value is to blame.
         without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
         blamed = [name for name, other in without.items() if not other._failure(problem)] or list(
             given
@@ -205,6 +216,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         from pymoo.core.problem import Problem as PymooProblem
         from pymoo.util.ref_dirs import get_reference_directions
 
+        # Arguments: pymoo's defaults, the study's population, the user's values.
         objectives = (
             len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
         )
@@ -216,6 +228,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         }
         if isinstance(defaults.get("pop_size"), int):
             given = {"pop_size": problem.population, **given}
+
+        # Reference directions for as many objectives.
         if "ref_dirs" in defaults:
             partitions = given.get("ref_dirs", PARTITIONS)
             if isinstance(partitions, int):
@@ -231,6 +245,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                 raise ValueError(
                     f"pop_size is less than the {len(given['ref_dirs'])} reference directions"
                 )
+
+        # The problem, and the algorithm on it.
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
         constraints = 0 if self.name.endswith("MOEAD") else 1  # it refuses constraints

@@ -157,6 +157,8 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
     unit = unit_text(row.unit)
+
+    # The stated values, else those of the domain.
     stated = stated_values(distribution)
     lower = stated.get("lower", row.lower)
     upper = stated.get("upper", row.upper)
@@ -168,6 +170,8 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
                 f"{key}.{field} = {value:g}",
                 f"a number in [{row.lower:g}, {row.upper:g}]{unit}",
             )
+
+    # In an order that the distribution has.
     if lower >= upper:
         raise InputError("", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
     if isinstance(distribution, Triangular) and not lower <= mode <= upper:
@@ -298,6 +302,7 @@ def limits_of(
         If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of
         one characteristic cross, or a limit is outside the domain or excludes the original.
     """
+    # A limit is a name, a comparison and a number.
     sides: dict[str, dict[str, Any]] = {}
     for text in texts:
         match = LIMIT_FORM.fullmatch(text)
@@ -313,6 +318,8 @@ def limits_of(
     except ValueError as error:
         problem, _, legal = str(error).partition("\n")
         raise InputError("", f"{', '.join(texts)}: {problem}", legal) from None
+
+    # Limits that are typed replace stated ones.
     check_limits(rows, typed)
     limits = {**(stated or {}), **typed}
     return {name: limits[name] for name in rows if name in limits}

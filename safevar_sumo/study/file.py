@@ -206,6 +206,8 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
         return raw
     if not isinstance(base, str):
         raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
+
+    # A study takes its file's name, and its base may stand beside it.
     if "name" not in tables and re.fullmatch(NAME_PATTERN, path.stem):
         tables["name"] = path.stem
     sibling = path.parent / base
@@ -217,8 +219,12 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
         raise InputError(
             raw.source, f"extends = {base!r} leads back to {base_path}", "another study"
         )
+
+    # This study's tables over those of its base.
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = _with_overrides(base_study, tables, raw.source)
+
+    # Where both come from.
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
     remarks = (
         () if path.parent == STUDIES else merged_study.remarks
@@ -382,6 +388,8 @@ def data_files(study: Study) -> dict[str, str]:
     """
     places = study.origin.places or (os.getcwd(),)
     paths = {}
+
+    # Each file or folder beside the study.
     for key, table in (
         ("vehicle", study.vehicle),
         ("ads", study.ads),
@@ -397,6 +405,8 @@ def data_files(study: Study) -> dict[str, str]:
                     study.source, problem, f"the path of a file or folder, relative to {places[0]}"
                 )
             paths[name] = found[0]
+
+    # Files of OpenSCENARIO, at every point of the matrix.
     if study.scenario.model == MODEL:
         tests = () if study.matrix is None else study.matrix.tests
         with about(study.source):

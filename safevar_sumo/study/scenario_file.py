@@ -58,6 +58,8 @@ def files_of_scenario(
     """
     if not isinstance(scenario.get("file"), str):
         return {}
+
+    # Texts alone choose files: points that differ in numbers are read once.
     points = {}
     for test in tests or (MatrixTest(name=""),):
         axes = [
@@ -72,6 +74,8 @@ def files_of_scenario(
             }
             texts = frozenset(item for item in point.items() if isinstance(item[1], str))
             points[texts] = point
+
+    # The file itself, its catalogs and its road.
     files: dict[str, str] = {}
     for point in points.values():
         path = path_of(point["file"], places)
@@ -98,6 +102,8 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
     scenario = tables.get("scenario")
     if not isinstance(scenario, dict) or "file" not in scenario:
         return dict(tables)
+
+    # A file stands in place of a model.
     for key in ("model", "parameters", "files"):
         if scenario.get(key):
             raise InputError(
@@ -121,6 +127,7 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
 
 def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     """The tables of a study with what the file at `path` says; see `with_file`."""
+    # The file offers values; the study fixes some and searches others.
     offered = open_file(path)
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
@@ -135,6 +142,8 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
         name: table if name in WEATHER else _domain(name, table, offered)
         for name, table in search.items()
     }
+
+    # Fixed values are parameters of the scenario.
     fixed = {
         name: value if isinstance(value, str) else _plain(value) for name, value in values.items()
     }
@@ -145,10 +154,14 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
     if path != offered.concrete:
         kept["files"] = [_relative(path, places)]  # results depend on it, and a pack has it
+
+    # Searched ones have domains.
     result = {
         **tables,
         "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains},
     }
+
+    # All others are points of a matrix, if there are several.
     matrix = tables.get("matrix")
     searched = {
         name: domain["original"] for name, domain in domains.items() if name in offered.values
@@ -168,6 +181,8 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
             for point in points
         ]
         result["matrix"] = {**(matrix or {}), "tests": tests}
+
+    # Conditions of the file.
     constraints = _constraints(offered, fixed, domains, points)
     if constraints:
         result["constraints"] = [*tables.get("constraints", []), *constraints]
@@ -180,6 +195,8 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
         raise InputError(
             "scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty"
         )
+
+    # A number with a range, in the file or in the study.
     numbers = originals(offered)
     ends = offered.range_of(name)
     if name not in numbers:
@@ -191,6 +208,8 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
             "scenario", f"{name} has no range in the file", "lower and upper in [scenario.search]"
         )
     lower, upper = ends or (-np.inf, np.inf)
+
+    # What the study says counts.
     domain = {
         "unit": "-",
         "original": numbers[name],
@@ -199,6 +218,8 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
         "upper": upper,
         **table,
     }
+
+    # Within the file's range.
     if all(isinstance(domain[key], int | float) for key in ("lower", "upper", "original")):
         if domain["lower"] < lower or domain["upper"] > upper:
             problem = f"scenario.search.{name}: {domain['lower']:g} to {domain['upper']:g}"
@@ -244,6 +265,7 @@ def _playable(
 
     If nothing happens at any point, all that can be played are kept: they have no verdict.
     """
+    # Each point is played once.
     playable = {}
     problems = {}
     errors = []
@@ -261,6 +283,8 @@ def _playable(
         except InputError as error:
             problems[name] = error.problem
             errors.append(error)
+
+    # Points at which something happens, and a warning about the others.
     if not playable:
         raise errors[0]
     kept = {name: point for name, point in playable.items() if not problems[name]} or playable

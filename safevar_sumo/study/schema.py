@@ -359,6 +359,7 @@ class Study(Table, frozen=True, kw_only=True):
 
     def _check_search(self) -> None:
         """Refuse searched parameters that something else sets, too."""
+        # Neither a protocol, nor a characteristic, nor a fixed value, nor a test.
         tests = [] if self.matrix is None else self.matrix.tests
         for name in self.scenario.search:
             key = f"scenario.search.{name}"

@@ -190,6 +190,8 @@ def open_points_world(
     step = system.scenes.step
     n, n_searched = encounters.shape
     names = system.characteristics.scenario.names
+
+    # The scenario in each encounter, and a network for it.
     scenarios = [point.scenario]
     if n_searched:
         scenarios = [
@@ -197,6 +199,8 @@ def open_points_world(
             for values in encounters.tolist()
         ]
     networks = stage_networks(scenarios)
+
+    # The stage moves the other bodies.
     create: Callable[[Api, int], SumoWorld] = SumoWorld
     if stage is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)

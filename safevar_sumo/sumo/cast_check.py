@@ -31,6 +31,7 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
     InputError
         With the actor, the time [s] and what is expected.
     """
+    # A name for each actor.
     for name, count in Counter(track.name for track in cast).items():
         if count > 1:
             raise InputError(
@@ -38,6 +39,8 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
                 f"{CAST_KEY}: at 0 s {count} actors are called {name!r}",
                 "another name for each actor",
             )
+
+    # A number, or a value for each sample and encounter.
     for track in cast:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             shape = (1, *np.shape(value))[-2:]  # a number, or one row for all samples
@@ -67,6 +70,7 @@ def check_motion(track: Track, step: float) -> None:
     InputError
         With the actor, the time [s] and what is expected.
     """
+    # Finite numbers, a size, a speed, a direction of length 1.
     for name, column in zip(Track._fields[2:], track[2:], strict=True):
         _refuse(
             track,
@@ -98,6 +102,8 @@ def check_motion(track: Track, step: float) -> None:
         "has a direction of length {:g}",
         "a unit vector (along, left)",
     )
+
+    # Nobody jumps.
     for column in (track.x, track.y):
         jumps = np.diff(column, axis=0, prepend=column[:1]) / step
         expected = f"at most {MOST_SPEED:g} m/s between two samples"

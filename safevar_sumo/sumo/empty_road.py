@@ -100,6 +100,7 @@ def _problem(
     Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
     Who still has the speed that it began with when the others have left is late.
     """
+    # The run up to its end.
     trace = runs.trace
     end = (
         int(np.count_nonzero(trace.active)) + 1
@@ -107,8 +108,12 @@ def _problem(
     gap, speed, brake, position = (
         values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
     )
+
+    # Does it brake for nothing?
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
+
+    # Does it get to the encounter at its speed?
     approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
@@ -117,6 +122,8 @@ def _problem(
         return None
     if gap[-1] <= 0 or (keeps_speed and is_alone):
         return EmptyRoadFault(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
+
+    # It came too late, or stands.
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
     if (

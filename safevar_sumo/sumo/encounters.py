@@ -37,6 +37,7 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     of its matrix differ, a domain that is wider than the scenario's, and domains in which an
     encounter is impossible.
     """
+    # What the scenarios at all points let vary, in their units and domains.
     for point in points:
         legal = searchable_in(point.scenario)
         for name, domain in study.scenario.search.items():
@@ -58,6 +59,8 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                     f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
                 )
                 raise InputError("", problem, "a domain, or values in the weathers")
+
+    # An encounter at every corner of the domains is possible.
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
     corners = [corner for corner in corners if all(one.allows(corner) for one in study.constraints)]

@@ -66,6 +66,7 @@ def point_record(result: PointResult) -> JsonObject:
     deviation from the test speed before the ADS acted [km/h]; the time to collision at the first
     warning [s]; the side of the contact, and the position along that side [%].
     """
+    # What the first setting did.
     evaluations = result.evaluations
     runs = result.runs
     test_speed_error, warning_ttc, side, place = (
@@ -131,6 +132,7 @@ def drive_and_score(
     scenario, row i also holds the safety degree of the original vehicle in the encounter of setting
     i, unless `with_originals` is false.
     """
+    # Large batches are cut.
     takes_pairs = with_originals and len(system.characteristics.scenario) > 0
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:
@@ -142,16 +144,22 @@ def drive_and_score(
                 for each in batches
             ]
         )
+
+    # A variant and the original take turns, in the same encounter.
     vehicles = settings
     if takes_pairs:  # a variant and the original take turns: they share scenes
         originals = system.characteristics.with_original_vehicle(settings)
         vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
+
+    # At all points, or at the only one.
     if system.matrix:
         found = evaluate_matrix(system, vehicles, engine)
     else:
         found = score(system, vehicles, drive_all(system, vehicles, engine))
     if not takes_pairs:
         return found
+
+    # The original's safety degree stands beside the variant's.
     variants = found.take(np.arange(0, len(vehicles), 2))
     return replace(variants, metrics={**variants.metrics, ORIGINAL_DEGREE: found.f_safe[1::2]})
 

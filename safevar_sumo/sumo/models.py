@@ -64,6 +64,7 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
     """
     name = f"ads.model = {table.model!r}"
     with substitute_traci():
+        # A function, or a class with a method.
         member = lookup.find({}, table.model, "ads.model")
         controller = member.target
         parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
@@ -78,6 +79,8 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
                 f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
             )
             raise InputError("", problem, CONTROLLER_FORMS) from None
+
+        # Each vehicle gets a controller of its own.
         create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters")

@@ -79,15 +79,20 @@ class Moving(NamedTuple):
         """What follows from a track with columns; `vehicle_width` is that of the vehicle under test
         [m].
         """
+        # Half sizes of the box around a rotated body.
         cosine = np.abs(track.along)
         sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
+
+        # Where the vehicle first touches it from behind.
         rear = track.x - half_length
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
             edge = np.where(is_lengthwise, first_in_strip(track, vehicle_width / 2), rear)
+
+        # How it moves, and when it is in the vehicle's path.
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
         is_in_path = slim(
@@ -95,6 +100,8 @@ class Moving(NamedTuple):
         )
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
+
+        # Who crosses is seen from the side from which it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         level = np.where(
             is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0)

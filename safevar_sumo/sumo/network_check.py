@@ -124,6 +124,8 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     """
     if is_shipped(name):
         return []
+
+    # Attributes of the vehicle under test that have no effect.
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
     unused_attributes = [
@@ -140,6 +142,8 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
             f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
         )
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
+
+    # SUMO's driver, who drives beside a controller.
     model = next(
         (
             vtype.get("carFollowModel", "")
@@ -151,6 +155,8 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         remarks.append(
             f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone"
         )
+
+    # Options that are missing or overruled.
     options_file = network.path(OPTIONS_FILE)
     stated = DEFAULT_OPTIONS | options_in(options_file)
     if "step-length" not in stated:
@@ -172,6 +178,8 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
             f"{options_file}: no effect: {', '.join(overruled)}: {reason}, is the same in every"
             " study"
         )
+
+    # What SUMO says.
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
     return remarks
@@ -189,6 +197,7 @@ def _is_same(stated: str, own: str) -> bool:
 
 @lru_cache(maxsize=100)
 def _check_files(network: NetworkFiles) -> None:
+    # Options that this program can use.
     options = {
         "step-length": str(STEP_LENGTH),
         "route-files": TRAFFIC_FILE,
@@ -203,6 +212,8 @@ def _check_files(network: NetworkFiles) -> None:
         )  # SUMO would wait for a client at the port
         stated = ", ".join(f"{name} = {options[name]!r}" for name in names if name in options)
         raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
+
+    # The vehicle under test departs at once, alone of its type, without a stop.
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next(
@@ -282,6 +293,7 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of
     two copies.
     """
+    # SUMO loads the network.
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     own = own_options(options_in(network.path(OPTIONS_FILE)))
@@ -295,6 +307,8 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
             f" {messages or f'exit code {exit_code}'}"
         )
         raise InputError(network.folder, problem, legal)
+
+    # Two copies of its traffic move alike.
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:

@@ -48,6 +48,7 @@ class RecordedWorld:
     """
 
     def __init__(self, recording: Recording, size: int) -> None:
+        # The recorded actors, at every sample and in every scene.
         films = [*recording.tracks.values()]
         n_samples = max((len(film.motion) for film in films), default=1)
         n_scenes = np.size(recording.speed)
@@ -60,6 +61,8 @@ class RecordedWorld:
             self._motion[: len(film.motion), :, actor] = film.motion.reshape(
                 len(film.motion), -1, 5
             )
+
+        # From where on a vehicle may touch somebody.
         self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (self._sizes[:, :1] / 2)
         self._reach = (
             np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
@@ -72,6 +75,7 @@ class RecordedWorld:
         """The first position along the way, at every sample, of a front that may touch somebody
         [m].
         """
+        # The vehicles at the start.
         self.n = size * n_scenes
         self.step_length = recording.step_length
         self.sample = 0

@@ -196,6 +196,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 
 def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
+    # The scene as SUMO starts it.
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         api = world.api
@@ -208,6 +209,8 @@ def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) ->
             copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1]
             for id_ in vehicle.getIDList()
         }
+
+        # All that vehicles meet in it.
         return Recording(
             step_length=world.step_length,
             start=float(vehicle.getLanePosition(vut)),
@@ -245,6 +248,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane,
     or the lanes do not form a straight line.
     """
+    # The only way along the route, with the lanes of junctions.
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
         links = [
@@ -259,6 +263,8 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
             lanes.append(links[0][INTERNAL_LANE])
             links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
+
+    # Straight lanes without a gap between them.
     shapes = [api.lane.getShape(lane) for lane in lanes]
     if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
         return None
@@ -271,6 +277,8 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     largest_gap = np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
+
+    # Where persons walk, and how shapes and lengths relate.
     is_junction = np.array([float(copy_and_name(lane)[1].startswith(":")) for lane in lanes])
     meets_persons = is_junction if is_junction.any() else np.ones(len(lanes))
     stretch = np.maximum(shape_length, POSITION_EPS) / lengths

@@ -104,11 +104,13 @@ class Stage:
         """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
         a body sees it.
         """
+        # The front of each vehicle, and who is met at all.
         front = motion.fronts[:, 0]
         speed = motion.speeds
         over = ALL_TRUE
         seen = []
         for k in self._met:
+            # How near a body is, and whether the encounter with it is over.
             body = self._bodies[k]
             gap = self._row(body.edge) - front
             closing = speed - self._row(body.vx)
@@ -126,6 +128,8 @@ class Stage:
             counts: BoolArray = self._row(self._counts[k])
             over = over & (ended | ~counts)
             seen.append(_Seen(k, gap, closing, is_passed, self._is_visible(k, front)))
+
+        # The only body, or the nearest of several.
         return self._scene_of(seen[0], over) if len(seen) == 1 else self._nearest(seen, over)
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
@@ -182,6 +186,8 @@ class Stage:
         nearest other.
         """
         ranks = []
+
+        # Who is nearest of those that are or come into the way?
         for one in seen:
             body = self._bodies[one.body]
             counts: BoolArray = self._row(self._counts[one.body])
@@ -205,6 +211,8 @@ class Stage:
                 + NOT_MET * ~counts
             )
             ranks.append(np.where(self._struck == one.body, -np.inf, rank))
+
+        # A scene of which each vehicle sees its own body.
         chosen = np.argmin(np.stack(ranks), axis=0)
         first, *others = [number for number in range(len(seen)) if (chosen == number).any()]
         scene = self._scene_of(seen[first], over)
@@ -219,6 +227,7 @@ class Stage:
         """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is
         that of `observe`.
         """
+        # Bodies that a front has reached.
         self._sample = sample
         self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
@@ -238,6 +247,8 @@ class Stage:
                     self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles)
                 )
                 self._struck[vehicles[overlaps > TOUCH]] = k
+
+        # Who was touched, with the speed.
         touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 

@@ -94,6 +94,8 @@ class StageWorld(SumoWorld):
         super().__init__(api, n)
         self._stage = stage
         self._start = start
+
+        # Vehicles on a lane, and actors that the stage places.
         self._sample = 0
         self._lane = LaneWorld(stage, start_speeds, self.step_length)
         self._actors = [
@@ -101,6 +103,8 @@ class StageWorld(SumoWorld):
             for track in stage.cast
             if track.kind != SCREEN
         ]
+
+        # Functions of SUMO that place them.
         self._move_person, self._move_vehicle, self._set_previous_speed = (
             function_of(api, *name)
             for name in (

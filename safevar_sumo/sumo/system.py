@@ -156,6 +156,7 @@ class System:
         """Remarks for the user on parts of networks and weathers that are not used or have no
         effect.
         """
+        # On networks, vehicles and drivers.
         uses_traci = isinstance(self.ads, TraciController)
         remarks = [
             remark
@@ -164,6 +165,8 @@ class System:
         ]
         remarks += self.vehicle.remarks
         remarks += self._remarks_on_driver()
+
+        # On weathers without effect.
         for weather in {point.weather.name: point.weather for point in self.points}.values():
             if weather.visibility != 1 and uses_traci and not self._has_limited_range():
                 remarks.append(

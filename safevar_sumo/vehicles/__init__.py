@@ -69,6 +69,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     """Accelerate at full throttle to the highest speed of the tables; from there, coast in one
     drive and brake lightly in another.
     """
+    # At rest with the original's values, on a dry road.
     prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     rest = vehicle.at_rest(prepared)
 
@@ -88,6 +89,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
                 break
         return speeds, state
 
+    # The drives, which give accelerations at each speed.
     launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
     coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
     braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)

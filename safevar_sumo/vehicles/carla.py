@@ -157,12 +157,15 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             Car,
         )  # Numba takes longer to load than a simulation
 
+        # Radius, grip and steps of time.
         c = characteristics
         radius = c["radius"] / 100
         grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down
         substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
+
+        # Constants of the equations of motion.
         constants = Car(
             radius=radius,
             wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius / tyre_step,
@@ -181,6 +184,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
             standstill=np.zeros_like(radius),
         )
+
+        # The speed at which a slope moves the wheels counts as standstill.
         rows = np.array(constants)
         car = Car(*rows)
         pull = c["mass"] * slope.back

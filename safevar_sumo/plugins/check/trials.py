@@ -46,6 +46,7 @@ def try_simulations(study: Study) -> Iterator[FailedCheck]:
     """Simulate a study with the original vehicle, the corners of the domains and random
     settings.
     """
+    # The settings that are tried.
     region = region_of(study)
     settings = region.repaired(
         region.characteristics.filter(
@@ -61,6 +62,8 @@ def try_simulations(study: Study) -> Iterator[FailedCheck]:
         return lambda rows: drive_and_score(system, settings[rows]).results
 
     yield from _try(load, region.characteristics, settings)
+
+    # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
     if ":" in study.scenario.model and is_recorded(system):
         try:
@@ -94,6 +97,7 @@ def _try(
     settings: FloatArray,
 ) -> Iterator[FailedCheck]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
+    # All settings at once, with code that is loaded anew for the other runs.
     run = load()
     all_rows = np.arange(len(settings))
     outputs = run(all_rows)
@@ -162,6 +166,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     """All settings that a run with the last seed, after runs with the others, requests, and then
     those that it returns; shape (k, n).
     """
+    # The algorithm, on a problem of small size.
     system = _system(study)
     lookup = Lookup.of(study)
     label = label_of(name)
@@ -177,6 +182,8 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         region=system.region,
         scoring=system.measuring.scoring,
     )
+
+    # Runs of several seeds, of which the last one counts.
     for seed in seeds:
         algorithm = instance_of(
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
