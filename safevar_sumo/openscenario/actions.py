@@ -439,7 +439,8 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         player.ignored.add(f"{leaf.tag} of {player.ego.name}")
         # It is a record of a run; the driving system drives anew.
         line = line_of(_trajectory(leaf), player.network, player.place_of)
-        player.ego_turns([piece.start.facing for piece in line.pieces])
+        every = np.linspace(0.0, line.length, round(line.length) + 2)
+        player.refuse_turn(line.pose(every).place)
         return []
     if player.sample and player.ego in actors:
         raise unsupported(

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
+from safevar_sumo.openscenario.lines import Line, Pose
 from safevar_sumo.openscenario.places import Place, Way
-from safevar_sumo.openscenario.road import Pose
 
 STEP = 0.01
 """Time between two samples [s]."""
@@ -74,6 +74,22 @@ class Following(NamedTuple):
     distance: float
 
 
+class LaneLine(NamedTuple):
+    """The lane that an actor follows since it is on a path and moved sideways as it does: at
+    distances, how far the lane's middle has moved to the left; the actor's offset then [m].
+    """
+
+    path: Line
+    sideways: Motion | None
+    distances: Array
+    shifts: Array
+    left: float
+
+    def shift(self, distance: Array) -> Array:
+        """How far the lane has moved to the left at distances [m]."""
+        return np.interp(distance, self.distances, self.shifts)
+
+
 @dataclass
 class Actor:
     """An entity that moves: where it is now, its motions, and arrays of all samples.
@@ -93,6 +109,7 @@ class Actor:
     follows: Following | None = None
     running: dict[str, Running] = field(default_factory=dict)
     deleted: float = math.inf
+    lane: LaneLine | None = None
 
     def __post_init__(self) -> None:
         self.place, self.facing = (np.zeros(self.n_samples, dtype=complex) for _ in range(2))
@@ -174,30 +191,38 @@ class Actor:
             )
         self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
         forward = ahead
-        left = np.full(n, now.left)
+        lane = self._follow_lane()
+        base = np.full(n, now.left if lane is None else lane.left)
         turn = np.ones(n)
         if self.sideways is not None:
             motion = self.sideways
             passed: Array = times[later] if motion.until is None else self.travelled[later]
-            left = np.broadcast_to(motion.value(passed - motion.since), n)
+            base = np.broadcast_to(motion.value(passed - motion.since), n)
             if motion.until is not None:
                 # It ends at the first sample at which the actor has travelled so far.
                 index = int(np.searchsorted(self.travelled[sample : last + 1], motion.until - 1e-9))
                 self.running["sideways"].end = float(
                     np.append(times[sample : last + 1], np.inf)[index]
                 )
-            aside = np.diff(left, prepend=now.left)
-            sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
-            cosine = np.sqrt(1 - np.square(sine))
-            forward = ahead * cosine
-            turn = np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
+        left = base
         distance = now.distance + np.cumsum(forward)
-        if (
-            isinstance(path, Way) and not path.is_straight
-        ):  # on a way that bends, the inner side is shorter
-            for _ in range(2):
-                middle = distance - forward / 2
-                distance = now.distance + np.cumsum(forward / (1 - path.curvature(middle) * left))
+        # Where a lane is depends on the distance, and the distance on how far it leads aside.
+        for _ in range(1 if lane is None else 3):
+            if lane is not None:
+                left = base + lane.shift(distance)
+            if lane is not None or self.sideways is not None:
+                aside = np.diff(left, prepend=now.left)
+                sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
+                cosine = np.sqrt(1 - np.square(sine))
+                forward = ahead * cosine
+                turn = np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
+                distance = now.distance + np.cumsum(forward)
+            if isinstance(path, Way) and not path.is_straight:
+                # On a way that bends, the inner side is shorter.
+                for _ in range(2):
+                    middle = distance - forward / 2
+                    inside = 1 - path.curvature(middle) * left
+                    distance = now.distance + np.cumsum(forward / inside)
         if self.follows is not None:
             distance = self._behind(self.follows, later)
         pose = path.pose(distance, left)
@@ -211,6 +236,21 @@ class Actor:
         self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (
             since == 0
         )
+
+    def _follow_lane(self) -> LaneLine | None:
+        """The lane that it follows; None if it is on no roads, or lanes keep their places."""
+        path = self.here.path
+        if not isinstance(path, Way) or path.has_even_lanes:
+            return None
+        if self.lane is None or not (
+            self.lane.path is path and self.lane.sideways is self.sideways
+        ):
+            # Who changes lanes follows the new one.
+            left = self.here.left
+            goal = left if self.sideways is None else float(self.sideways.value(1e12))
+            distances, lefts = path.lane_line(self.here.distance, goal)
+            self.lane = LaneLine(path, self.sideways, distances, lefts - lefts[0], left)
+        return self.lane
 
     def _behind(self, following: Following, later: slice) -> Array:
         """Distances along the path of who keeps its distance to another actor."""

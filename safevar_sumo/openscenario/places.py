@@ -8,16 +8,29 @@ import cmath
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
-from safevar_sumo.openscenario.road import Line, Network, Piece, Pose, Road, unit
+from safevar_sumo.openscenario.lines import Curved, Line, Piece, Pose, unit
+from safevar_sumo.openscenario.road import Network, Road
 
 MAX_DETOUR = 6
 """Roads between two waypoints of a route at most."""
 LEAST_WAY = 1e-9
 """Distance between two vertices from which on they are two [m]."""
+STRAY = 0.05
+"""How far a straight line is left at most where somebody drives straight on [m]."""
+LANE_STEP = 0.5
+"""Distance between two places of a lane's line [m]."""
+MAX_SHIFT = 0.5
+"""Largest shift of a lane's middle between two of these places [m]; a lane that goes farther ends.
+"""
+FloatArray = Any
+"""An array of numbers."""
 AHEAD = -1e-9
 """Cosine of a direction relative to a road from which on it leads along the road [-]."""
 
@@ -43,7 +56,7 @@ class Way(Line):
     @classmethod
     def of(cls, network: Network, chain: tuple[tuple[str, bool], ...]) -> Way:
         """The way along a chain of roads, each with its direction."""
-        pieces: list[Piece] = []
+        pieces: list[Curved] = []
         for name, is_forward in chain:
             own = network.road(name).line.pieces
             pieces += own if is_forward else [piece.reversed() for piece in reversed(own)]
@@ -56,10 +69,10 @@ class Way(Line):
         """
         way = cls.of(network, ((name, is_forward),))
         following = [(name, is_forward)]
-        while len(following) == 1 and way.is_straight and len(way.chain) <= MAX_DETOUR:
+        while len(following) == 1 and way.stray < STRAY and len(way.chain) <= MAX_DETOUR:
             found = way
             ways = [one for one in network.ways(*way.chain[-1]) if not network.road(one[0]).flaw]
-            following = [one for one in ways if cls.of(network, (*found.chain, one)).is_straight]
+            following = [one for one in ways if cls.of(network, (*found.chain, one)).stray < STRAY]
             if len(following) == 1:
                 way = cls.of(network, (*found.chain, *following))
         return way
@@ -102,6 +115,36 @@ class Way(Line):
         """The lane at a place."""
         here = self.road_at(distance, left)
         return here.road.lane_at(here.s, here.t)
+
+    @cached_property
+    def has_even_lanes(self) -> bool:
+        """Whether no lane changes its place."""
+        assert self.network is not None
+        return all(self.network.road(name).is_even for name, _ in self.chain)
+
+    @property
+    def is_level(self) -> bool:
+        """Whether none of its roads has slopes."""
+        assert self.network is not None
+        return all(self.network.road(name).is_level for name, _ in self.chain)
+
+    def lane_line(self, distance: float, left: float) -> tuple[FloatArray, FloatArray]:
+        """Distances, and how far the middle of the lane at a place is to the left there [m].
+
+        Where the lanes of a road have other numbers than before, the lane goes on in the nearest.
+        """
+        distances = np.arange(distance, self.length + LANE_STEP, LANE_STEP)
+        lefts = []
+        middle = self.lane_left(self.lane_at(distance, left), distance)
+        for at in distances:
+            here = self.road_at(float(at), middle)
+            sign = 1 if here.is_forward else -1
+            # A lane that ends is left straight on.
+            if nearest := [here.road.lane_t(lane, here.s) for lane in here.road.lanes_at(here.s)]:
+                found = sign * min(nearest, key=lambda t: abs(t - here.t))
+                middle = found if abs(found - middle) < MAX_SHIFT else middle
+            lefts.append(middle)
+        return distances, np.array(lefts)
 
 
 class Place(NamedTuple):

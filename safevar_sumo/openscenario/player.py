@@ -7,11 +7,9 @@ import numpy as np
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, actors_of
 from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
-from safevar_sumo.openscenario.places import Place, place_of, turn_of
+from safevar_sumo.openscenario.places import STRAY, Place, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network
 
-MAX_TURN = 0.01
-"""Largest turn of an Ego that drives straight on [degrees]."""
 Key = tuple[str, str]
 """An element in conditions on states: its kind, and its name after those of all around it, joined
 by `::`.
@@ -81,14 +79,18 @@ class Player:
         if other is self.ego and (self.sample or until > self.now):
             self.dependences[what] = max(until, self.dependences.get(what, 0.0))
 
-    def ego_turns(self, facings: Array) -> None:
-        """Refuse directions of Ego that differ from the one at the start."""
-        turn = max(
-            turn_of(complex(facing), self.ego.here.pose.facing) for facing in np.unique(facings)
-        )
-        if turn > MAX_TURN:
+    def refuse_turn(self, places: Array) -> None:
+        """Refuse a way of Ego that leaves the straight line along its direction at the start."""
+        facing = self.ego.pose(0).facing
+        ahead = (places - places[0]) / facing
+        is_aside = np.abs(ahead.imag) >= STRAY
+        if is_aside.any():
+            moves = np.diff(places)
+            turn = max(turn_of(complex(one), facing) for one in moves[moves != 0])
             raise unsupported(
-                f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees"
+                f"{self.ego.name} does not drive straight on: it turns by {turn:.1f} degrees, and"
+                f" leaves its line by {np.abs(ahead.imag).max():.2f} m",
+                f"a way that leaves a straight line by less than {STRAY:g} m during the scene",
             )
 
     def remark(self, text: str) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
 from safevar_sumo.openscenario.conditions import bodies_apart
 from safevar_sumo.openscenario.document import is_number, read, unsupported, violated, whole
-from safevar_sumo.openscenario.road import Pose
+from safevar_sumo.openscenario.lines import Pose
+from safevar_sumo.openscenario.places import Way
 from safevar_sumo.openscenario.storyboard import Storyboard
 
 
@@ -110,7 +111,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     player.play()
     own = player.ego
     samples = slice(0, player.sample + 1)
-    player.ego_turns(own.facing[samples])
+    player.refuse_turn(own.place[samples])
     if own.speed[0] <= 0:
         raise unsupported(f"{ego} stands at the start", "a SpeedAction in Init")
     if np.ptp(own.speed[samples]) > 1e-6:
@@ -205,6 +206,9 @@ def _remark(player: Storyboard) -> None:
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")
     for actor in player.actors.values():
+        path = actor.here.path
+        if isinstance(path, Way) and not path.is_level:
+            player.remark("without effect here: the road's elevation")
         if actor.deleted < math.inf:
             player.remark(f"{actor.name} is deleted at {actor.deleted:.1f} s")
     for one in player.acts:

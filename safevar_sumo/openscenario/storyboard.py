@@ -23,7 +23,7 @@ from safevar_sumo.openscenario.document import (
     truth,
     unsupported,
 )
-from safevar_sumo.openscenario.places import Way
+from safevar_sumo.openscenario.places import STRAY, Way
 from safevar_sumo.openscenario.player import Key, Player
 
 LONGEST = 600.0
@@ -363,4 +363,19 @@ class Storyboard(Player):
                         f"the scene ends at {self.times[end]:.1f} s, when {name} is at the end of"
                         " its road"
                     )
+        return self._straight_end(end)
+
+    def _straight_end(self, last: int) -> int:
+        """The last sample at which Ego is on its line, once all that the file says has happened."""
+        events = [event for one in self.acts for event in one.events if event.moves]
+        if math.isinf(self.stop) and (
+            _stop_trigger(self._board) is not None or not all(one.has_ended for one in events)
+        ):
+            return last
+        places = self.ego.place[: last + 1]
+        is_aside = np.abs(((places - places[0]) / self.ego.facing[0]).imag) >= STRAY
+        if not is_aside[self.sample :].any() or is_aside[: self.sample + 1].any():
+            return last
+        end = int(np.argmax(is_aside)) - 1
+        self.remark(f"the scene ends at {self.times[end]:.1f} s, when {self.ego.name}'s way bends")
         return end

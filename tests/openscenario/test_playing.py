@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import quad
 
 from safevar_sumo.openscenario import STEP, Moved, Played, play
-from safevar_sumo.openscenario.road import Piece, Pose
+from safevar_sumo.openscenario.lines import Piece, Pose
 from tests.openscenario.writing import (
     AT_ONCE,
     at,

@@ -33,7 +33,7 @@ from tests.openscenario.writing import (
 )
 
 CATALOG = '<CatalogReference catalogName="cars" entryName="mine"/>'
-SPLINE = STRAIGHT.replace("<line/>", "<paramPoly3/>")
+SPLINE = STRAIGHT.replace("<line/>", "<bezier/>")
 TURN = '<geometry s="0" x="0" y="0" hdg="0" length="2000"><arc curvature="0.001"/></geometry>'
 BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
 EXTERNAL = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
@@ -60,7 +60,7 @@ COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionConditio
 @pytest.mark.parametrize(
     ("parts", "problem"),
     [
-        ({"geometry": SPLINE}, "the road 1 has a paramPoly3; supported: line, arc, spiral"),
+        ({"geometry": SPLINE}, "the road 1 has a bezier"),
         ({"geometry": TURN}, "Ego does not drive straight on: it turns by"),
         ({"ego": private("Ego", teleport(at(-1, 50)), speed(-1.11))}, r"Ego drives backwards \(-1.11 m/s\)"),
         ({"ego": private("Ego", teleport(at(-1, 50)))}, "Ego stands at the start"),

@@ -162,3 +162,38 @@ def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Pat
     assert (runs.outcome == "invalid-test").tolist() == [False, True, True, False]
     assert np.isnan(runs.f_safe[1:3]).all()
     assert (system.measuring.scoring.violation(runs) > 0).tolist() == [False, True, True, False]
+
+
+BENT = """<geometry s="0" x="10" y="20" hdg="0" length="300"><line/></geometry>
+<geometry s="300" x="310" y="20" hdg="0" length="1700"><arc curvature="{}"/></geometry>"""
+
+
+@pytest.mark.parametrize(
+    ("curvature", "stop", "end"),
+    [
+        (0.001, 12.3, 13.0),  # after the StopTrigger at 298 m
+        (0.001, 8.0, 12.0),  # not reached
+        (0.001, 13.5, None),  # refused: 0.2 m aside by then
+        (1e-6, 13.5, 17.5),  # 1 mm aside
+    ],
+)
+def test_ego_drives_straight_on_where_it_leaves_its_line_by_less_than_5_cm(
+    tmp_path: Path, curvature: float, stop: float, end: float | None
+) -> None:
+    """Ego is in the bend at 20 m/s after 12.5 s, and 0.05 m aside after 10 m more."""
+    slope = "<elevation s='0' a='0' b='0.01' c='0' d='0'/>"
+    elevation = f"<elevationProfile>{slope}</elevationProfile>"
+    file = writing.write(
+        tmp_path, geometry=BENT.format(curvature), stop=trigger(AT_ONCE.format(stop), "")
+    )
+    road = tmp_path / "road.xodr"
+    road.write_text(road.read_text().replace("<lanes>", f"{elevation}<lanes>"))
+    if end is None:
+        with pytest.raises(InputError, match=r"not drive straight on: it turns by 5\.7 deg"):
+            play(file, {})
+        return
+    played = play(file, {})
+    assert played.duration == pytest.approx(end, abs=0.02)
+    assert "without effect here: the road's elevation" in played.remarks
+    bends = [remark for remark in played.remarks if "Ego's way bends" in remark]
+    assert len(bends) == (end == 13.0)
