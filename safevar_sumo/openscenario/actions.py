@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
+from safevar_sumo.openscenario.actors import STEP, Actor, Array, Following, Motion, Running
 from safevar_sumo.openscenario.document import (
     Element,
     attribute,
@@ -108,14 +108,20 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
             raise unsupported(
                 "SpeedAction: RelativeTargetSpeed with continuous = true is not supported"
             )
-        value = _relative_speed(target, other)
+        value = _relative_speed(target, other.speed_now)
         player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
     if value < 0:
         raise unsupported(f"{actor.name} drives backwards ({value:.2f} m/s)")
     dynamics = part(action, "SpeedActionDynamics")
     transition = transition_of(dynamics, value - start, (start + value) / 2)
-    if actor is player.ego and transition.duration:
-        raise unsupported(f"SpeedAction of {actor.name} that takes time: its driving system drives")
+    if actor is player.ego:
+        player.profile.begin(player.now, transition.duration, actor.name)
+    until, follower = player.masters.get(actor.name, (0.0, ""))
+    if player.now < until:
+        raise unsupported(
+            f"SpeedAction of {actor.name} while {follower} synchronises with it",
+            "a SpeedAction before or after that",
+        )
     if math.isinf(transition.duration):
         player.remark(f"{actor.name}: SpeedAction with rate 0 has no effect")
     if not transition.duration:
@@ -127,14 +133,11 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
     return [running]
 
 
-def _relative_speed(target: Element, other: Actor) -> float:
-    """A speed relative to another actor's [m/s] (enumeration SpeedTargetValueType)."""
+def _relative_speed(target: Element, speed: float) -> float:
+    """A speed relative to another one [m/s] (enumeration SpeedTargetValueType)."""
     value = number(target, "value")
-    return (
-        other.speed_now * value
-        if target.get("speedTargetValueType") == "factor"
-        else other.speed_now + value
-    )
+    is_factor = target.get("speedTargetValueType") == "factor"
+    return speed * value if is_factor else speed + value
 
 
 def longitudinal_distance_action(player: Player, action: Element, actor: Actor) -> list[Running]:
@@ -173,19 +176,15 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
 
 
 def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """SynchronizeAction: the actor and its master, who holds its speed, reach their positions at
-    the same time.
+    """SynchronizeAction: the actor and its master, whose speed is known until then, reach their
+    positions at the same time.
 
     Up to its steady state the actor changes its speed evenly twice, each time for half of the time;
     one that stands waits, and then accelerates evenly. Then its speed is the final one.
     """
     master = player.actor(attribute(action, "masterEntityRef"))
-    time = math.inf
-    if master.speed_now:
-        time = (
-            master.here.way_to(player.place(part(action, "TargetPositionMaster/*")))
-            / master.speed_now
-        )
+    goal = player.place(part(action, "TargetPositionMaster/*"))
+    time, speed_there = _arrival(player, master, master.here.way_to(goal))
     if not 0 < time < math.inf:
         raise unsupported(f"SynchronizeAction: {master.name} does not move towards its position")
     way = actor.here.way_to(player.place(part(action, "TargetPosition/*")))
@@ -197,7 +196,7 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
         if target.tag == "RelativeSpeedToMaster":
             if master is not player.ego:
                 raise unsupported(f"RelativeSpeedToMaster: {master.name} may change its speed")
-            final = _relative_speed(target, master)
+            final = _relative_speed(target, speed_there)
         for steady in target:
             is_way = steady.tag == "TargetDistanceSteadyState"
             steady_way = number(steady, "distance") if is_way else number(steady, "time") * final
@@ -209,10 +208,29 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
     if rest < -1e-6 or until < -1e-6:
         where = f"{way:.1f} m and {time:.1f} s before its position"
         raise unsupported(f"SynchronizeAction: {actor.name} is {where}, within its steady state")
+    player.masters[master.name] = player.now + time, actor.name
     player.depends(
         master, player.now + until, f"{actor.name}'s SynchronizeAction with {master.name}"
     )
     return [actor.begin("along", time, player.now, _approach(player, actor, until, rest, final))]
+
+
+def _arrival(player: Player, master: Actor, way: float) -> tuple[float, float]:
+    """The time in which an actor drives a way [s], and its speed there [m/s]."""
+    speed = master.speed_now
+    since = player.times - player.now
+    later = since[player.sample :]
+    if master.along is not None:
+        begun = player.now - master.along.since
+        speeds = np.broadcast_to(master.along.value(later + begun), later.shape)
+        if np.ptp(speeds):  # it changes its speed meanwhile
+            ways = np.concatenate([[0.0], np.cumsum(speeds[1:] + speeds[:-1]) * STEP / 2])
+            index = int(np.searchsorted(ways, way))
+            if index == len(ways):
+                return math.inf, 0.0
+            time = np.interp(way, ways[: index + 1], later[: index + 1])
+            return float(time), float(speeds[index])
+    return way / speed if speed else math.inf, speed
 
 
 def _approach(
@@ -424,6 +442,10 @@ def is_ignored(action: Element) -> bool:
 
 def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
     """Begin a PrivateAction or GlobalAction; returns what goes on in time."""
+    for one in action.iter("ActivateControllerAction"):
+        if player.ego in actors and one.get("longitudinal") not in ("false", "0"):
+            player.profile.end(player.now)
+            player.ego.hold()
     if is_ignored(action):
         player.ignored.add(leaf_of(action).tag if len(action) else action.tag)
         return []
@@ -442,7 +464,7 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         every = np.linspace(0.0, line.length, round(line.length) + 2)
         player.refuse_turn(line.pose(every).place)
         return []
-    if player.sample and player.ego in actors:
+    if player.sample and player.ego in actors and leaf.tag != "SpeedAction":
         raise unsupported(
             f"{leaf.tag} of {player.ego.name} after the start: its driving system drives"
         )

@@ -160,6 +160,11 @@ class Actor:
                 else:
                     self.sideways = None
 
+    def hold(self) -> None:
+        """End what changes the speed."""
+        if "along" in self.running:
+            self.end(self.running["along"])
+
     def note(self, sample: int) -> None:
         """Write where it is now; who has not been put elsewhere faces as it moved."""
         pose = self.here.pose

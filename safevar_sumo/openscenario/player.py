@@ -7,6 +7,7 @@ import numpy as np
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, actors_of
 from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
+from safevar_sumo.openscenario.own_speed import SpeedProfile
 from safevar_sumo.openscenario.places import STRAY, Place, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network
 
@@ -20,9 +21,10 @@ class Player:
     """A scene that is being played, at the sample `sample` of `times` [s].
 
     `begun` and `ended` are times of elements of the storyboard [s]; `dependences` says until when
-    the scene depends on Ego, and why; `ignored` are elements without effect; `has_begun` says
-    whether Init is over; `seen` are the values of conditions, from the sample on at which they were
-    asked for the first time.
+    the scene depends on Ego, and why; `profile` are Ego's own speeds; `masters` says until when
+    actors are masters of a SynchronizeAction [s], and of whose; `ignored` are elements without
+    effect; `has_begun` says whether Init is over; `seen` are the values of conditions, from the
+    sample on at which they were asked for the first time.
     """
 
     def __init__(self, document: Document, ego: str, times: Array) -> None:
@@ -44,6 +46,8 @@ class Player:
         self.begun: dict[Key, float] = {}
         self.ended: dict[Key, float] = {}
         self.dependences: dict[str, float] = {}
+        self.profile = SpeedProfile()
+        self.masters: dict[str, tuple[float, str]] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
         self.has_begun = False

@@ -32,15 +32,17 @@ class Moved(NamedTuple):
 
 
 class Played(NamedTuple):
-    """A scene: Ego's shape, the pose of the middle of its front at the start, and its speed [m/s];
-    the others; the length [s]; the time until which a motion depends on Ego, and what depends on
-    it; remarks; the files that were read; the file's parameters that are numbers; and why nothing
-    happens to Ego, "" if something does.
+    """A scene: Ego's shape, the pose of the middle of its front at the start, the speed that it
+    keeps [m/s], and the `profile` of its speeds before, at samples up to the one at which the
+    driving system is switched on; the others; the length [s]; the time until which a motion depends
+    on Ego, and what depends on it; remarks; the files that were read; the file's parameters that
+    are numbers; and why nothing happens to Ego, "" if something does.
     """
 
     ego: Shape
     start: Pose
     speed: float
+    profile: Array
     others: list[Moved]
     duration: float
     depends_until: float
@@ -112,10 +114,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     own = player.ego
     samples = slice(0, player.sample + 1)
     player.refuse_turn(own.place[samples])
-    if own.speed[0] <= 0:
-        raise unsupported(f"{ego} stands at the start", "a SpeedAction in Init")
-    if np.ptp(own.speed[samples]) > 1e-6:
-        raise unsupported(f"{ego} does not keep its speed at the start: its driving system drives")
+    profile = player.profile.speeds(own, player.sample)
     kept = slice(0, player.sample + 1, every)
     others = [_moved(actor, kept) for actor in player.actors.values() if actor is not own]
     if not others:
@@ -126,11 +125,22 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     until = min(player.dependences.get(what, 0.0), player.now)
     files = list(dict.fromkeys([file, *document.catalogs, document.road]))
     numbers = [name for name, value in document.values.items() if is_number(value)]
-    speed = float(own.speed[0])
+    speed = float(profile[-1])
     remarks = [*player.remarks]
     reason = _why_uneventful(player)
     return Played(
-        own.shape, start, speed, others, player.now, until, what, remarks, files, numbers, reason
+        own.shape,
+        start,
+        speed,
+        profile.copy(),
+        others,
+        player.now,
+        until,
+        what,
+        remarks,
+        files,
+        numbers,
+        reason,
     )
 
 
@@ -202,6 +212,11 @@ def _remark(player: Storyboard) -> None:
         player.remark(
             "an Orientation relative to a lane counts from its driving direction (ASAM allows the"
             " road's, too)"
+        )
+    if player.profile.end_time:
+        player.remark(
+            f"a robot drives {player.ego.name} by the file's speeds, until the driving system is"
+            f" switched on at {player.profile.end_time:.1f} s"
         )
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")

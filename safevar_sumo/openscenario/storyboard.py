@@ -94,6 +94,8 @@ class Storyboard(Player):
 
     def __init__(self, document: Document, ego: str) -> None:
         super().__init__(document, ego, TIMES)
+        self.reactions: list[tuple[Key, str]] = []
+        """Elements that move somebody and wait for what Ego does, and how they do."""
         self._changes = 0
         """How many events have begun or ended."""
         self.stop = math.inf
@@ -122,9 +124,9 @@ class Storyboard(Player):
                     for event in maneuver.findall("Event")
                 ]
                 self._remark_repeats(group, maneuver)
-        act_of_story = Act(element, act_key, events)
-        self._refuse_reactions(act_of_story)
-        return act_of_story
+        found = Act(element, act_key, events)
+        self._note_reactions(found)
+        return found
 
     def _refuse_states_of_nothing(self) -> None:
         """Refuse conditions on the state of an element that the storyboard does not have."""
@@ -150,21 +152,25 @@ class Storyboard(Player):
                     f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times"
                 )
 
-    def _refuse_reactions(self, one: Act) -> None:
-        """Refuse an act that moves somebody and an event that moves somebody, if only a run can
-        begin them.
-        """
-        moving = [event.element for event in one.events if event.moves]
-        if not moving:
-            return
-        for element in (one.element, *moving):
+    def _note_reactions(self, one: Act) -> None:
+        moving = [(event.key, event.element) for event in one.events if event.moves]
+        for key, element in [(one.key, one.element), *moving] if moving else ():
             for kind in watched(self, element.find("StartTrigger")):
                 if kind in REACTIONS:
                     waiting = f"the {element.tag.lower()} {attribute(element, 'name')}"
-                    raise unsupported(
-                        f"{waiting} waits for a {kind} of {self.ego.name}, which only a run can"
-                        " tell"
-                    )
+                    self.reactions.append((key, f"{waiting} waits for a {kind}"))
+
+    def _refuse_reactions(self) -> None:
+        """Refuse an act and an event that move somebody, if only a run can begin them: Ego's speed
+        is known while a robot drives it.
+        """
+        end = self.profile.end_time
+        for key, waits in self.reactions:
+            if not end or self.begun.get(key, math.inf) > end:
+                raise unsupported(
+                    f"{waits} of {self.ego.name}, which only a run can tell",
+                    "a condition on time, places or others",
+                )
 
     def initialise(self) -> None:
         """Class Init: places first, then speeds, then all others, as the order of the list is none
@@ -340,6 +346,7 @@ class Storyboard(Player):
             for actor in self.actors.values():
                 actor.arrive(last)
             self.sample = last
+        self._refuse_reactions()
         if math.isinf(self.stop) and self.now >= longest:
             if longest == LONGEST:
                 legal = f"one that does, if {self.ego.name} keeps its speed"

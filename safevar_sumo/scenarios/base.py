@@ -166,6 +166,10 @@ class Scenario:
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves
         the speed tolerance before the ADS brakes is an invalid test.
+    profile_until, profile_highest
+        Time until which a robot drives the vehicle at the speeds of `profile_speed` [s], if the
+        driving system does not brake before; and the highest of them, to which a cruise control is
+        set [m/s].
     is_hit_in_front
         Whether only contacts at the vehicle's front are collisions.
     depends_until, dependence
@@ -202,6 +206,10 @@ class Scenario:
         @property
         def test_speed(self) -> float | None: ...
         @property
+        def profile_until(self) -> float: ...
+        @property
+        def profile_highest(self) -> float: ...
+        @property
         def depends_until(self) -> float: ...
         @property
         def dependence(self) -> str: ...
@@ -212,6 +220,7 @@ class Scenario:
     else:
         pre_crash = ""
         test_speed = None
+        profile_until = profile_highest = 0.0
         depends_until = 0.0
         dependence = "others move as if the vehicle kept its speed"
         uneventful = None
@@ -221,6 +230,10 @@ class Scenario:
     def is_hit_in_front(self) -> bool:
         """By default in a test at its speed."""
         return self.test_speed is not None
+
+    def profile_speed(self, time: float) -> Quantity:
+        """Speed of the vehicle before `profile_until` [m/s]."""
+        raise NotImplementedError
 
     def free(self) -> Mapping[str, FreeParameter]:
         """Parameters that a study may search, by name."""

@@ -139,8 +139,27 @@ class OpenScenario(TrackScenario):
 
     @property
     def start_speed(self) -> Quantity:
-        """The same [m/s]."""
-        return self.test_speed
+        """The speed of Ego at the start [m/s]."""
+        return self.profile_speed(0.0)
+
+    @property
+    def profile_until(self) -> Quantity:
+        """The time until which a robot drives Ego's own speeds [s]."""
+        return self._of_scenes([(len(one.profile) - 1) * STEP for one in self._scenes])
+
+    @property
+    def profile_highest(self) -> Quantity:
+        """The highest of Ego's own speeds [m/s]."""
+        return self._of_scenes([float(one.profile.max()) for one in self._scenes])
+
+    def profile_speed(self, time: float) -> Quantity:
+        """Ego's own speed at a time [m/s], and after its profile the one that it holds."""
+        return self._of_scenes(
+            [
+                float(np.interp(time / STEP, np.arange(len(one.profile)), one.profile))
+                for one in self._scenes
+            ]
+        )
 
     @property
     def depends_until(self) -> Quantity:
@@ -205,7 +224,7 @@ class OpenScenario(TrackScenario):
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """A longer lane in SUMO for a long scene."""
-        way = float(np.max(self.test_speed * self.duration))
+        way = float(np.max(self.profile_highest) * np.max(self.duration))
         if way < LANE_LENGTH / 2:
             return {}
         end = as_text(LANE_LENGTH + way)

@@ -95,7 +95,7 @@ def drive(
             observation, state = vehicle.sense(prepared, state, observation)
             if listen is not None:
                 listen(observation)
-            command, memory = ads.drive(observation, memory)
+            command, memory = ads.drive(robot.at_first(observation), memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
             values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
@@ -105,7 +105,7 @@ def drive(
 
             # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
-            state = vehicle.advance(prepared, state, command)
+            state = robot.lead(vehicle.advance(prepared, state, command))
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()

@@ -18,6 +18,7 @@ from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
+from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
@@ -234,6 +235,16 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
+def _check_speed(scenario: Scenario, max_speed: float) -> None:
+    """Refuse a test that is faster than the original vehicle, or than any test."""
+    speed = float(np.max([scenario.test_speed or 0.0, scenario.profile_highest]))
+    highest = min(max_speed, MAX_TEST_SPEED)
+    if speed > highest:
+        name = getattr(scenario, "ego", "the vehicle under test")
+        problem = f"{name} drives at {speed:.1f} m/s, faster than the study's vehicle can"
+        raise InputError("", problem, f"at most {highest:.1f} m/s, or another vehicle")
+
+
 def _assemble(study: Study) -> System:
     # The models: each system has the code as it is now, and no state of another one.
     unload_user_modules()
@@ -268,6 +279,8 @@ def _assemble(study: Study) -> System:
     # What the driving system knows of the original vehicle.
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
+    for one in (scenario, *(point.scenario for point in matrix)):
+        _check_speed(one, nominal.max_speed)
     if study.vehicle.model not in VEHICLES:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(

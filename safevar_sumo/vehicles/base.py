@@ -254,6 +254,17 @@ class Vehicle:
         """The state one simulation step later."""
 
 
+def led_state(is_led: BoolArray, steady: State, state: State) -> State:
+    """The state of vehicles that move as in a steady state where `is_led` is true; what a signal
+    was before stays.
+    """
+    if isinstance(state, tuple):
+        columns = [led_state(is_led, *states) for states in zip(steady, state, strict=True)]
+        return type(state)(*columns) if hasattr(state, "_fields") else tuple(columns)
+    is_kept = steady is None or state is None or hasattr(state, "where")
+    return state if is_kept else np.where(is_led, steady, state)
+
+
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
     of states.

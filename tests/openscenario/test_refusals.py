@@ -35,6 +35,7 @@ from tests.openscenario.writing import (
 CATALOG = '<CatalogReference catalogName="cars" entryName="mine"/>'
 SPLINE = STRAIGHT.replace("<line/>", "<bezier/>")
 TURN = '<geometry s="0" x="0" y="0" hdg="0" length="2000"><arc curvature="0.001"/></geometry>'
+ACTIVATE = "<ActivateControllerAction longitudinal='true'/>"
 BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
 EXTERNAL = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
 LIMITED = (
@@ -64,7 +65,7 @@ COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionConditio
         ({"geometry": TURN}, "Ego does not drive straight on: it turns by"),
         ({"ego": private("Ego", teleport(at(-1, 50)), speed(-1.11))}, r"Ego drives backwards \(-1.11 m/s\)"),
         ({"ego": private("Ego", teleport(at(-1, 50)))}, "Ego stands at the start"),
-        ({"groups": group(event(speed(5), AT_ONCE.format(3)), actor="Ego")}, "SpeedAction of Ego after the start"),
+        ({"ego": private("Ego", teleport(at(-1, 50)), speed(20), ACTIVATE), "groups": group(event(speed(5), AT_ONCE.format(3)), actor="Ego")}, "SpeedAction of Ego after the start"),
         ({"events": group(event(speed(5), watching("Ego", COLLISION)))}, "the event Event waits for a CollisionCondition of Ego"),
         ({"entities": body("Car1") + body("Car2"), "init": ""}, "no ScenarioObject is named 'Ego'; there are: Car1, Car2"),
         ({"car": ("<LongitudinalAction><SpeedProfileAction/></LongitudinalAction>",)}, "SpeedProfileAction is not supported"),

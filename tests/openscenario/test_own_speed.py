@@ -1,0 +1,167 @@
+"""Ego's own speeds: a robot drives them until the driving system is switched on, or brakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safevar_sumo.ads import Ads
+from safevar_sumo.errors import InputError
+from safevar_sumo.openscenario import STEP, Played, play
+from safevar_sumo.scenarios import OpenScenario
+from tests.in_process import refused, run
+from tests.openscenario.writing import (
+    AT_ONCE,
+    at,
+    event,
+    group,
+    lane_change,
+    private,
+    speed,
+    teleport,
+    trigger,
+    watching,
+    write,
+)
+from tests.scenarios.holding import CARLA, NATIVE, Hold, Pedals, driven
+
+ACTIVATE = "<ControllerAction><ActivateControllerAction {}/></ControllerAction>"
+STANDING = private("Ego", teleport(at(-1, 50)), speed(0))
+FASTER = event(speed(20, "linear", "time", 5), AT_ONCE.format(1), "Faster")
+STOP = trigger(AT_ONCE.format(20), "")
+
+
+def played(folder: Path, *events: str, car: str = "", ego: str = STANDING, **parts: str) -> Played:
+    """What a file says in which Ego and the Car have these events."""
+    groups = (group(*events, actor="Ego") if events else "") + (group(car) if car else "")
+    return play(write(folder, groups=groups, ego=ego, stop=STOP, **parts), {})  # type: ignore[arg-type]
+
+
+def begins(scene: Played) -> float:
+    """When the Car begins to change its lane [s]."""
+    (car,) = scene.others
+    return float(np.flatnonzero(np.abs(np.diff(car.facing.imag)) > 1e-6)[0] * STEP)
+
+
+def when(condition: str) -> str:
+    """The Car's event that begins with a condition on Ego."""
+    return event(lane_change(-1, "linear", "time", 2), watching("Ego", condition), "Aside")
+
+
+def test_ego_accelerates_and_then_keeps_its_speed(tmp_path: Path) -> None:
+    """From 1 s on by 4 m/s^2 to 20 m/s; without an ActivateControllerAction up to the end at 6 s."""
+    scene = played(tmp_path, FASTER)
+    times = np.arange(len(scene.profile)) * STEP
+    assert times[-1] == pytest.approx(6)
+    assert np.abs(scene.profile - 4 * np.clip(times - 1, 0, 5)).max() < 1e-9
+    assert scene.speed == 20
+    assert "until the driving system is switched on at 6.0 s" in " ".join(scene.remarks)
+    at_start = private("Ego", teleport(at(-1, 50)), speed(20, "linear", "time", 5))
+    assert len(played(tmp_path, ego=at_start).profile) == 501
+
+
+@pytest.mark.parametrize(
+    ("condition", "expected"),
+    [
+        ('<TraveledDistanceCondition value="18"/>', 4.0),  # 2 m/s^2 t^2 after 3 s
+        ('<SpeedCondition value="10" rule="greaterThan"/>', 3.5),
+        ('<AccelerationCondition value="3" rule="greaterThan"/>', 1.01),
+        ('<TraveledDistanceCondition value="90"/>', 8.0),  # 50 m by 6 s, then 20 m/s
+    ],
+)
+def test_what_waits_for_ego_waits_for_its_own_speed(
+    tmp_path: Path, condition: str, expected: float
+) -> None:
+    scene = played(tmp_path, FASTER, car=when(condition))
+    assert begins(scene) == pytest.approx(expected, abs=2 * STEP)
+    assert scene.depends_until == pytest.approx(expected, abs=2 * STEP)
+
+
+def test_a_reaction_of_ego_after_its_profile_is_known_to_no_file(tmp_path: Path) -> None:
+    faster = when('<SpeedCondition value="21" rule="greaterThan"/>')
+    with pytest.raises(InputError, match="the event Aside waits for a SpeedCondition of Ego"):
+        played(tmp_path, FASTER, car=faster)
+
+
+def test_a_master_arrives_when_its_speeds_say(tmp_path: Path) -> None:
+    """Ego reaches s = 150 m at 8.5 s: 50 m by 6 s, and 50 m at 20 m/s."""
+    action = (
+        f'<SynchronizeAction masterEntityRef="Ego"><TargetPositionMaster>{at(-1, 150)}'
+        f"</TargetPositionMaster><TargetPosition>{at(-2, 200)}</TargetPosition>"
+        '<FinalSpeed><AbsoluteSpeed value="12"/></FinalSpeed></SynchronizeAction>'
+    )
+    start = trigger(AT_ONCE.format(1))
+    scene = played(tmp_path, FASTER, car=event(action, start, priority="parallel"))
+    (car,) = scene.others
+    index = round(8.5 / STEP)
+    assert (car.place - 1.5 * car.facing)[index].real == pytest.approx(10 + 200, abs=0.05)
+    assert car.speed[index] == pytest.approx(12)
+
+
+@pytest.mark.parametrize("longitudinal", ["longitudinal='true'", ""])
+def test_a_driving_system_is_switched_on_by_its_action(tmp_path: Path, longitudinal: str) -> None:
+    """At 4 s, when Ego drives at 12 m/s."""
+    on = event(ACTIVATE.format(longitudinal), AT_ONCE.format(4), "On", "parallel")
+    scene = played(tmp_path, FASTER, on)
+    assert (len(scene.profile) - 1) * STEP == pytest.approx(4, abs=STEP)
+    assert scene.speed == pytest.approx(12)
+    off = event(ACTIVATE.format("longitudinal='false'"), AT_ONCE.format(4), "Off", "parallel")
+    assert played(tmp_path, FASTER, off).speed == 20
+    late = event(speed(5), AT_ONCE.format(9), "Late", "parallel")
+    with pytest.raises(InputError, match=r"SpeedAction of Ego after the start: .* from 4\.0 s on"):
+        played(tmp_path, FASTER, on, late)
+    with pytest.raises(InputError, match="LaneChangeAction of Ego after the start"):
+        played(tmp_path, FASTER, event(lane_change(-2, "linear", "time", 2), AT_ONCE.format(2)))
+    init = private("Ego", teleport(at(-1, 50)), speed(20, "linear", "time", 5), ACTIVATE.format(""))
+    with pytest.raises(InputError, match="beside an ActivateControllerAction in Init"):
+        played(tmp_path, ego=init)
+
+
+@pytest.mark.parametrize("system", [CARLA, NATIVE], ids=["carla", "native"])
+def test_a_robot_drives_the_profile_and_holds_its_last_speed(
+    tmp_path: Path, system: object
+) -> None:
+    file = write(tmp_path, groups=group(FASTER, actor="Ego"), ego=STANDING, stop=STOP)
+    run = driven(OpenScenario(file), system=system)  # type: ignore[arg-type]
+    times, speeds = run.trace.time, run.trace.speed[:, 0]
+    led = times <= 6.0
+    assert np.abs(speeds - 4 * np.clip(times - 1, 0, 5))[led].max() < 1e-6
+    assert abs(run.test_speed_error[0]) < 1.0 / 3.6
+    assert run.outcome[0] in ("passed", "timeout")
+
+
+def test_the_first_brake_ends_the_profile(tmp_path: Path) -> None:
+    """At 3 s, at 8 m/s. What is an invalid test if another one still waits for Ego; to release an
+    accelerator ends nothing.
+    """
+    brakes: Ads = Hold(np.array([3.0]))
+    waits = when('<TraveledDistanceCondition value="90"/>')
+    for car, outcome in (("", "stopped"), (waits, "invalid-test")):
+        groups = group(FASTER, actor="Ego") + (group(car) if car else "")
+        scenario = OpenScenario(write(tmp_path, groups=groups, ego=STANDING, stop=STOP))
+        run = driven(scenario, brakes)
+        assert run.trace.speed.max() == pytest.approx(8, abs=0.3)
+        assert run.outcome[0] == outcome
+    releases = Pedals(lambda seen: (np.where(seen.time < 2, 1.0, 0.0), 0.0))
+    file = write(tmp_path, groups=group(FASTER, actor="Ego"), ego=STANDING, stop=STOP)
+    assert driven(OpenScenario(file), releases).trace.speed.max() == pytest.approx(20, abs=0.3)
+
+
+def test_the_driving_system_sees_while_the_robot_leads(tmp_path: Path) -> None:
+    """A car stands 30 m ahead: the system brakes before Ego is at its test speed."""
+    car = teleport(at(-1, 84)), speed(0)
+    groups = group(FASTER, actor="Ego")
+    file = write(tmp_path, groups=groups, ego=STANDING, stop=STOP, car=car)
+    study = tmp_path / "mine.toml"
+    study.write_text(f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\n')
+    text = run("simulate", str(study)).stdout
+    assert "The original vehicle stops" in text
+
+
+def test_an_ego_that_is_faster_than_the_vehicle_is_bad_input(tmp_path: Path) -> None:
+    file = write(tmp_path, ego=private("Ego", teleport(at(-1, 50)), speed(60)))
+    study = tmp_path / "mine.toml"
+    study.write_text(f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\n')
+    refused("simulate", str(study), message=("Ego drives at 60.0 m/s", "at most 55.6 m/s"))
