@@ -129,21 +129,26 @@ class Parameter(NamedTuple):
     groups: tuple[tuple[tuple[str, str], ...], ...]
 
 
+GROUPS_OF_CONSTRAINTS = ("ConstraintGroup", "ValueConstraintGroup")
+"""Elements of a parameter's constraints: by the schema, and by its class."""
+
+
 def declared(element: Element) -> list[Parameter]:
     """The parameters that an element declares."""
     found = [
         Parameter(
-            attribute(each, "name"),
+            attribute(each, "name").lstrip("$"),
             attribute(each, "value"),
             tuple(
                 tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
-                for group in each.findall("ConstraintGroup")
+                for group in each
+                if group.tag in GROUPS_OF_CONSTRAINTS
             ),
         )
         for each in element.findall("ParameterDeclarations/ParameterDeclaration")
     ]
     check_unique([parameter.name for parameter in found], "parameters")
-    for rule in element.iterfind("ParameterDeclarations/*/ConstraintGroup/*"):
+    for rule in element.iterfind("ParameterDeclarations/*/*/*"):
         _check(rule)
     return found
 
@@ -169,6 +174,14 @@ def values_of(parameters: Sequence[Parameter], given: Values, outer: Values) -> 
     return values
 
 
+def refuse_violated(parameters: Sequence[Parameter], values: Values) -> None:
+    """Refuse values that violate a constraint."""
+    if problems := violated(parameters, values):
+        raise unsupported(
+            f"the file's constraints exclude {', '.join(problems)}", "values that they allow"
+        )
+
+
 def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
     """The values that violate a constraint, as `name = value`.
 
@@ -190,7 +203,7 @@ def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
 
 class Document(NamedTuple):
     """A concrete file with every value a literal: its root, its parameters and their values, and
-    the paths of the catalogs and the road that it names.
+    the paths of the catalogs and the road that it names, "" without one.
     """
 
     root: Element
@@ -225,7 +238,7 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     for each in root.findall("CatalogLocations/*/Directory"):
         folders.append(beside(folder, literal(attribute(each, "path"), values)))
     catalogs: list[str] = []
-    _resolve(root, values, tuple(folders), catalogs)
+    _resolve(root, values, Library(tuple(folders), catalogs))
     # An orientation without a type is absolute up to version 1.2, and relative from 1.3 on.
     for orientation in root.iter("Orientation"):
         orientation.attrib.setdefault(
@@ -234,10 +247,9 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     check_unique([attribute(one, "name") for one in root.findall("Entities/*")], "entities")
     _name_members(root)
     logic = root.find("RoadNetwork/LogicFile")
-    if logic is None:
-        raise unsupported(f"{file!r} names no road", "RoadNetwork/LogicFile")
-    road = beside(folder, attribute(logic, "filepath"))
-    if not os.path.isfile(road):
+    name = "" if logic is None else logic.get("filepath", "")
+    road = name and beside(folder, name)
+    if road and not os.path.isfile(road):
         raise unsupported(
             f"the road {road!r} is not there",
             "the path of an OpenDRIVE file, from the file that names it",
@@ -267,40 +279,68 @@ def beside(folder: str, path: str) -> str:
     return os.path.normpath(os.path.join(folder, path.replace("\\", "/")))
 
 
-def _resolve(
-    element: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]
-) -> None:
-    """Replace values and references to catalogs below an element; `catalogs` collects the files
-    that are read.
-    """
+class Library(NamedTuple):
+    """Where catalogs are: folders, the files that are read, and the entries that are being read."""
+
+    folders: tuple[str, ...]
+    files: list[str]
+    entered: tuple[tuple[str, str], ...] = ()
+
+
+REFERENCES = ("parameterRef", "parameterName", "variableRef")
+"""Attributes that name a parameter or a variable, also as `$name`."""
+NAMES = ("name", "storyboardElementRef")
+"""Attributes that name an element."""
+WITHOUT_EFFECT = ("ObjectController", "AssignControllerAction", "EnvironmentAction")
+"""Elements that move nobody, whose catalogs may be missing."""
+
+
+def _resolve(element: Element, values: Values, library: Library) -> None:
+    """Replace values and references to catalogs below an element."""
     for key, text in element.attrib.items():
-        if "$" in text:
-            element.set(key, literal(text, values))
+        if "$" in text and key not in REFERENCES:
+            try:
+                element.set(key, literal(text, values))
+            except InputError:
+                # The name of what is no entity is a text, whatever it holds.
+                if key not in NAMES or element.tag == "ScenarioObject":
+                    raise
     _check(element)
     for place, child in enumerate(list(element)):
         if child.tag == "ParameterDeclarations":
             continue
         if child.tag == "CatalogReference":
-            element[place] = _referenced(child, values, folders, catalogs)
+            try:
+                element[place] = _referenced(child, values, library)
+            except InputError:
+                # A vehicle that the file describes itself needs no catalog.
+                if element.tag not in WITHOUT_EFFECT and element.find("*/BoundingBox") is None:
+                    raise
         else:
             own = declared(child)
-            _resolve(child, values_of(own, {}, values) if own else values, folders, catalogs)
+            inner = values_of(own, {}, values) if own else values
+            refuse_violated(own, inner)
+            _resolve(child, inner, library)
 
 
-def _referenced(
-    child: Element, values: Values, folders: tuple[str, ...], catalogs: list[str]
-) -> Element:
+def _referenced(child: Element, values: Values, library: Library) -> Element:
     """The entry of a catalog that a reference names, with the values that it assigns."""
     catalog, name = (literal(attribute(child, key), values) for key in ("catalogName", "entryName"))
-    file, found = _entry(catalog, name, folders)
+    if (catalog, name) in library.entered:
+        raise unsupported(f"the entry {name} of the catalog {catalog} refers to itself", "another")
+    file, found = _entry(catalog, name, library.folders)
     # Another value of a parameter may choose any of them.
-    catalogs += _files(folders) if "$" in attribute(child, "catalogName") else [file]
+    is_chosen = "$" in attribute(child, "catalogName")
+    library.files.extend(_files(library.folders) if is_chosen else [file])
     given = {
         attribute(each, "parameterRef").lstrip("$"): literal(attribute(each, "value"), values)
         for each in child.iter("ParameterAssignment")
     }
     entry = copy.deepcopy(found)
-    _resolve(entry, values_of(declared(found), given, values), folders, catalogs)
+    own = declared(found)
+    inner = values_of(own, given, values)
+    refuse_violated(own, inner)
+    _resolve(entry, inner, library._replace(entered=(*library.entered, (catalog, name))))
     return entry
 
 
@@ -319,10 +359,14 @@ def _files(folders: Sequence[str]) -> list[str]:
 
 
 def _entry(catalog: str, entry: str, folders: tuple[str, ...]) -> tuple[str, Element]:
-    """The file of a catalog, and its entry of that name."""
-    for file in _files(folders):
-        found = root_of(file).find("Catalog")
-        if found is not None and found.get("name") == catalog:
+    """The file of a catalog, and its entry of that name; without a catalog of that name a file may
+    have it.
+    """
+    catalogs = {file: root_of(file).find("Catalog") for file in _files(folders)}
+    named = [(file, one) for file, one in catalogs.items() if one is not None]
+    for names in ([one.get("name") for _, one in named], [Path(file).stem for file, _ in named]):
+        if catalog in names:
+            file, found = named[names.index(catalog)]
             entries = {each.get("name", ""): each for each in found}
             if entry not in entries:
                 raise unsupported(f"the catalog {catalog} has no {entry}", one_of(entries))

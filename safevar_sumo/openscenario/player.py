@@ -9,7 +9,7 @@ from safevar_sumo.openscenario.actors import Actor, Array, actors_of
 from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
 from safevar_sumo.openscenario.own_speed import SpeedProfile
 from safevar_sumo.openscenario.places import STRAY, Place, place_of, turn_of
-from safevar_sumo.openscenario.road import read_network
+from safevar_sumo.openscenario.road import read_network, straight_network
 
 Key = tuple[str, str]
 """An element in conditions on states: its kind, and its name after those of all around it, joined
@@ -29,7 +29,9 @@ class Player:
 
     def __init__(self, document: Document, ego: str, times: Array) -> None:
         self.document = document
-        self.network = read_network(document.road)
+        self.network = (
+            read_network(document.road) if document.road else straight_network(document.root)
+        )
         self.times = times
         self.actors = {actor.name: actor for actor in actors_of(document.root, len(times))}
         if ego not in self.actors:
@@ -40,7 +42,7 @@ class Player:
         self.ego = self.actors[ego]
         self.sample = 0
         self.variables = {
-            attribute(each, "name"): attribute(each, "value")
+            attribute(each, "name").lstrip("$"): attribute(each, "value")
             for each in document.root.findall("VariableDeclarations/VariableDeclaration")
         }
         self.begun: dict[Key, float] = {}

@@ -15,6 +15,7 @@ from safevar_sumo.openscenario.document import (
     part,
     root_of,
     unsupported,
+    whole,
 )
 from safevar_sumo.openscenario.lines import Curved, Line, Piece, Pose
 from safevar_sumo.openscenario.polynomials import curve_of
@@ -116,6 +117,35 @@ class Network:
             for incoming, to, at in self.junctions.get(other, [])
             if incoming == road
         ]
+
+
+LONG, WIDTH = 100_000.0, 3.5
+"""Length of the road of a file that names none, and width of its lanes [m]."""
+MOST_LANES = 20
+"""Lanes on each side of it at most."""
+
+
+def straight_network(scenario: Element) -> Network:
+    """A straight road to the east for a file that names none, with the lanes that it names."""
+    names = {one.get("roadId", "") for one in scenario.iter() if "roadId" in one.attrib}
+    lanes = [whole(one, "laneId") for one in scenario.iter() if "laneId" in one.attrib]
+    lanes += [whole(one, "value") for one in scenario.iter("AbsoluteTargetLane")]
+    beside = [whole(one, "dLane") for one in scenario.iter("RelativeLanePosition")]
+    beside += [whole(one, "value") for one in scenario.iter("RelativeTargetLane")]
+    most = max(map(abs, [1, *lanes])) + sum(map(abs, beside))
+    if len(names) > 1 or most > MOST_LANES:
+        problem = f"the file names no road file, but {len(names)} roads and {most} lanes"
+        raise unsupported(problem, f"RoadNetwork/LogicFile, or a road of up to {MOST_LANES} lanes")
+    name = names.pop() if names else ""
+    widths: dict[int, Cubics] = {
+        sign * lane: [(0.0, (WIDTH, 0.0, 0.0, 0.0))]
+        for lane in range(1, most + 1)
+        for sign in (1, -1)
+    }
+    line = Piece(Pose.at(0.0, 0.0, 0.0), LONG)
+    offsets: Cubics = [(0.0, (0.0,) * 4)]
+    road = Road(name, [line], "", [(0.0, widths)], offsets, {}, is_left_hand=False, is_level=True)
+    return Network("the road", {name: road}, {})
 
 
 def read_network(file: str) -> Network:

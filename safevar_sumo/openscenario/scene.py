@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
 from safevar_sumo.openscenario.conditions import bodies_apart
-from safevar_sumo.openscenario.document import is_number, read, unsupported, violated, whole
+from safevar_sumo.openscenario.document import is_number, read, refuse_violated, unsupported, whole
 from safevar_sumo.openscenario.lines import Pose
 from safevar_sumo.openscenario.places import Way
 from safevar_sumo.openscenario.storyboard import Storyboard
@@ -105,10 +105,7 @@ def _stamps(files: Sequence[str]) -> list[tuple[int, int]]:
 
 def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     document = read(file, values)
-    if problems := violated(document.parameters, document.values):
-        raise unsupported(
-            f"the file's constraints exclude {', '.join(problems)}", "values that they allow"
-        )
+    refuse_violated(document.parameters, document.values)
     player = Storyboard(document, ego)
     player.play()
     own = player.ego
@@ -123,7 +120,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     what = max(player.dependences, key=player.dependences.__getitem__, default="")
     start = own.pose(0).moved(own.shape.front, own.shape.left)
     until = min(player.dependences.get(what, 0.0), player.now)
-    files = list(dict.fromkeys([file, *document.catalogs, document.road]))
+    files = list(dict.fromkeys(filter(None, [file, *document.catalogs, document.road])))
     numbers = [name for name, value in document.values.items() if is_number(value)]
     speed = float(profile[-1])
     remarks = [*player.remarks]
@@ -218,6 +215,8 @@ def _remark(player: Storyboard) -> None:
             f"a robot drives {player.ego.name} by the file's speeds, until the driving system is"
             f" switched on at {player.profile.end_time:.1f} s"
         )
+    if not player.document.road:
+        player.remark("the file names no road: a straight one is taken")
     if player.ignored:
         player.remark(f"without effect here: {', '.join(sorted(player.ignored))}")
     for actor in player.actors.values():

@@ -88,7 +88,7 @@ def files_of_scenario(
             raise InputError(
                 "", f"scenario.file = {point['file']!r}: {error.problem}", error.legal
             ) from None
-        files |= {name: name for name in (path, *document.catalogs, document.road)}
+        files |= {name: name for name in (path, *document.catalogs, document.road) if name}
     return files
 
 

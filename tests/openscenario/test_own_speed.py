@@ -51,7 +51,7 @@ def when(condition: str) -> str:
 
 
 def test_ego_accelerates_and_then_keeps_its_speed(tmp_path: Path) -> None:
-    """From 1 s on by 4 m/s^2 to 20 m/s; without an ActivateControllerAction up to the end at 6 s."""
+    """From 1 s on by 4 m/s^2 to 20 m/s; nothing switches a driving system on before 6 s."""
     scene = played(tmp_path, FASTER)
     times = np.arange(len(scene.profile)) * STEP
     assert times[-1] == pytest.approx(6)

@@ -1,0 +1,147 @@
+# ruff: noqa: E501 (lines of XML)
+"""Parameters, names and catalogs of OpenSCENARIO files, and files without a road."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.openscenario import play, read
+from safevar_sumo.scenarios import OpenScenario
+from tests.openscenario.writing import (
+    AT_ONCE,
+    at,
+    body,
+    event,
+    group,
+    lane_change,
+    speed,
+    teleport,
+    trigger,
+    write,
+)
+from tests.scenarios.holding import driven
+
+V = '<ParameterDeclaration name="{}" parameterType="{}" value="{}">{}</ParameterDeclaration>'
+LIMIT = '<ConstraintGroup><ValueConstraint rule="lessThan" value="{}"/></ConstraintGroup>'
+ENDED = (
+    "<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{}'"
+    " state='completeState'/>"
+)
+
+
+@pytest.mark.parametrize("name", ["owner", "$owner"])
+@pytest.mark.parametrize("reference", ["v", "$v"])
+def test_names_and_references_of_parameters_may_begin_with_a_dollar(
+    tmp_path: Path, name: str, reference: str
+) -> None:
+    parameters = V.format(name, "string", "Car", "") + V.format("v", "double", "3", "")
+    condition = f"<ParameterCondition parameterRef='{reference}' rule='equalTo' value='3'/>"
+    file = write(
+        tmp_path,
+        groups=group(event(speed(5), condition), actor="$owner"),
+        entities=body("Ego") + body("$owner", 5.0),
+        parameters=parameters,
+    )
+    (car,) = play(file, {}).others
+    assert (car.name, car.speed[-1]) == ("Car", 5)
+    assert play(file, {"v": "4"}).others[0].speed[-1] == 10
+
+
+@pytest.mark.parametrize("name", ["$Brake", "${1 +", "costs $5", "$v"])
+def test_names_of_elements_and_conditions_are_texts(tmp_path: Path, name: str) -> None:
+    file = write(
+        tmp_path,
+        event(speed(20, "linear", "time", 2), AT_ONCE.format(1), name),
+        parameters=V.format("v", "double", "3", ""),
+        stop=trigger(ENDED.format(name), "").replace('name=""', f'name="{name}"'),
+    )
+    assert play(file, {}).duration == pytest.approx(3 + 4, abs=0.02)
+
+
+def test_the_constraints_of_inner_parameters_hold(tmp_path: Path) -> None:
+    """Those of a Story, whose value may depend on one of the file, and of a catalog's entry."""
+    inner = V.format("w", "double", "${$v * 2}", LIMIT.format(8))
+    file = Path(write(tmp_path, event(speed("$w")), parameters=V.format("v", "double", "3", "")))
+    declarations = f"<ParameterDeclarations>{inner}</ParameterDeclarations>"
+    text = file.read_text().replace('<Story name="Story">', f'<Story name="Story">{declarations}')
+    file.write_text(text)
+    assert play(str(file), {}).others[0].speed[-1] == 6
+    with pytest.raises(InputError, match=r"the file's constraints exclude w = 8"):
+        play(str(file), {"v": "4"})
+
+
+NO_ROAD = '<RoadNetwork><LogicFile filepath="road.xodr"/></RoadNetwork>'
+
+
+@pytest.mark.parametrize(
+    "network", ["", "<RoadNetwork/>", "<RoadNetwork><SceneGraphFile/></RoadNetwork>"]
+)
+def test_a_file_without_a_road_gets_a_straight_one(tmp_path: Path, network: str) -> None:
+    """With the lanes that it names, of 3.5 m each."""
+    file = Path(write(tmp_path, event(lane_change(-3, "linear", "time", 2), AT_ONCE.format(1))))
+    file.write_text(file.read_text().replace(NO_ROAD, network))
+    played = play(str(file), {})
+    (car,) = played.others
+    assert "the file names no road: a straight one is taken" in played.remarks
+    left = (car.place - 1.5 * car.facing).imag
+    assert (left[0], left[-1]) == (pytest.approx(-3.5 * 1.5), pytest.approx(-3.5 * 2.5))
+    assert played.start.place == pytest.approx(50 + 3.5 - 1.75j)
+    assert driven(OpenScenario(str(file))).outcome[0] == "passed"
+
+
+def test_a_file_without_a_road_names_one_road_of_some_lanes(tmp_path: Path) -> None:
+    for place, problem in (("1000", "1 roads and 1000 lanes"), ("-1", "2 roads and 2 lanes")):
+        other = at(-2, 90).replace('roadId="1"', 'roadId="7"') if place == "-1" else at(1000, 90)
+        file = Path(write(tmp_path, car=(teleport(other), speed(10))))
+        file.write_text(file.read_text().replace(NO_ROAD, ""))
+        with pytest.raises(InputError, match=f"the file names no road file, but {problem}"):
+            play(str(file), {})
+
+
+VEHICLES = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="0"/><Catalog name="{}">{}</Catalog></OpenSCENARIO>"""
+PLACES = "<{0}Catalog><Directory path='.'/></{0}Catalog>"
+LOOP = '<CatalogReference catalogName="Cars" entryName="car"/>'
+ENTRY = '<Vehicle name="car" vehicleCategory="car"><BoundingBox><Center x="1" y="0"/><Dimensions width="2" length="6"/></BoundingBox>{}</Vehicle>'
+
+
+def with_catalog(folder: Path, its_name: str, entry: str = ENTRY.format("")) -> str:
+    """A file whose Car is the entry `car` of the catalog Cars, in a file of that name."""
+    (folder / "Cars.xosc").write_text(VEHICLES.format(its_name, entry))
+    car = f'<ScenarioObject name="Car">{LOOP}</ScenarioObject>'
+    return write(folder, entities=body("Ego") + car, catalogs=PLACES.format("Vehicle"))
+
+
+@pytest.mark.parametrize("its_name", ["Cars", "VehicleCatalog"])
+def test_a_catalog_is_found_by_its_name_or_its_file(tmp_path: Path, its_name: str) -> None:
+    file = with_catalog(tmp_path, its_name)
+    assert play(file, {}).others[0].shape.length == 6
+    assert read(file, {}).catalogs == [str(tmp_path / "Cars.xosc")]
+
+
+def test_a_catalog_that_refers_to_itself_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the entry car of the catalog Cars refers to itself"):
+        play(with_catalog(tmp_path, "Cars", ENTRY.format(LOOP)), {})
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("<ScenarioObject name='Car'>{}</ScenarioObject>", "there is no catalog None in"),
+        (body("Car").replace("</ScenarioObject>", "{}</ScenarioObject>"), ""),
+        (body("Car").replace("</ScenarioObject>", "<ObjectController>{}</ObjectController></ScenarioObject>"), ""),
+    ],
+)  # fmt: skip
+def test_a_missing_catalog_is_refused_where_the_file_needs_it(
+    tmp_path: Path, place: str, message: str
+) -> None:
+    reference = '<CatalogReference catalogName="None" entryName="x"/>'
+    file = write(tmp_path, entities=body("Ego") + place.format(reference))
+    if message:
+        with pytest.raises(InputError, match=message) as caught:
+            play(file, {})
+        assert caught.value.legal
+    else:
+        assert play(file, {}).others[0].shape.length == 4
