@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Following, Motion, Running
 from safevar_sumo.openscenario.document import (
     Element,
@@ -106,12 +107,15 @@ def speed_action(player: Player, action: Element, actor: Actor) -> list[Running]
         other = player.other(target)
         if truth(target, "continuous"):
             raise unsupported(
-                "SpeedAction: RelativeTargetSpeed with continuous = true is not supported"
+                "SpeedAction: RelativeTargetSpeed with continuous = true is not supported",
+                "continuous = false",
             )
         value = _relative_speed(target, other.speed_now)
         player.depends(other, player.now, f"{actor.name}'s speed relative to {other.name}'s")
     if value < 0:
-        raise unsupported(f"{actor.name} drives backwards ({value:.2f} m/s)")
+        raise unsupported(
+            f"{actor.name} drives backwards ({value:.2f} m/s)", "a speed of at least 0"
+        )
     dynamics = part(action, "SpeedActionDynamics")
     transition = transition_of(dynamics, value - start, (start + value) / 2)
     if actor is player.ego:
@@ -144,7 +148,10 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
     """LongitudinalDistanceAction: at once at a distance, which is kept if it is continuous."""
     other = player.other(action)
     if action.find("DynamicConstraints") is not None:
-        raise unsupported("LongitudinalDistanceAction with DynamicConstraints is not supported")
+        raise unsupported(
+            "LongitudinalDistanceAction with DynamicConstraints is not supported",
+            "one without them, which acts at once",
+        )
     leads = action.get("displacement", "leadingReferencedEntity") != "trailingReferencedEntity"
     follower = other if leads else actor
     gap = number(action, "distance", math.nan)
@@ -186,7 +193,10 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
     goal = player.place(part(action, "TargetPositionMaster/*"))
     time, speed_there = _arrival(player, master, master.here.way_to(goal))
     if not 0 < time < math.inf:
-        raise unsupported(f"SynchronizeAction: {master.name} does not move towards its position")
+        raise unsupported(
+            f"SynchronizeAction: {master.name} does not move towards its position",
+            "a position ahead of it, and a speed above 0",
+        )
     way = actor.here.way_to(player.place(part(action, "TargetPosition/*")))
     final = way / time
     steady_time = 0.0
@@ -195,19 +205,27 @@ def synchronize_action(player: Player, action: Element, actor: Actor) -> list[Ru
         final = number(target, "value")
         if target.tag == "RelativeSpeedToMaster":
             if master is not player.ego:
-                raise unsupported(f"RelativeSpeedToMaster: {master.name} may change its speed")
+                raise unsupported(
+                    f"RelativeSpeedToMaster: {master.name} may change its speed",
+                    "a master that is the vehicle under test",
+                )
             final = _relative_speed(target, speed_there)
         for steady in target:
             is_way = steady.tag == "TargetDistanceSteadyState"
             steady_way = number(steady, "distance") if is_way else number(steady, "time") * final
             steady_time = steady_way / final if final else 0.0
     if final < 0:
-        raise unsupported(f"{actor.name} drives backwards ({final:.2f} m/s)")
+        raise unsupported(
+            f"{actor.name} drives backwards ({final:.2f} m/s)", "a final speed of at least 0"
+        )
     until = time - steady_time
     rest = way - steady_way
     if rest < -1e-6 or until < -1e-6:
         where = f"{way:.1f} m and {time:.1f} s before its position"
-        raise unsupported(f"SynchronizeAction: {actor.name} is {where}, within its steady state")
+        raise unsupported(
+            f"SynchronizeAction: {actor.name} is {where}, within its steady state",
+            "a position farther away, or a shorter steady state",
+        )
     player.masters[master.name] = player.now + time, actor.name
     player.depends(
         master, player.now + until, f"{actor.name}'s SynchronizeAction with {master.name}"
@@ -245,7 +263,10 @@ def _approach(
         return lambda time: final * np.clip((time - until + ramp) / ramp, 0.0, 1.0)
     middle = 2 * way / until - (start + final) / 2
     if middle < 0:
-        raise unsupported(f"SynchronizeAction: {actor.name} would have to drive backwards")
+        raise unsupported(
+            f"SynchronizeAction: {actor.name} would have to drive backwards",
+            "a final speed with which the way takes as long",
+        )
     if not start:
         player.remark(
             f"{actor.name} begins to move at once: it has only {until:.2f} s for {way:.2f} m"
@@ -295,7 +316,10 @@ def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Ru
 
 def _way_of(action: Element, actor: Actor) -> Way:
     if not isinstance(actor.here.path, Way):
-        raise unsupported(f"{action.tag} of {actor.name}, which is not on a road")
+        raise unsupported(
+            f"{action.tag} of {actor.name}, which is not on a road",
+            "an actor whose position is on a road",
+        )
     return actor.here.path
 
 
@@ -327,7 +351,10 @@ def _sideways(player: Player, actor: Actor, goal: float, transition: Transition)
 def teleport_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """TeleportAction."""
     if player.sample:
-        raise unsupported(f"TeleportAction of {actor.name} after the start: no body jumps")
+        raise unsupported(
+            f"TeleportAction of {actor.name} after the start: no body jumps",
+            "a TeleportAction in Init",
+        )
     actor.at = player.place(part(action, "Position/*"))
     return []
 
@@ -351,7 +378,9 @@ def _go_on(actor: Actor, way: Way) -> list[Running]:
         there = here.path.road_at(here.distance, here.left)
         distance = way.distance_to(there.road.id, there.s)
         if distance is None:
-            raise unsupported(f"{actor.name} is not on its route")
+            raise unsupported(
+                f"{actor.name} is not on its route", "a route that begins with its road"
+            )
         actor.at = here._replace(path=way, distance=distance)
     return []
 
@@ -368,13 +397,16 @@ def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> l
     if timing is None:
         return []
     if not line.times:
-        raise unsupported("FollowTrajectoryAction with Timing: every vertex needs a time")
+        raise unsupported(
+            "FollowTrajectoryAction with Timing: every vertex needs a time", "Vertex with time"
+        )
     is_relative = timing.get("domainAbsoluteRelative") == "relative"
     begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
     times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
     if (np.diff(times) <= 0).any():
         raise unsupported(
-            "FollowTrajectoryAction with Timing: the times of the vertices do not grow"
+            "FollowTrajectoryAction with Timing: the times of the vertices do not grow",
+            "a larger time at each vertex",
         )
     now = player.now
     stations = np.asarray(line.stations)
@@ -454,9 +486,12 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         if leaf.tag == "EntityAction" and leaf.find("DeleteEntityAction") is not None:
             player.other(leaf).deleted = player.now  # class DeleteEntityAction
             return []
-        raise unsupported(f"{part(leaf, '*').tag if len(leaf) else leaf.tag} is not supported")
+        raise unsupported(
+            f"{part(leaf, '*').tag if len(leaf) else leaf.tag} is not supported",
+            one_of(["DeleteEntityAction", *IGNORED]),
+        )
     if leaf.tag not in PRIVATE:
-        raise unsupported(f"{leaf.tag} is not supported")
+        raise unsupported(f"{leaf.tag} is not supported", one_of([*PRIVATE, *IGNORED]))
     if player.ego in actors and player.has_begun and leaf.tag == "FollowTrajectoryAction":
         player.ignored.add(f"{leaf.tag} of {player.ego.name}")
         # It is a record of a run; the driving system drives anew.
@@ -466,6 +501,7 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         return []
     if player.sample and player.ego in actors and leaf.tag != "SpeedAction":
         raise unsupported(
-            f"{leaf.tag} of {player.ego.name} after the start: its driving system drives"
+            f"{leaf.tag} of {player.ego.name} after the start: its driving system drives",
+            "other actions of it in Init, and later SpeedActions alone",
         )
     return [running for actor in actors for running in PRIVATE[leaf.tag](player, leaf, actor)]

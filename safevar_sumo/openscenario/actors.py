@@ -121,7 +121,9 @@ class Actor:
     def here(self) -> Place:
         """Where it is now."""
         if self.at is None:
-            raise unsupported(f"{self.name} has no place in Init")
+            raise unsupported(
+                f"{self.name} has no place in Init", "a TeleportAction or a trajectory in Init"
+            )
         return self.at
 
     def begin(
@@ -268,7 +270,8 @@ class Actor:
         ):
             raise unsupported(
                 f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same"
-                " roads"
+                " roads",
+                "continuous = false, or entities on the same roads",
             )
         return other.distance[later] + by
 
@@ -293,11 +296,16 @@ def actors_of(root: Element, n_samples: int) -> Iterator[Actor]:
             (each for each in entity if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None
         )
         if body is None:
-            raise unsupported(f"{name} is no Vehicle, Pedestrian or MiscObject")
+            raise unsupported(
+                f"{name} is no Vehicle, Pedestrian or MiscObject",
+                "one of them, or a reference to a catalog",
+            )
         if any(
             each.tag != "TrailerRef" or each.get("entityRef") for each in body.findall("Trailer/*")
         ):
-            raise unsupported(f"the Trailer of {name} is not supported")
+            raise unsupported(
+                f"the Trailer of {name} is not supported", "a vehicle without a trailer"
+            )
         middle = part(body, "BoundingBox/Center")
         size = part(body, "BoundingBox/Dimensions")
         length = number(size, "length")

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
@@ -68,9 +69,12 @@ def _value(player: Player, condition: Element, window: slice) -> Array:
     if kind.tag == "ByValueCondition" and inner.tag in BY_VALUE:
         return BY_VALUE[inner.tag](player, inner, window)
     if kind.tag != "ByEntityCondition" or inner.tag not in BY_ENTITY:
-        raise unsupported(f"{inner.tag} is not supported")
+        raise unsupported(f"{inner.tag} is not supported", one_of([*BY_VALUE, *BY_ENTITY]))
     if inner.get("direction", "longitudinal") != "longitudinal":
-        raise unsupported(f"{inner.tag} with direction = {inner.get('direction')} is not supported")
+        raise unsupported(
+            f"{inner.tag} with direction = {inner.get('direction')} is not supported",
+            "direction = longitudinal",
+        )
     triggering = part(kind, "TriggeringEntities")
     actors = [player.other(each) for each in triggering.findall("EntityRef")]
     values = [
@@ -136,7 +140,7 @@ def parameter_condition(player: Player, condition: Element, window: slice) -> Ar
     values = player.variables if is_variable else player.document.values
     name = attribute(condition, "variableRef" if is_variable else "parameterRef").lstrip("$")
     if name not in values:
-        raise unsupported(f"the file declares no parameter {name}")
+        raise unsupported(f"the file declares no parameter {name}", one_of(values))
     holds = compare(attribute(condition, "rule"), values[name], attribute(condition, "value"))
     return np.full(window.stop - window.start, holds)
 
@@ -165,7 +169,10 @@ def time_to_collision_condition(
     """TimeToCollisionCondition: the distance over the speed at which it shrinks [s]."""
     target = condition.find("TimeToCollisionConditionTarget/EntityRef")
     if target is None:
-        raise unsupported("TimeToCollisionCondition with a position is not supported")
+        raise unsupported(
+            "TimeToCollisionCondition with a position is not supported",
+            "an EntityRef as its target",
+        )
     other = player.other(target)
     closing = actor.speed[window] - _along(actor, other, window)
     return compared(condition, _time(distance(condition, actor, other, window), closing))
@@ -194,7 +201,9 @@ def reach_position_condition(
 def distance_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """DistanceCondition: from a position [m]; the bodies' ends do not count."""
     if truth(condition, "freespace"):
-        raise unsupported("DistanceCondition with freespace = true is not supported")
+        raise unsupported(
+            "DistanceCondition with freespace = true is not supported", "freespace = false"
+        )
     gap = (
         player.place(part(condition, "Position/*")).pose.place - actor.place[window]
     ) / actor.facing[window]
@@ -237,7 +246,9 @@ def never(player: Player, condition: Element, actor: Actor, window: slice) -> Ar
 def offroad_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """OffroadCondition: Ego drives straight on in its lane."""
     if actor is not player.ego:
-        raise unsupported(f"OffroadCondition of {actor.name} is not supported")
+        raise unsupported(
+            f"OffroadCondition of {actor.name} is not supported", "one of the vehicle under test"
+        )
     return never(player, condition, actor, window)
 
 
@@ -251,7 +262,10 @@ def distance(condition: Element, actor: Actor, other: Actor, window: slice) -> A
     is_free = truth(condition, "freespace")
     kind = condition.get("relativeDistanceType", "longitudinal")
     if is_free and kind not in ("longitudinal", "lateral"):
-        raise unsupported(f"{condition.tag} with {kind} and freespace = true is not supported")
+        raise unsupported(
+            f"{condition.tag} with {kind} and freespace = true is not supported",
+            "longitudinal or lateral, or freespace = false",
+        )
     if _is_along_road(condition, kind, actor):
         return _along_road(condition, actor, other, window, is_free)
     apart, reach = bodies_apart(actor, other, window)
@@ -303,7 +317,10 @@ def _along_road(
     own = actor.here.path
     its = other.here.path
     if not (isinstance(own, Way) and isinstance(its, Way) and own.chain == its.chain):
-        raise unsupported(f"{condition.tag} along a road, of entities on different roads")
+        raise unsupported(
+            f"{condition.tag} along a road, of entities on different roads",
+            "entities on the same roads, or coordinateSystem = entity",
+        )
     gap = other.distance[window] - actor.distance[window]
     if not is_free:
         return np.abs(gap)

@@ -64,7 +64,7 @@ def attribute(element: Element, name: str) -> str:
     """An attribute that an element must have."""
     value = element.get(name)
     if value is None:
-        raise unsupported(f"{element.tag} has no {name}")
+        raise unsupported(f"{element.tag} has no {name}", f"{name} = ..., as the schema says")
     return value
 
 
@@ -115,7 +115,9 @@ def part(element: Element, path: str) -> Element:
     """The element at a path that must be there; with `/*` at its end the first one below."""
     found = element.find(path)
     if found is None:
-        raise unsupported(f"{element.tag} has no {path}")
+        raise unsupported(
+            f"{element.tag} has no {path}", f"the element {path} in it, as the schema says"
+        )
     return found
 
 
@@ -266,7 +268,9 @@ def _name_members(root: Element) -> None:
         for one in root.findall("Entities/EntitySelection")
     }
     if root.find("Entities/EntitySelection/Members/ByType") is not None:
-        raise unsupported("EntitySelection with ByType is not supported")
+        raise unsupported(
+            "EntitySelection with ByType is not supported", "EntityRef for each member"
+        )
     for parent in root.iter() if members else ():
         if parent.tag in ("Actors", "TriggeringEntities"):
             parent[:] = [

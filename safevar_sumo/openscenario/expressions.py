@@ -100,7 +100,11 @@ def evaluate(expression: str, values: Values) -> Any:
         text = NAME.sub(lambda match: f"({_value(match[1], values)})", expression)
         return _evaluated(ast.parse(text.strip(), mode="eval").body)
     except (SyntaxError, ValueError, ArithmeticError, TypeError, KeyError, RecursionError) as error:
-        raise InputError("", f"the expression ${{{expression}}} has no value: {error}") from None
+        raise InputError(
+            "",
+            f"the expression ${{{expression}}} has no value: {error}",
+            "an expression of declared parameters and numbers",
+        ) from None
 
 
 def _evaluated(node: ast.expr) -> Any:

@@ -131,7 +131,10 @@ def _choice(each: Element) -> Choice:
             lower = number(limits, "lowerLimit")
             upper = number(limits, "upperLimit")
             if not (step > 0 and lower <= upper and (upper - lower) / step < MOST_STEPS):
-                raise unsupported(f"{_name(each)}: a range from {lower:g} to {upper:g} by {step:g}")
+                raise unsupported(
+                    f"{_name(each)}: a range from {lower:g} to {upper:g} by {step:g}",
+                    f"a step above 0, and at most {MOST_STEPS:,} of them between growing limits",
+                )
             count = math.floor((upper - lower) / step + 1e-9) + 1
             values = (round(lower + k * step, 9) for k in range(count))
             return Choice((_name(each),), tuple((repr(value),) for value in values), (lower, upper))
@@ -139,9 +142,15 @@ def _choice(each: Element) -> Choice:
             sets = [{_reference(one): attribute(one, "value") for one in own} for own in content]
             names = tuple(sets[0]) if sets else ()
             if any(own.keys() != {*names} for own in sets):
-                raise unsupported("ValueSetDistribution: its sets name different parameters")
+                raise unsupported(
+                    "ValueSetDistribution: its sets name different parameters",
+                    "the same parameters in each set",
+                )
             return _filled(Choice(names, tuple(tuple(own[name] for name in names) for own in sets)))
-    raise unsupported(f"{content.tag} is not supported")
+    raise unsupported(
+        f"{content.tag} is not supported",
+        "DistributionSet, DistributionRange or ValueSetDistribution",
+    )
 
 
 def _name(element: Element) -> str:
@@ -154,7 +163,7 @@ def _reference(element: Element) -> str:
 
 def _filled(choice: Choice) -> Choice:
     if not (choice.names and choice.sets):
-        raise unsupported("a distribution without values is not supported")
+        raise unsupported("a distribution without values is not supported", "one value at least")
     return choice
 
 

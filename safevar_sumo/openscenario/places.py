@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
 from safevar_sumo.openscenario.lines import Curved, Line, Piece, Pose, unit
 from safevar_sumo.openscenario.road import Network, Road
@@ -178,7 +179,10 @@ class Place(NamedTuple):
         elif path == goal.path:
             return goal.distance - self.distance
         if not path.is_straight:
-            raise unsupported("a position that is not on its actor's path, which bends")
+            raise unsupported(
+                "a position that is not on its actor's path, which bends",
+                "a position on the road of its actor",
+            )
         here = path.pose(self.distance)
         return float(((goal.pose.place - here.place) * here.facing.conjugate()).real)
 
@@ -208,7 +212,8 @@ def on_road(
     """
     if not -1e-9 <= s <= road.length + 1e-9:
         raise unsupported(
-            f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long"
+            f"s = {s:.1f} m is not on road {road.id}, which is {road.length:.0f} m long",
+            f"s from 0 to {road.length:.0f} m",
         )
     along = road.line.pose(s).facing
     turn = oriented(facing, -along if against else along) / along
@@ -222,7 +227,7 @@ def place_of(position: Element, network: Network, entity: Entity) -> Place:
     entity.
     """
     if position.tag not in POSITIONS:
-        raise unsupported(f"{position.tag} is not supported")
+        raise unsupported(f"{position.tag} is not supported", one_of(POSITIONS))
     return POSITIONS[position.tag](position, network, entity)
 
 
@@ -261,7 +266,10 @@ def of_reference(target: Element, entity: Entity) -> Crossing:
     """Where the entity that a position or a target refers to is on its road."""
     place = entity(attribute(target, "entityRef"))
     if not isinstance(place.path, Way):
-        raise unsupported(f"{target.tag} refers to an entity that is not on a road")
+        raise unsupported(
+            f"{target.tag} refers to an entity that is not on a road",
+            "an entity whose position is on a road",
+        )
     return place.path.road_at(place.distance, place.left)
 
 
@@ -320,7 +328,9 @@ def route_position(position: Element, network: Network, entity: Entity) -> Place
                 where, "laneOffset", 0.0
             )
         case _:
-            raise unsupported(f"{where.tag} is not supported")
+            raise unsupported(
+                f"{where.tag} is not supported", "FromRoadCoordinates or FromLaneCoordinates"
+            )
     return _turned(Place(way, distance, left), position.find("Orientation"))
 
 
@@ -353,7 +363,7 @@ def neighbour(lane: int, by: int) -> int:
 
 
 def _nobody(name: str) -> Place:
-    raise unsupported(f"a route refers to the entity {name}")
+    raise unsupported(f"a route refers to the entity {name}", "waypoints on roads")
 
 
 def way_of(route: Element, network: Network) -> Way:
@@ -371,7 +381,9 @@ def way_through(places: Sequence[Place], network: Network) -> Way:
     """The roads of the shortest chain from place to place."""
     ways = tuple(place.path.chain[0] for place in places if isinstance(place.path, Way))
     if len(ways) < len(places) or not ways:
-        raise unsupported("a route has a waypoint that is not on a road")
+        raise unsupported(
+            "a route has a waypoint that is not on a road", "LanePosition or RoadPosition"
+        )
     options = [ways[:1]]
     if len(ways) > 1:  # in which direction the first road is driven
         name = ways[0][0]
@@ -404,7 +416,10 @@ def _extended(network: Network, options: Sequence[Chain], end: str) -> Chain:
             return option
         if len(option) <= most:
             queue += [(*option, way) for way in network.ways(*option[-1])]
-    raise unsupported(f"no route leads from road {options[0][-1][0]} to road {end}")
+    raise unsupported(
+        f"no route leads from road {options[0][-1][0]} to road {end}",
+        f"at most {MAX_DETOUR} roads between two waypoints",
+    )
 
 
 def line_of(
@@ -425,7 +440,8 @@ def line_of(
             return Line([Piece(pose, length, first, first + slope * length)])
     raise unsupported(
         f"the trajectory's {shape.tag} is not supported; supported: Polyline, Clothoid,"
-        " ClothoidSpline"
+        " ClothoidSpline",
+        "Polyline, Clothoid or ClothoidSpline",
     )
 
 
@@ -462,7 +478,8 @@ def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | N
             pose = place_of(part(begin, "*"), network, entity).pose
         if pose is None:
             raise unsupported(
-                "a ClothoidSpline without a start in the plane, which no actor follows"
+                "a ClothoidSpline without a start in the plane, which no actor follows",
+                "PositionStart in its first segment",
             )
         curvatures = (number(segment, name) for name in ("curvatureStart", "curvatureEnd"))
         piece = Piece(pose, number(segment, "length"), *curvatures)

@@ -64,7 +64,8 @@ class Player:
         """The entity of this name."""
         if name not in self.actors:
             raise unsupported(
-                f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}"
+                f"no ScenarioObject is named {name!r}; there are: {', '.join(self.actors)}",
+                one_of(self.actors),
             )
         return self.actors[name]
 

@@ -43,7 +43,7 @@ class Road:
     def line(self) -> Line:
         """The reference line."""
         if self.flaw:
-            raise unsupported(self.flaw)
+            raise unsupported(self.flaw, "a road that can be driven")
         return Line(self.pieces)
 
     @property
@@ -55,7 +55,10 @@ class Road:
         """The t of a lane's middle [m]; that of lane 0 is its offset."""
         start, lanes = self._section(s)
         if lane and lane not in lanes:
-            raise unsupported(f"road {self.id} has no lane {lane} at s = {s:.1f} m")
+            raise unsupported(
+                f"road {self.id} has no lane {lane} at s = {s:.1f} m",
+                f"one of {', '.join(map(str, sorted(lanes)))}",
+            )
         sign = 1 if lane > 0 else -1
         widths = [_cubic(lanes[sign * k], s - start) for k in range(1, abs(lane) + 1)]
         return _cubic(self.offsets, s) + sign * (sum(widths) - (widths[-1] / 2 if widths else 0.0))
@@ -101,7 +104,7 @@ class Network:
     def road(self, name: str) -> Road:
         """The road of this id."""
         if name not in self.roads:
-            raise unsupported(f"{self.name} has no road {name}")
+            raise unsupported(f"{self.name} has no road {name}", one_of(self.roads))
         return self.roads[name]
 
     def ways(self, road: str, is_forward: bool) -> list[tuple[str, bool]]:
@@ -157,7 +160,7 @@ def read_network(file: str) -> Network:
 def _network(file: str, modified: int) -> Network:
     root = root_of(file)
     if root.tag != "OpenDRIVE":
-        raise unsupported(f"{file!r} is no OpenDRIVE file")
+        raise unsupported(f"{file!r} is no OpenDRIVE file", "a file whose root is OpenDRIVE")
     roads = {attribute(element, "id"): _road(element) for element in root.findall("road")}
     junctions = {
         attribute(junction, "id"): [
@@ -241,4 +244,4 @@ def _piece(geometry: Element, road: str) -> Curved:
             case "userData" | "include" | "dataQuality":
                 continue
         raise unsupported(f"the road {road} has a {shape.tag}", one_of(SHAPES))
-    raise unsupported(f"the road {road} has a geometry without shape")
+    raise unsupported(f"the road {road} has a geometry without shape", one_of(SHAPES))

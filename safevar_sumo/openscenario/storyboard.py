@@ -114,7 +114,10 @@ class Storyboard(Player):
             actors = part(group, "Actors")
             group_key = _below(act_key, group)
             if truth(actors, "selectTriggeringEntities"):
-                raise unsupported("Actors with selectTriggeringEntities = true is not supported")
+                raise unsupported(
+                    "Actors with selectTriggeringEntities = true is not supported",
+                    "selectTriggeringEntities = false, and EntityRef for each actor",
+                )
             own = [self.other(each) for each in actors.findall("EntityRef")]
             for maneuver in group.findall("Maneuver"):
                 key = _below(group_key, maneuver)

@@ -253,7 +253,9 @@ def _points(rest: Source, given: Parameters) -> list[Parameters]:
             raise _too_many(rest, total)
     if not points:
         raise InputError(
-            "scenario", "the file's constraints exclude every combination of its values"
+            "scenario",
+            "the file's constraints exclude every combination of its values",
+            "values that they allow",
         )
     return points
 
