@@ -3,7 +3,7 @@ its speed.
 """
 
 from safevar_sumo.openscenario.actors import STEP as STEP
-from safevar_sumo.openscenario.document import read as read
+from safevar_sumo.openscenario.document import MOST as MOST, read as read
 from safevar_sumo.openscenario.expressions import text_of as text_of
 from safevar_sumo.openscenario.logical import (
     Source as Source,

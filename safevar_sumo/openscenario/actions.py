@@ -496,8 +496,7 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
         player.ignored.add(f"{leaf.tag} of {player.ego.name}")
         # It is a record of a run; the driving system drives anew.
         line = line_of(_trajectory(leaf), player.network, player.place_of)
-        every = np.linspace(0.0, line.length, round(line.length) + 2)
-        player.refuse_turn(line.pose(every).place)
+        player.refuse_turn(line.samples)
         return []
     if player.sample and player.ego in actors and leaf.tag != "SpeedAction":
         raise unsupported(

@@ -9,7 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported
+from safevar_sumo.errors import InputError
+from safevar_sumo.openscenario.document import (
+    FILE_KEY,
+    Element,
+    attribute,
+    number,
+    part,
+    unsupported,
+)
 from safevar_sumo.openscenario.lines import Line, Pose
 from safevar_sumo.openscenario.places import Place, Way
 
@@ -53,6 +61,10 @@ class Motion(NamedTuple):
     since: float
     value: Callable[[Array], Array]
     until: float | None = None
+
+
+class Unplaced(InputError):
+    """An entity has no place yet."""
 
 
 @dataclass
@@ -121,9 +133,8 @@ class Actor:
     def here(self) -> Place:
         """Where it is now."""
         if self.at is None:
-            raise unsupported(
-                f"{self.name} has no place in Init", "a TeleportAction or a trajectory in Init"
-            )
+            problem = f"{self.name} has no place in Init"
+            raise Unplaced(FILE_KEY, problem, "a TeleportAction or a trajectory in Init")
         return self.at
 
     def begin(

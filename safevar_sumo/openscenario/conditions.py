@@ -31,7 +31,7 @@ LEFT_TO_RUNS = frozenset((*REACTIONS, "EndOfRoadCondition", "OffroadCondition"))
 
 def compared(condition: Element, values: Array) -> Array:
     """Where values satisfy the condition's rule."""
-    return RULES[condition.get("rule", "equalTo")](values, number(condition, "value"))
+    return RULES[attribute(condition, "rule")](values, number(condition, "value"))
 
 
 def holds(player: Player, trigger: Element | None, window: slice) -> Array:

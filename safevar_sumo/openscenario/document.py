@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import os
 import tomllib
 import xml.etree.ElementTree as ElementTree
@@ -18,6 +17,7 @@ from defusedxml.ElementTree import ParseError, parse
 
 from safevar_sumo.errors import InputError, one_of, unknown_name
 from safevar_sumo.openscenario.expressions import Values, compare, literal
+from safevar_sumo.openscenario.guard import guarded
 
 Element: TypeAlias = "ElementTree.Element[str]"
 
@@ -28,7 +28,13 @@ LEGAL = tomllib.loads(Path(__file__).with_name("legal.toml").read_text(encoding=
 SIZE = "at least 0"
 
 
-def unsupported(problem: str, legal: str = "") -> InputError:
+MOST = 1e9
+"""Largest size of a number: beyond it sums lose their places."""
+MOST_DEPTH = 100
+"""Elements within each other at most; the schemas need fewer than 30."""
+
+
+def unsupported(problem: str, legal: str) -> InputError:
     """The refusal of a file, in a sentence that names the element."""
     return InputError(FILE_KEY, problem, legal)
 
@@ -50,6 +56,12 @@ def _parsed(file: str, modified: int, size: int) -> Element:
         root: Element = parse(file, forbid_dtd=True).getroot()
         for element in root.iter():
             element.tag = element.tag.rpartition("}")[2]  # without a namespace
+        level = [root]
+        for _ in range(MOST_DEPTH):
+            level = [child for element in level for child in element]
+        if level:
+            problem = f"{file!r} has elements within each other, {MOST_DEPTH} and more"
+            raise unsupported(problem, f"up to {MOST_DEPTH}")
         return root
     except DefusedXmlException as error:
         problem = f"{file!r} has a document type or entities ({type(error).__name__})"
@@ -74,14 +86,16 @@ def number(element: Element, name: str, default: float | None = None) -> float:
         return default
     text = literal(attribute(element, name), {})
     if not is_number(text):
-        raise unsupported(f"{element.tag}: {name} = {text!r}", "a finite number")
+        raise unsupported(
+            f"{element.tag}: {name} = {text[:80]!r}", f"a finite number, at most {MOST:g}"
+        )
     return float(text)
 
 
 def is_number(text: str) -> bool:
-    """Whether a text is a finite number."""
+    """Whether a text is a number that is not too large."""
     try:
-        return math.isfinite(float(text))
+        return "_" not in text and abs(float(text)) <= MOST
     except ValueError:
         return False
 
@@ -122,15 +136,18 @@ def part(element: Element, path: str) -> Element:
 
 
 class Parameter(NamedTuple):
-    """A declared parameter, its value as written, and its constraints: groups of a rule and a limit
-    each.
+    """A declared parameter, its value as written, whether it is a whole number, and its
+    constraints: groups of a rule and a limit each.
     """
 
     name: str
     text: str
+    is_whole: bool
     groups: tuple[tuple[tuple[str, str], ...], ...]
 
 
+WHOLE = ("integer", "int", "unsignedInt", "unsignedShort")
+"""Types of whole numbers."""
 GROUPS_OF_CONSTRAINTS = ("ConstraintGroup", "ValueConstraintGroup")
 """Elements of a parameter's constraints: by the schema, and by its class."""
 
@@ -141,6 +158,7 @@ def declared(element: Element) -> list[Parameter]:
         Parameter(
             attribute(each, "name").lstrip("$"),
             attribute(each, "value"),
+            each.get("parameterType") in WHOLE,
             tuple(
                 tuple((attribute(rule, "rule"), attribute(rule, "value")) for rule in group)
                 for group in each
@@ -192,7 +210,7 @@ def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
     they are all `equalTo`, else by "and".
     """
     problems = []
-    for name, _, groups in parameters:
+    for name, _, _, groups in parameters:
         results = [
             all(compare(rule, values[name], literal(limit, values)) for rule, limit in group)
             for group in groups
@@ -201,6 +219,10 @@ def violated(parameters: Sequence[Parameter], values: Values) -> list[str]:
         if results and not (any(results) if has_choices else all(results)):
             problems.append(f"{name} = {values[name]}")
     return problems
+
+
+MINORS = (0, 1, 2, 3)
+"""Versions 1.0 to 1.3."""
 
 
 class Document(NamedTuple):
@@ -215,6 +237,7 @@ class Document(NamedTuple):
     road: str
 
 
+@guarded
 def read(file: str, given: Mapping[str, str]) -> Document:
     """Read a concrete file with some of its parameters set.
 
@@ -229,6 +252,9 @@ def read(file: str, given: Mapping[str, str]) -> Document:
         raise unsupported(
             f"{file!r} is no OpenSCENARIO XML 1.x", "a file with FileHeader revMajor = 1"
         )
+    if whole(header, "revMinor") not in MINORS:
+        problem = f"FileHeader: revMinor = {header.get('revMinor')!r}"
+        raise unsupported(problem, f"one of {', '.join(map(str, MINORS))}")
     if root.find("Storyboard") is None:
         raise unsupported(
             f"{file!r} has no Storyboard", "a scenario, or a file of parameter values"
@@ -244,7 +270,7 @@ def read(file: str, given: Mapping[str, str]) -> Document:
     # An orientation without a type is absolute up to version 1.2, and relative from 1.3 on.
     for orientation in root.iter("Orientation"):
         orientation.attrib.setdefault(
-            "type", "relative" if number(header, "revMinor", 0.0) >= 3 else "absolute"
+            "type", "relative" if whole(header, "revMinor") >= 3 else "absolute"
         )
     check_unique([attribute(one, "name") for one in root.findall("Entities/*")], "entities")
     _name_members(root)

@@ -64,6 +64,8 @@ def literal(text: str, values: Values) -> str:
     if text.startswith("${") and text.endswith("}"):
         found = evaluate(text[2:-1], values)
         return str(found).lower() if isinstance(found, bool) else repr(found)
+    if text.startswith("${"):
+        raise InputError("", f"the expression {text} is not closed", "a brace } at its end")
     if text.startswith("$"):
         return _value(text[1:], values)
     return text

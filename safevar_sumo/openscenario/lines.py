@@ -17,6 +17,8 @@ LEAST_TURN = 1e-9
 """Turn of a curve by its change of curvature below which it is an arc, or a line [rad]."""
 STRAIGHT = 1e-6
 """Largest turn of a straight line [rad]."""
+MOST_SAMPLES = 10_000
+"""Number of places at which a line is sampled at most."""
 Number = Any
 """A number or an array of them, real or complex."""
 
@@ -186,8 +188,14 @@ class Line:
     def stray(self) -> float:
         """How far the line leaves the straight line along its first direction [m]."""
         first = self.pose(0.0)
-        every = np.linspace(0.0, self.length, round(self.length) + 2)
-        return float(np.abs(((self.pose(every).place - first.place) / first.facing).imag).max())
+        return float(np.abs(((self.samples - first.place) / first.facing).imag).max())
+
+    @property
+    def samples(self) -> Number:
+        """Places along the line, one each metre, or `MOST_SAMPLES`."""
+        return self.pose(
+            np.linspace(0.0, self.length, min(round(self.length) + 2, MOST_SAMPLES))
+        ).place
 
     def _piece_at(self, distance: Number) -> Number:
         return np.clip(

@@ -27,6 +27,7 @@ from safevar_sumo.openscenario.document import (
     violated,
 )
 from safevar_sumo.openscenario.expressions import literal
+from safevar_sumo.openscenario.guard import guarded
 
 FloatArray = Any
 """An array of numbers."""
@@ -46,12 +47,13 @@ class Choice(NamedTuple):
 
 
 class Source(NamedTuple):
-    """What a file offers: the concrete file, its parameters with their values, and the choices of a
-    logical one.
+    """What a file offers: the concrete file, its parameters with their values, which of them are
+    whole numbers, and the choices of a logical one.
     """
 
     concrete: str
     values: dict[str, str]
+    whole_numbers: list[str]
     choices: list[Choice]
 
     def combinations(self, given: Mapping[str, str]) -> Iterator[dict[str, str]]:
@@ -85,6 +87,7 @@ class Source(NamedTuple):
         return next((choice.ends for choice in self.choices if choice.names == (name,)), None)
 
 
+@guarded
 def open_file(file: str) -> Source:
     """A concrete or a logical file.
 
@@ -114,7 +117,8 @@ def open_file(file: str) -> Source:
         name: choice.sets[0][place] for choice in choices for place, name in enumerate(choice.names)
     }
     values_of(declarations, given, {})  # refuses names that the file does not declare
-    return Source(concrete, values_of(declarations, {}, {}), choices)
+    whole_numbers = [one.name for one in declarations if one.is_whole]
+    return Source(concrete, values_of(declarations, {}, {}), whole_numbers, choices)
 
 
 def _choice(each: Element) -> Choice:
@@ -217,7 +221,7 @@ def constraints_of(
 
     middle = (low + high) / 2
     half = (high - low) / 2
-    for name, _, groups in declarations:
+    for name, _, _, groups in declarations:
         for rule, limit in chain(*groups):
             if rule not in KINDS:
                 continue

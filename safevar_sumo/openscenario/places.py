@@ -27,6 +27,8 @@ STRAY = 0.05
 """How far a straight line is left at most where somebody drives straight on [m]."""
 LANE_STEP = 0.5
 """Distance between two places of a lane's line [m]."""
+LONGEST_LANE = 30_000.0
+"""How far a lane's line is followed [m]."""
 MAX_SHIFT = 0.5
 """Largest shift of a lane's middle between two of these places [m]; a lane that goes farther ends.
 """
@@ -134,7 +136,8 @@ class Way(Line):
 
         Where the lanes of a road have other numbers than before, the lane goes on in the nearest.
         """
-        distances = np.arange(distance, self.length + LANE_STEP, LANE_STEP)
+        end = min(self.length, distance + LONGEST_LANE) + LANE_STEP
+        distances = np.arange(distance, end, LANE_STEP)
         lefts = []
         middle = self.lane_left(self.lane_at(distance, left), distance)
         for at in distances:
@@ -447,6 +450,7 @@ def line_of(
 
 def _polyline(shape: Element, network: Network, entity: Entity) -> Line:
     """Class Polyline: straight from vertex to vertex; who stands at one place has several there."""
+    part(shape, "Vertex")  # one at least
     positions = [(vertex, part(vertex, "Position/*")) for vertex in shape.findall("Vertex")]
     poses = [place_of(position, network, entity).pose for _, position in positions]
     pieces = []
@@ -470,6 +474,7 @@ def _clothoids(shape: Element, network: Network, entity: Entity, start: Pose | N
     """Class ClothoidSpline: one segment after another, from where its actor is unless a start is
     given.
     """
+    part(shape, "ClothoidSplineSegment")  # one at least
     pieces = []
     pose = start
     for segment in shape.findall("ClothoidSplineSegment"):

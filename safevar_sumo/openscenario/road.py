@@ -42,9 +42,13 @@ class Road:
     @cached_property
     def line(self) -> Line:
         """The reference line."""
-        if self.flaw:
-            raise unsupported(self.flaw, "a road that can be driven")
+        self.check()
         return Line(self.pieces)
+
+    def check(self) -> None:
+        """Refuse a road on which nobody can be."""
+        if self.flaw:
+            raise unsupported(self.flaw, f"a road of widths, and of {one_of(SHAPES)}")
 
     @property
     def length(self) -> float:
@@ -80,6 +84,7 @@ class Road:
         )
 
     def _section(self, s: float) -> tuple[float, dict[int, Cubics]]:
+        self.check()
         return next(
             (one for one in reversed(self.sections) if one[0] <= s + 1e-9), self.sections[0]
         )
@@ -189,30 +194,35 @@ def _road(element: Element) -> Road:
         for link in element.findall("link/*")
         if link.tag in ("predecessor", "successor")
     }
-    sections = [
-        (
-            number(section, "s"),
-            {
-                whole: _cubics(lane, "width", "sOffset")
-                for lane in section.iter("lane")
-                if (whole := int(attribute(lane, "id")))
-            },
-        )
-        for section in element.findall("lanes/laneSection")
-    ]
-    offsets = _cubics(part(element, "lanes"), "laneOffset", "s")
-    pieces = []
+    pieces: list[Curved] = []
+    sections: list[tuple[float, dict[int, Cubics]]] = []
+    offsets: Cubics = []
     flaw = ""
     try:
         pieces = [_piece(each, name) for each in element.findall("planView/geometry")]
+        offsets = _cubics(part(element, "lanes"), "laneOffset", "s")
+        sections = [_section(each, name) for each in element.findall("lanes/laneSection")]
     except InputError as error:
         flaw = error.problem
+    if not flaw and not (pieces and sections):
+        flaw = f"the road {name} has no {'laneSection' if pieces else 'geometry'}"
     if element.find("lanes//border") is not None:
         flaw = f"the road {name} has lanes with borders; supported: width"
     heights = [*element.iterfind("elevationProfile/*"), *element.iterfind("lateralProfile/*")]
     is_level = not any(number(one, key, 0.0) for one in heights for key in "bcd")
     is_left_hand = element.get("rule") == "LHT"
     return Road(name, pieces, flaw, sections, offsets, links, is_left_hand, is_level)
+
+
+def _section(element: Element, road: str) -> tuple[float, dict[int, Cubics]]:
+    """A section of lanes: where it begins, and the widths of its lanes."""
+    lanes = {whole(lane, "id"): _cubics(lane, "width", "sOffset") for lane in element.iter("lane")}
+    lanes.pop(0, None)
+    for lane in lanes:
+        inner = lane - 1 if lane > 0 else lane + 1
+        if inner and inner not in lanes:
+            raise unsupported(f"the road {road} has a lane {lane} without {inner}", "all lanes")
+    return number(element, "s"), lanes
 
 
 def _cubics(element: Element, tag: str, start: str) -> Cubics:

@@ -9,9 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
 from safevar_sumo.openscenario.conditions import bodies_apart
 from safevar_sumo.openscenario.document import is_number, read, refuse_violated, unsupported, whole
+from safevar_sumo.openscenario.guard import guarded
 from safevar_sumo.openscenario.lines import Pose
 from safevar_sumo.openscenario.places import Way
 from safevar_sumo.openscenario.storyboard import Storyboard
@@ -67,7 +69,7 @@ def play(file: str, values: Mapping[str, str], ego: str = "Ego", every: int = 1)
     key = file, ego, every, tuple(sorted(values.items()))
     played, stamps = _SCENES.pop(key, (None, []))
     if played is None or stamps != _stamps(played.files):
-        played = _play(file, values, ego, every)
+        played = guarded(_play)(file, values, ego, every)
         stamps = _stamps(played.files)
     _SCENES[key] = played, stamps  # the last one is the newest
     most = min(KEPT_SCENES, KEPT_SAMPLES // sum(len(one.speed) for one in played.others))
@@ -107,7 +109,11 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     document = read(file, values)
     refuse_violated(document.parameters, document.values)
     player = Storyboard(document, ego)
-    player.play()
+    try:
+        player.play()
+    except InputError:
+        player.refuse_bend()  # an Ego that turns cannot be helped by other changes
+        raise
     own = player.ego
     samples = slice(0, player.sample + 1)
     player.refuse_turn(own.place[samples])
@@ -181,6 +187,8 @@ def _moved(actor: Actor, samples: slice) -> Moved:
     )
     facing = actor.facing[samples]
     speed = actor.speed[samples]
+    if not np.isfinite(place).all():
+        raise unsupported(f"{actor.name} has no place", "numbers that can be added")
     kept = slice(None)
     if samples.step > 1:  # who goes on evenly needs no samples
         even = np.abs(np.diff(place) - samples.step * STEP * speed[1:] * facing[1:]) < EVEN

@@ -10,9 +10,8 @@ from itertools import chain
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
-from safevar_sumo.openscenario.actors import STEP, Actor, Running
+from safevar_sumo.openscenario.actors import STEP, Actor, Running, Unplaced
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import (
     Document,
@@ -45,6 +44,7 @@ class Event:
     """
 
     element: Element
+    group: Element
     key: Key
     outer: list[Key]
     actors: list[Actor]
@@ -123,10 +123,9 @@ class Storyboard(Player):
                 key = _below(group_key, maneuver)
                 outer = [key, group_key, act_key, story]
                 events += [
-                    Event(event, _below(key, event), outer, own)
+                    Event(event, group, _below(key, event), outer, own)
                     for event in maneuver.findall("Event")
                 ]
-                self._remark_repeats(group, maneuver)
         found = Act(element, act_key, events)
         self._note_reactions(found)
         return found
@@ -146,14 +145,26 @@ class Storyboard(Player):
                     f"the name of a storyboard's {kind}",
                 )
 
-    def _remark_repeats(self, group: Element, maneuver: Element) -> None:
-        for one in (group, *maneuver.findall("Event")):
-            times = number(one, "maximumExecutionCount", 1)
-            if times > 1:
-                kind = "event" if one.tag == "Event" else "group"
-                self.remark(
-                    f"the {kind} {attribute(one, 'name')} is played once, of up to {times:g} times"
-                )
+    def _refuse_repeats(self) -> None:
+        """Refuse events that could begin again, by a count of theirs or of their group."""
+        for event in (event for one in self.acts for event in one.events if event.moves):
+            for element in (event.element, event.group):
+                times = number(element, "maximumExecutionCount", 1)
+                key = event.key if element is event.element else event.outer[1]
+                if times <= 1:
+                    continue
+                kind = "event" if element is event.element else "group"
+                name = f"the {kind} {attribute(element, 'name')}"
+                ended = self.ended.get(key, math.inf)
+                again = round(min(ended / STEP, self.sample)) + 1
+                rest = slice(again, self.sample + 1)
+                holds(self, event.element.find("StartTrigger"), slice(1, again))
+                if holds(self, event.element.find("StartTrigger"), rest).any():
+                    raise unsupported(
+                        f"{name} could begin again after {ended:.1f} s, up to {times:g} times",
+                        "maximumExecutionCount = 1",
+                    )
+                self.remark(f"{name} is played once, of up to {times:g} times")
 
     def _note_reactions(self, one: Act) -> None:
         moving = [(event.key, event.element) for event in one.events if event.moves]
@@ -189,7 +200,7 @@ class Storyboard(Player):
             actor, action = privates.pop(0)
             try:
                 act(self, action, [actor])
-            except InputError:
+            except Unplaced:
                 if leaf_of(action).tag != "TeleportAction" or waiting == 1:
                     raise
                 places_left = sum(leaf_of(other).tag == "TeleportAction" for _, other in privates)
@@ -350,6 +361,7 @@ class Storyboard(Player):
                 actor.arrive(last)
             self.sample = last
         self._refuse_reactions()
+        self._refuse_repeats()
         if math.isinf(self.stop) and self.now >= longest:
             if longest == LONGEST:
                 legal = f"one that does, if {self.ego.name} keeps its speed"
@@ -374,6 +386,13 @@ class Storyboard(Player):
                         " its road"
                     )
         return self._straight_end(end)
+
+    def refuse_bend(self) -> None:
+        """Refuse an Ego whose way bends in the next seconds of driving."""
+        if self.has_begun:
+            last = self.sample + round(UNSTOPPED / STEP)
+            self.ego.move(self.sample, min(last, len(self.times) - 1), self.times)
+            self.refuse_turn(self.ego.place[: last + 1])
 
     def _straight_end(self, last: int) -> int:
         """The last sample at which Ego is on its line, once all that the file says has happened."""

@@ -15,6 +15,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, unknown_name, warn
 from safevar_sumo.openscenario import (
     EVERY,
+    MOST,
     Source,
     constraints_of,
     open_file,
@@ -138,6 +139,11 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
             raise unknown_name(
                 "scenario", f"the file declares no parameter {name}", name, offered.values
             )
+    for name, value in values.items():
+        is_text = isinstance(value, str)
+        if not is_text and not (isinstance(value, int | float) and abs(value) <= MOST):
+            problem = f"scenario.values.{name} = {value!r:.80}"
+            raise InputError("scenario", problem, f"a text, or a number of at most {MOST:g}")
     domains = {
         name: table if name in WEATHER else _domain(name, table, offered)
         for name, table in search.items()
@@ -195,6 +201,9 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
         raise InputError(
             "scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty"
         )
+    if name in offered.whole_numbers:
+        problem = f"scenario.search.{name}: the file declares {name} as a whole number"
+        raise InputError("scenario", problem, "a parameter of type double")
 
     # A number with a range, in the file or in the study.
     numbers = originals(offered)
