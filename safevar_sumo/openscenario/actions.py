@@ -171,6 +171,8 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
         and mine.path.chain == its.path.chain
     ):
         actor.at = mine._replace(distance=its.distance + signed)
+    elif isinstance(mine.path, Way) and mine.path.is_straight:
+        actor.at = mine._replace(distance=mine.path.along(its.pose.place) + signed)
     else:
         actor.at = Place.free(its.pose.moved(signed))
     if not truth(action, "continuous"):
@@ -450,9 +452,10 @@ PRIVATE: dict[str, Callable[[Player, Element, Actor], list[Running]]] = {
 """Actions of an actor that are supported, by the standard's names."""
 GROUPS = ("LongitudinalAction", "LateralAction", "RoutingAction")
 """Classes of which one action is a child."""
+PLACING = "TeleportAction", "FollowTrajectoryAction"
+"""Actions of Init that say where somebody is."""
 INIT_ORDER = (
-    ("TeleportAction",),
-    ("FollowTrajectoryAction",),
+    *((name,) for name in PLACING),
     ("SpeedAction",),
     ("AssignRouteAction", "AcquirePositionAction"),
 )

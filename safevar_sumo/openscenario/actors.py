@@ -274,17 +274,16 @@ class Actor:
         """Distances along the path of who keeps its distance to another actor."""
         other, by = following
         path = self.here.path
-        if not (
-            isinstance(path, Way)
-            and isinstance(other.here.path, Way)
-            and path.chain == other.here.path.chain
-        ):
+        its = other.here.path
+        if isinstance(path, Way) and isinstance(its, Way) and path.chain == its.chain:
+            return other.distance[later] + by
+        if not (path.is_straight and its.is_straight):
             raise unsupported(
                 f"LongitudinalDistanceAction: {self.name} and {other.name} are not on the same"
                 " roads",
                 "continuous = false, or entities on the same roads",
             )
-        return other.distance[later] + by
+        return path.along(other.place[later]) + by
 
     def arrive(self, sample: int) -> None:
         """Be where it has been at a sample."""

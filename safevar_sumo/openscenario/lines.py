@@ -197,6 +197,11 @@ class Line:
             np.linspace(0.0, self.length, min(round(self.length) + 2, MOST_SAMPLES))
         ).place
 
+    def along(self, place: Number) -> Number:
+        """How far places are along the line's first direction [m]."""
+        first = self.pose(0.0)
+        return ((place - first.place) / first.facing).real
+
     def _piece_at(self, distance: Number) -> Number:
         return np.clip(
             np.searchsorted(self.starts, distance, side="right") - 1, 0, len(self.pieces) - 1

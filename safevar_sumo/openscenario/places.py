@@ -190,6 +190,26 @@ class Place(NamedTuple):
         return float(((goal.pose.place - here.place) * here.facing.conjugate()).real)
 
 
+def located(place: Place, network: Network) -> Place:
+    """A place on the straight road on which it lies; as it is if there is none."""
+    pose = place.pose
+    for road in network.roads.values():
+        if road.flaw or not road.line.is_straight:
+            continue
+        first = road.line.pose(0.0)
+        at = (pose.place - first.place) / first.facing
+        s = float(at.real)
+        if 0 <= s <= road.length and road.has_lane(s, float(at.imag)):
+            turn = pose.facing / first.facing
+            is_forward = turn.real >= AHEAD
+            way = Way.onward(network, road.id, is_forward)
+            sign = 1 if is_forward else -1
+            return Place(
+                way, s if is_forward else road.length - s, sign * float(at.imag), sign * turn
+            )
+    return place
+
+
 Entity = Callable[[str], Place]
 """The place of an entity by its name."""
 

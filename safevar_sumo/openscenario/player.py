@@ -8,7 +8,7 @@ from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, actors_of
 from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
 from safevar_sumo.openscenario.own_speed import SpeedProfile
-from safevar_sumo.openscenario.places import STRAY, Place, place_of, turn_of
+from safevar_sumo.openscenario.places import STRAY, Place, Way, located, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network, straight_network
 
 Key = tuple[str, str]
@@ -74,8 +74,9 @@ class Player:
         return self.actor(attribute(element, "entityRef"))
 
     def place_of(self, name: str) -> Place:
-        """The place of an entity now."""
-        return self.actor(name).here
+        """The place of an entity now: on a road also if it follows a trajectory there."""
+        here = self.actor(name).here
+        return here if isinstance(here.path, Way) else located(here, self.network)
 
     def place(self, position: Element) -> Place:
         """The place that the child of a Position names."""

@@ -75,6 +75,15 @@ class Road:
         """The lane whose middle is nearest."""
         return min(self.lanes_at(s), key=lambda lane: abs(self.lane_t(lane, s) - t))
 
+    def has_lane(self, s: float, t: float) -> bool:
+        """Whether a lane is there."""
+        start, lanes = self._section(s)
+        ways = [
+            abs(self.lane_t(lane, s) - t) - _cubic(widths, s - start) / 2
+            for lane, widths in lanes.items()
+        ]
+        return min(ways, default=1.0) <= 0
+
     @cached_property
     def is_even(self) -> bool:
         """Whether no lane changes its place along the road."""

@@ -10,7 +10,7 @@ from itertools import chain
 
 import numpy as np
 
-from safevar_sumo.openscenario.actions import INIT_ORDER, act, is_ignored, leaf_of
+from safevar_sumo.openscenario.actions import INIT_ORDER, PLACING, act, is_ignored, leaf_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Running, Unplaced
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import (
@@ -201,9 +201,9 @@ class Storyboard(Player):
             try:
                 act(self, action, [actor])
             except Unplaced:
-                if leaf_of(action).tag != "TeleportAction" or waiting == 1:
+                if leaf_of(action).tag not in PLACING or waiting == 1:
                     raise
-                places_left = sum(leaf_of(other).tag == "TeleportAction" for _, other in privates)
+                places_left = sum(leaf_of(other).tag in PLACING for _, other in privates)
                 privates.insert(places_left, (actor, action))
                 waiting -= 1
             else:
