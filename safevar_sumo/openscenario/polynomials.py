@@ -42,8 +42,6 @@ class Curve:
         # Simpson's rule on each part.
         parts = (rate[:-2:2] + 4 * rate[1::2] + rate[2::2]) * (self.last / N_PARTS / 6)
         ways = np.concatenate([[0.0], np.cumsum(parts)])
-        if not (rate > 0).all() or not ways[-1] < np.inf:
-            raise unsupported("a polynomial of a road stands still", "u and v that change with p")
         scale = self.length / ways[-1]
         return CubicHermiteSpline(ways * scale, p[::2], 1 / (rate[::2] * scale))
 
@@ -92,6 +90,8 @@ def curve_of(start: Pose, length: float, shape: Element) -> Curve | Piece:
         is_normalised = shape.get("pRange", "normalized") != "arcLength"
         curve = Curve(start, length, weights, 1.0 if is_normalised else length)
     rates = curve._shape(np.linspace(0.0, curve.last, N_PARTS + 1), 1)
+    if not (np.abs(rates) > 0).all():
+        raise unsupported("a polynomial of a road stands still", "u and v that change with p")
     if np.abs(np.angle(rates[1:] / rates[0])).max() < LEAST_TURN:
         return Piece(curve.pose(0.0), length)
     return curve

@@ -36,7 +36,8 @@ class Moved(NamedTuple):
 class Played(NamedTuple):
     """A scene: Ego's shape, the pose of the middle of its front at the start, the speed that it
     keeps [m/s], and the `profile` of its speeds before, at samples up to the one at which the
-    driving system is switched on; the others; the length [s]; the time until which a motion depends
+    driving system is switched on; the others; the names of events, whose they are, and when they
+    begin and end [s];  the length [s]; the time until which a motion depends
     on Ego, and what depends on it; remarks; the files that were read; the file's parameters that
     are numbers; and why nothing happens to Ego, "" if something does.
     """
@@ -46,6 +47,7 @@ class Played(NamedTuple):
     speed: float
     profile: Array
     others: list[Moved]
+    events: list[tuple[str, str, float, float]]
     duration: float
     depends_until: float
     dependence: str
@@ -137,6 +139,7 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
         speed,
         profile.copy(),
         others,
+        player.events(),
         player.now,
         until,
         what,

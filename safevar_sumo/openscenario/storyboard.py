@@ -387,6 +387,21 @@ class Storyboard(Player):
                     )
         return self._straight_end(end)
 
+    def events(self) -> list[tuple[str, str, float, float]]:
+        """Events that move somebody, in their order: names, actors, and times of both ends [s]."""
+        found = [
+            (
+                event.name,
+                ", ".join(actor.name for actor in event.actors),
+                self.begun.get(event.key, math.nan) if event.running else math.nan,
+                self.ended.get(event.key, math.nan) if event.running else math.nan,
+            )
+            for one in self.acts
+            for event in one.events
+            if event.moves
+        ]
+        return sorted(found, key=lambda one: math.inf if math.isnan(one[2]) else one[2])
+
     def refuse_bend(self) -> None:
         """Refuse an Ego whose way bends in the next seconds of driving."""
         if self.has_begun:

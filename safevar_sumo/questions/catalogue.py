@@ -16,6 +16,7 @@ from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.check_scenario import TABLES, check_scenario
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
     SCENARIOS,
@@ -162,15 +163,23 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
         yield name, description, "; ".join(domains)
 
 
-@contents("passed", findings=FINDINGS)
-def check(name: str) -> Answer:
+@contents("passed", findings=FINDINGS, **TABLES)
+def check(name: str, ego: str | None = None) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
     the promises that results rest on.
 
     NAME is the name or path of a study, all of whose code is checked, or a driving system, by its
     name or package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME
-    passes, 1 with findings, 2 if it cannot be loaded.
+    passes, 1 with findings, 2 if it cannot be loaded. A file of OpenSCENARIO (*.xosc) passes if it
+    plays; what happens in it is said too, and drawn with --plot.
+
+    Parameters
+    ----------
+    ego
+        The vehicle under test in a file of OpenSCENARIO; Ego if it is left out.
     """
+    if name.endswith(".xosc"):
+        return check_scenario(name, ego or "Ego", FINDINGS)
     from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check  # loads SUMO
 
     study = study_to_check(name)
