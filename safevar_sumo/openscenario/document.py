@@ -332,8 +332,9 @@ def _resolve(element: Element, values: Values, library: Library) -> None:
             try:
                 element.set(key, literal(text, values))
             except InputError:
-                # The name of what is no entity is a text, whatever it holds.
-                if key not in NAMES or element.tag == "ScenarioObject":
+                # The name of what is no entity is a text, whatever it holds, and so is a property.
+                is_text = key in NAMES and element.tag != "ScenarioObject"
+                if not is_text and element.tag != "Property":
                     raise
     _check(element)
     for place, child in enumerate(list(element)):

@@ -133,6 +133,8 @@ def _play(file: str, values: Mapping[str, str], ego: str, every: int) -> Played:
     speed = float(profile[-1])
     remarks = [*player.remarks]
     reason = _why_uneventful(player)
+    if player.is_cut and reason:
+        player.refuse_bend()
     return Played(
         own.shape,
         start,

@@ -99,6 +99,8 @@ class Storyboard(Player):
         self._changes = 0
         """How many events have begun or ended."""
         self.stop = math.inf
+        self.is_cut = False
+        """Whether the scene ends where Ego's way bends, before its StopTrigger holds."""
         self._board = part(document.root, "Storyboard")
         self._refuse_states_of_nothing()
         self.acts = [
@@ -412,14 +414,14 @@ class Storyboard(Player):
     def _straight_end(self, last: int) -> int:
         """The last sample at which Ego is on its line, once all that the file says has happened."""
         events = [event for one in self.acts for event in one.events if event.moves]
-        if math.isinf(self.stop) and (
-            _stop_trigger(self._board) is not None or not all(one.has_ended for one in events)
-        ):
+        is_over = bool(events) and all(one.has_ended for one in events)
+        if math.isinf(self.stop) and not is_over:
             return last
         places = self.ego.place[: last + 1]
         is_aside = np.abs(((places - places[0]) / self.ego.facing[0]).imag) >= STRAY
         if not is_aside[self.sample :].any() or is_aside[: self.sample + 1].any():
             return last
         end = int(np.argmax(is_aside)) - 1
+        self.is_cut = math.isinf(self.stop)
         self.remark(f"the scene ends at {self.times[end]:.1f} s, when {self.ego.name}'s way bends")
         return end
