@@ -36,7 +36,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import MAX_VEHICLES, drive_worst
-from safevar_sumo.sumo.network import stage_network
+from safevar_sumo.sumo.network import network_for
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
@@ -146,7 +146,7 @@ def floor(study: Study) -> float:
     """
     system, n = assemble(study), study.search.population
     steps = len(drive_worst(system, drawn(study, n)).trace.time)
-    network = stage_network(system.points[0].scenario)
+    network = network_for(system.points[0].scenario)
     return float(np.median([bare(network, n, steps)[0] for _ in range(9)])) / n
 
 

@@ -36,7 +36,7 @@ from safevar_sumo.sumo.batch import observer_of
 from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.engine import open_world, sumo_options
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
-from safevar_sumo.sumo.network import copied_network, stage_network
+from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.world import SumoWorld
 
@@ -130,7 +130,7 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
 def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
     """Measure a study's evaluations."""
     system = assemble(read_study(study))
-    network = stage_network(system.points[0].scenario)
+    network = network_for(system.points[0].scenario)
     for n in populations:
         settings = settings_of(system, n)
         steps = len(drive_worst(system, settings).trace.time)
@@ -163,7 +163,7 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("ads")))
     drive_and_score(system, settings)
     program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
-    command = [program, *sumo_options(copied_network(stage_network(system.points[0].scenario), 1))]
+    command = [program, *sumo_options(copied_network(network_for(system.points[0].scenario), 1))]
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(

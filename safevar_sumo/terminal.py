@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the stage, the amount done in it, and its total, 0
+"""A function that shows progress, called with the phase, the amount done in it, and its total, 0
 where it is unknown; first with nothing done.
 """
 SECONDS_BETWEEN_LINES = 30.0
@@ -61,7 +61,10 @@ class WholeTable(Table):
                 for cell in cells
             ]
             sizes.append(
-                (max(one.minimum for one in measures), max(one.maximum for one in measures))
+                (
+                    max(measure.minimum for measure in measures),
+                    max(measure.maximum for measure in measures),
+                )
             )
             column.overflow = "fold"
 
@@ -98,13 +101,13 @@ def print_text(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-def show_no_progress(stage: str, done: int, total: int) -> None:
+def show_no_progress(phase: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
-def show_within(progress: Progress, whole: str, stage: str, done: int, total: int) -> None:
-    """Show a stage of something larger, which is named before it."""
-    progress(f"{whole}: {stage}", done, total)
+def show_within(progress: Progress, whole: str, phase: str, done: int, total: int) -> None:
+    """Show a phase of something larger, which is named before it."""
+    progress(f"{whole}: {phase}", done, total)
 
 
 class _Count(ProgressColumn):
@@ -116,7 +119,7 @@ class _Count(ProgressColumn):
 
 
 class _Pace(ProgressColumn):
-    """The mean speed of the stage under way, and the time left at that speed."""
+    """The mean speed of the phase under way, and the time left at that speed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -124,7 +127,7 @@ class _Pace(ProgressColumn):
         self._total = 0
         self._last = 0.0
         self._begun: tuple[int, float] | None = None
-        """What was done when the stage began, such as by an earlier command, and the time [s]."""
+        """What was done when the phase began, such as by an earlier command, and the time [s]."""
 
     def update(self, done: int, total: int) -> None:
         is_new = self._begun is None or done == 0 or done < self._done or not self._total
@@ -161,18 +164,18 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
     ended = Event()
     line = "searching"
 
-    def show(stage: str, done: int, total: int) -> None:
+    def show(phase: str, done: int, total: int) -> None:
         nonlocal line
-        line = f"{stage}: {done} of {total}, " if total else f"{stage}: {done}"
+        line = f"{phase}: {done} of {total}, " if total else f"{phase}: {done}"
         pace.update(done, total)
-        bar.update(task, description=stage, completed=done, total=total or None)
+        bar.update(task, description=phase, completed=done, total=total or None)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
             print_text(console, f"{line}{pace.render()}")
 
-    stage = TextColumn("{task.description}", markup=False)
-    columns = (stage, BarColumn(bar_width=None), _Count(), pace)
+    text = TextColumn("{task.description}", markup=False)
+    columns = (text, BarColumn(bar_width=None), _Count(), pace)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None)

@@ -97,7 +97,9 @@ class Fmu:
 
         # The variable by its name.
         variables = {
-            one.name: one for one in self._model.modelVariables if one.causality == causality
+            variable.name: variable
+            for variable in self._model.modelVariables
+            if variable.causality == causality
         }
         if name not in variables or variables[name].type not in REAL_TYPES:
             raise unknown_name(

@@ -62,7 +62,7 @@ def evaluate(
     jobs
         Worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function called with the stage, the number of settings
+        True for a bar on the terminal, or a function called with the phase, the number of settings
         done, and of all.
 
     Returns

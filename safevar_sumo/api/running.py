@@ -49,7 +49,7 @@ def run(
     pool
         Pool that simulates, in place of new worker processes or a cluster.
     progress
-        True for a bar on the terminal; or a function called with a stage (the study's name and its
+        True for a bar on the terminal; or a function called with a phase (the study's name and its
         finished runs), the number of evaluations done, and the number to do at most.
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once

@@ -198,8 +198,8 @@ def journal_progress(
     def show(ended: Sequence[int]) -> None:
         asked = [reader.asked() for reader in readers]
         finished = sum(reader.is_finished for reader in readers)
-        stage = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
-        progress(stage, sum(asked), len(keys) * study.search.evaluations)
+        phase = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
+        progress(phase, sum(asked), len(keys) * study.search.evaluations)
 
     return show
 

@@ -42,7 +42,7 @@ BATCHES_PER_WORKER = 4
 time left is known.
 """
 COMPILING = "compiling the vehicle model, for the first time"
-"""The stage of progress in which one worker compiles, and no simulation has begun."""
+"""The phase of progress in which one worker compiles, and no simulation has begun."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps

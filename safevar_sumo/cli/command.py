@@ -52,15 +52,19 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     """
     # Arguments and options as the signature has them.
     signature = inspect.signature(function)
-    positional = [one for one in signature.parameters.values() if one.kind is not one.KEYWORD_ONLY]
+    positional = [
+        parameter
+        for parameter in signature.parameters.values()
+        if parameter.kind is not parameter.KEYWORD_ONLY
+    ]
     options = [option for option in options_of(function) if option.name not in LIBRARY_ONLY]
     constants = {"progress": True} if "progress" in signature.parameters else {}
 
     def call(**values: Any) -> Any:
         subjects: list[Any] = []
-        for one in positional:
-            value = values.pop(one.name)
-            subjects += value if one.kind is one.VAR_POSITIONAL else [value]
+        for parameter in positional:
+            value = values.pop(parameter.name)
+            subjects += value if parameter.kind is parameter.VAR_POSITIONAL else [value]
         return function(
             *subjects,
             **{option.name: option.check(values[option.name]) for option in options},

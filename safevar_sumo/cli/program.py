@@ -220,17 +220,19 @@ def _exit_on_interrupt() -> Iterator[None]:
 
     previous = {}
     if threading.current_thread() is threading.main_thread():
-        for one in INTERRUPTS:
-            previous[one] = signal.signal(one, exit_at_once)
+        for interrupt in INTERRUPTS:
+            previous[interrupt] = signal.signal(interrupt, exit_at_once)
     try:
         yield
     finally:
-        for one, handler in previous.items():
-            signal.signal(one, handler or signal.default_int_handler)  # None: not set from Python
+        for interrupt, handler in previous.items():
+            signal.signal(
+                interrupt, handler or signal.default_int_handler
+            )  # None: not set from Python
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:
-    for one in INTERRUPTS:  # another Ctrl-C must change neither exit code nor message
-        signal.signal(one, signal.SIG_IGN)
+    for interrupt in INTERRUPTS:  # another Ctrl-C must change neither exit code nor message
+        signal.signal(interrupt, signal.SIG_IGN)
     click.echo(f"{PROGRAM}: {message}", err=True)
     sys.exit(code)

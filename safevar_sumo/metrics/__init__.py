@@ -47,7 +47,7 @@ OPTIONAL_METRICS = {
     )
 }
 """Metrics that only the studies have that name them."""
-OBJECTIVES = {one.name: one for one in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
+OBJECTIVES = {objective.name: objective for objective in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
     SAFETY_DEGREE_METRIC.name: F_SAFE,
     "f_comfort": MAX_JERK,
 }

@@ -80,9 +80,9 @@ class Contents(NamedTuple):
         for table, names in tables.items():
             of_study = given.get(table, [...])
             tables[table] = [
-                one
+                filled_name
                 for name in names
-                for one in (of_study if name is ... else [name.format_map(named)])
+                for filled_name in (of_study if name is ... else [name.format_map(named)])
             ]
         return Contents(tables.pop(""), tables)
 
@@ -232,6 +232,7 @@ class Answer:
         """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default
         the first, as CSV.
         """
+        # A table as CSV, or the answer with this table alone.
         if form == "csv":
             return self.table(table).map(csv_cell).to_csv(index=False, lineterminator="\n")
         if table is not None:
@@ -254,6 +255,8 @@ class Answer:
             return "\n".join(
                 [f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others]
             )
+
+        # Text as on a terminal of fixed width.
         console = Console(width=WIDTH, no_color=True, force_terminal=False)
         with console.capture() as capture:
             self.print(console)
@@ -361,12 +364,15 @@ def _draw_intervals(answer: Answer) -> Figure:
     """The numbers of the first table with their intervals, a row for each of its rows."""
     from safevar_sumo.questions.figures import BLUE, FONT_SIZE, escape_dollars, new_figure
 
+    # Columns that have an interval.
     frame = answer.table()
     names = [
         name for name in map(str, frame) if f"{name}{LOW}" in frame and frame[name].notna().any()
     ]
     if not names or frame.empty:
         raise InputError("plot", "the answer has nothing to draw", "the answer as a table")
+
+    # A panel for each column.
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
     figure, axes = new_figure(frame.attrs["title"], 1, len(names), size, sharey=True)
     places = range(len(frame), 0, -1)

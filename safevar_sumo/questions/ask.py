@@ -85,7 +85,7 @@ COMMON_OPTIONS = (
         "progress",
         Any,
         False,
-        "True for a bar on the terminal, or a function of a stage, the number done and its total.",
+        "True for a bar on the terminal, or a function of a phase, the number done and its total.",
     ),
     (
         *("as_it_is_now", bool, False),
@@ -143,13 +143,19 @@ class Question:
     """A question as a function of the library: `risk("rain", samples=1000)`."""
 
     def __init__(self, compute: Callable[..., Answer]) -> None:
+        # Its name, as in commands.
         update_wrapper(self, compute)
         is_own = compute.__module__.partition(".")[0] == PACKAGE.name
         self.compute = compute
         self.name = f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
+
+        # Its parameters: what it is about, and options.
         parameters = list(inspect.signature(compute).parameters.values())
         if (
-            sum(one.kind in (one.POSITIONAL_ONLY, one.POSITIONAL_OR_KEYWORD) for one in parameters)
+            sum(
+                parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+                for parameter in parameters
+            )
             < 2
         ):
             takes = f"takes ({', '.join(map(str, parameters))})"
@@ -165,6 +171,7 @@ class Question:
             if parameter.kind is not parameter.KEYWORD_ONLY
         }
         """Further positional parameters, and whether each is a file instead of a subject."""
+        # Options that all questions have.
         common = [
             inspect.Parameter(
                 name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
@@ -192,6 +199,7 @@ class Question:
         as_it_is_now: bool = False,
         **values: Any,
     ) -> Answer:
+        # Options that it has, with legal values.
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
             raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
@@ -208,6 +216,7 @@ class Question:
                 warn(shortfall)
             return reduce_to_point(subject, point)
 
+        # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
@@ -232,6 +241,7 @@ class Question:
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
         from safevar_sumo.questions.measure import subject_by
 
+        # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
             criterion = next(
@@ -244,10 +254,14 @@ class Question:
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
                 evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
+
+            # The question's own function.
             with user_errors(self.name):
                 answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
             if not isinstance(answer, Answer):
                 raise InputError(self.name, f"returns {type(answer).__name__}", "an Answer")
+
+            # An answer about a driving system that fails by itself begins with that.
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
         verdict = " ".join(filter(None, (reason, answer.verdict, _undefined_in_words(evaluator))))
@@ -288,6 +302,7 @@ def find_question(name: str) -> Question:
     InputError
         If there is no such question.
     """
+    # A question of this package, or of the user's.
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
     if not (":" in name or name in QUESTIONS):
         raise InputError("question", f"there is no {name!r}", legal)
@@ -297,6 +312,8 @@ def find_question(name: str) -> Question:
             ()
         )  # the working directory, which an installed program does not have on its path
     invalidate_caches()  # the module may have been written a moment ago
+
+    # Its module has a function with the decorator.
     try:
         with user_errors(name):
             imported = import_module(module)
@@ -338,6 +355,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     InputError
         If there is no such question or option, or a value is not allowed.
     """
+    # The question's name.
     try:
         name, *words = split(text)
     except ValueError:  # nothing, or a quotation mark without its second one
@@ -345,6 +363,8 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
             "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
         ) from None
     asked = find_question(name)
+
+    # Options, each with its value.
     values = dict[str, Any]()
     waiting = iter(words)
     options = {option.flag: option for option in asked.options}
@@ -375,7 +395,7 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
         limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
-    is_repeated = any(get_origin(one) is tuple for one in (hint, *get_args(hint)))
+    is_repeated = any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
     kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
     kind = str if is_repeated or not kinds else kinds[0]
     choices = get_args(hint) if get_origin(hint) is Literal else ()

@@ -62,6 +62,7 @@ class Bar(NamedTuple):
                 f' height="{HEIGHT - 6}"/>'
             )
 
+        # Ranges beneath, then the domain's outline, limits and the original.
         ranges = [
             rectangle(ends, name)
             for ends, name in ((self.alone, "alone"), (self.together, "together"))

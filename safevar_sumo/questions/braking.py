@@ -27,11 +27,14 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     2. otherwise the first one after that;
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
+    # Speed and brake until the obstacle is nearest.
     trace = runs.trace
     nearest_sample = runs.nearest(column)
     active = trace.active[: None if nearest_sample is None else nearest_sample + 1, column]
     speed = np.where(active, trace.speed[: len(active), column], 0.0)
     brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
+
+    # Braking that belongs to the manoeuvre, after the last cruise.
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
     braking_samples = np.flatnonzero(is_braking)
     last_cruise = np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
@@ -43,6 +46,8 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     sample = (
         later_samples[0] if later_samples.size else braking_samples[-1]
     )  # a sample of the manoeuvre that counts
+
+    # Where the pedals no longer regulate the speed, the brake begins to rise.
     regulation = np.flatnonzero(
         ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0)) & ~is_braking[:sample]
     )

@@ -91,6 +91,7 @@ class Case:
         """The case of another form of its study, in which its settings have been simulated
         again.
         """
+        # Columns of the new simulations.
         columns = {
             "f_safe": evaluations.f_safe,
             **evaluations.metrics,
@@ -238,6 +239,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     InputError
         If a directory holds no results, is damaged or is given twice.
     """
+    # Each directory once.
     paths = [Path(check_text("directory", directory)) for directory in directories]
     duplicates = [
         path for path, count in Counter(path.resolve() for path in paths).items() if count > 1
@@ -246,6 +248,8 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         raise InputError(
             "directories", f"{duplicates[0]} is given twice", "each results directory once"
         )
+
+    # What each directory holds, as a case.
     cases = []
     for path in paths:
         try:
@@ -280,6 +284,8 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 f"is damaged: {describe_error(error)}",
                 "an unchanged directory of the command `study`",
             ) from error
+
+    # Names that tell them apart.
     names = Counter(case.name for case in cases)
     return [
         replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case
@@ -298,6 +304,7 @@ def build_case(
     scoring: Scoring = PUBLISHED_SCORING,
 ) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
+    # Columns that all cases of the study have.
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {

@@ -60,8 +60,8 @@ WEATHER: Columns = NAME | {
 }
 FURTHER_OBJECTIVES: Mapping[str, object] = {
     **{
-        name: f"{one.title.capitalize()} [{one.unit}]."
-        for name, one in OBJECTIVES.items()
+        name: f"{objective.title.capitalize()} [{objective.unit}]."
+        for name, objective in OBJECTIVES.items()
         if name not in METRICS
     },
     RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
@@ -91,13 +91,18 @@ def list_models(kind: str | None = None) -> Answer:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with
     KIND only these, or your own scenario, package.module:Name.
     """
+    # The user's own scenario, or everything.
     own = {}
     if kind is not None and ":" in kind:
         own[kind] = Lookup().class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario).target
         kind = "scenarios"
     effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
     weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
-    metrics = ((name, one.description) for name, one in {**METRICS, **OPTIONAL_METRICS}.items())
+    metrics = (
+        (name, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
+    )
+
+    # A table for each kind.
     tables = {
         "studies": tabulate("Studies", STUDIES, _studies()),
         "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
@@ -158,7 +163,8 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
             else {**free_parameters(models[name]), **WEATHER_PARAMETERS}
         )
         domains = (
-            f"{key} {one.lower:g} to {one.upper:g}{unit_text(one.unit)}" for key, one in own.items()
+            f"{key} {parameter.lower:g} to {parameter.upper:g}{unit_text(parameter.unit)}"
+            for key, parameter in own.items()
         )
         yield name, description, "; ".join(domains)
 
@@ -185,8 +191,8 @@ def check(name: str, ego: str | None = None) -> Answer:
     study = study_to_check(name)
     findings = check_study(study)
     rows = [
-        (one.finding, one.where, one.input, one.expected, one.check, CHECKS[one.check])
-        for one in findings
+        (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
+        for item in findings
     ]
     return Answer(
         question="check",

@@ -47,6 +47,8 @@ def read_changes(
     """
     values_by_name = {}
     forms = SINGLE_VALUE_FORMS if single else CHANGE_FORMS
+
+    # A name and its values, which are legal.
     for change in changes:
         name, equals, text = (text.strip() for text in change.partition("="))
         if not equals:
@@ -64,6 +66,8 @@ def read_changes(
             characteristic.check(
                 value, beyond=beyond, otherwise=hint, switch="" if single else "--beyond"
             )
+
+    # Not too many settings.
     if np.prod([len(values) for values in values_by_name.values()], dtype=float) > MAX_SETTINGS:
         raise InputError(
             "",

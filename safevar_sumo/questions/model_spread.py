@@ -19,8 +19,8 @@ from safevar_sumo.sumo.matrix import at_point, drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
-FITS_AT_ONCE = "fits of the vehicle model"
-"""The stage of progress in which several fits are asked at the same time."""
+SETS_AT_ONCE = "parameter sets of the vehicle model"
+"""The phase of progress in which several parameter sets are asked at the same time."""
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
@@ -129,27 +129,27 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
     if point:
         study = at_point(study, point)
     systems = []
-    for k, one in enumerate(studies_of_sets(study)):
+    for k, other in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
         systems.append(
             assemble(
                 msgspec.structs.replace(
-                    one, origin=msgspec.structs.replace(one.origin, called=called)
+                    other, origin=msgspec.structs.replace(other.origin, called=called)
                 )
             )
         )
     return [drive_and_score(system, settings) for system in systems]
 
 
-def across(evaluator: Evaluator, fits: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
+def across(evaluator: Evaluator, sets: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
     """What `measure` finds with the study's own parameters, then with each other of the first
-    `fits` parameter sets; several at the same time, in threads. The others are not verified in
+    `sets` parameter sets; several at the same time, in threads. The others are not verified in
     SUMO, because scene and equations are those of the study.
     """
     study = evaluator.study
-    others = studies_of_sets(study)[1:fits] if study.spread else []
+    others = studies_of_sets(study)[1:sets] if study.spread else []
     evaluators = [evaluator, *(evaluator.for_study(other, verified=0) for other in others)]
-    return side_by_side(evaluators, measure, FITS_AT_ONCE)
+    return side_by_side(evaluators, measure, SETS_AT_ONCE)
 
 
 def studies_of_sets(study: Study) -> list[Study]:

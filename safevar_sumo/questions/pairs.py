@@ -83,6 +83,7 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
         new_figure,
     )
 
+    # A point for each setting.
     frame = answer.tables["settings"]
     figure, ((axis,),) = new_figure(f"Unsafe: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0))
     for where, colour in {"neither": GREY, "both": SKY_BLUE, "a": BLUE, "b": VERMILION}.items():
@@ -90,6 +91,8 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
         axis.scatter(
             rows["a_degree"], rows["b_degree"], s=6, color=colour, label=where, rasterized=True
         )
+
+    # The line on which both agree.
     axis.axline((0, 0), slope=1, color="black", linewidth=0.6)
     labels = [escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles]
     axis.set(xlabel=labels[0], ylabel=labels[1])

@@ -108,6 +108,7 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of
     `judge_sample`.
     """
+    # What each driver avoids, of the collisions with a verdict.
     rows = []
     share_of = avoided_shares(verdicts)
     drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]

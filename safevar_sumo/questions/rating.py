@@ -108,6 +108,7 @@ def rating(
         The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it
         further.
     """
+    # The vehicles, in a study that is rated.
     study = evaluator.study
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
@@ -119,6 +120,8 @@ def rating(
         )
     if not is_rated(study):
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
+
+    # All cells of the protocol.
     rater = assemble(study).rater
     assert rater is not None
     cells = evaluator.for_study(study).at_each_point(
@@ -141,6 +144,8 @@ def _variant(
     characteristics = evaluator.characteristics
     setting = characteristics.original
     name = "variant"
+
+    # The solution's setting.
     if solution is not None:
         if isinstance(subject, Study):
             raise InputError(
@@ -151,6 +156,8 @@ def _variant(
         row = subject.solutions.iloc[row_of_handle(subject.solutions, SolutionId.parse(solution))]
         setting = row[list(characteristics.names)].to_numpy(float)
         name = solution
+
+    # Changes to it.
     if changes:
         with about("set"):
             values = dict(zip(characteristics.names, setting.tolist(), strict=True))
@@ -170,11 +177,14 @@ def rate(
     """The answer about the original vehicle and its variant, settings by name, that were simulated
     in all cells.
     """
+    # Points of all vehicles.
     protocol = rater.protocol
     scores = rater.points(cells)
     names = list(settings)
     lost = (scores.total[0] - scores.total).round(DECIMALS)
     possible = round(sum(sum(matrix.points) for matrix in protocol.matrices), DECIMALS)
+
+    # Tables of tests, vehicles and cells.
     tests = tabulate("Points by test", TESTS, _rows_of_tests(rater, scores, names))
     changes = [_changes(study, setting) for setting in settings.values()]
     invalid = (~cells.valid).sum(axis=1)
@@ -239,6 +249,7 @@ def _cells(
     protocol: Protocol, scores: Points, results: CellResults, names: list[str]
 ) -> pd.DataFrame:
     """The rows of `CELLS`: all cells of each vehicle."""
+    # What is tested in each cell.
     placed = pd.DataFrame(
         [
             (
@@ -249,6 +260,8 @@ def _cells(
         ],
         columns=["test", "range", "condition", "vut_speed", "target_speed", "impact_location"],
     )
+
+    # What each vehicle does there.
     measured = zip(names, scores.colours, results.impact, results.warning, strict=True)
     return pd.concat(
         [
@@ -311,6 +324,7 @@ def _verdict(
     """How many points the variant loses and in which tests; without a variant, the original's
     points.
     """
+    # The weather, if it is not that of the tests.
     weather = weather_of(study.weather)
     road = ""
     if weather.water or weather.road_friction != 1:
@@ -318,6 +332,8 @@ def _verdict(
             f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by"
             f" night {darken(weather).name!r}."
         )
+
+    # Without a variant, what the original earns.
     *others, variant = settings
     earned = f"{scores.total[0]:.2f}"
     if not others:
@@ -325,6 +341,8 @@ def _verdict(
             f"The original vehicle earns {earned} of the {possible:g} points of the tests that are"
             f" simulated.{road}"
         )
+
+    # What changes, what it costs, and where.
     items = {item.name: item for item in CharacteristicSet.of(study)}
     changes = [
         f"{items[name].short_name} {float(items[name].text(value)):g}{items[name].suffix}"
@@ -340,9 +358,9 @@ def _verdict(
     losses = tests[tests["variant"] == variant]
     largest = losses[losses["lost"] == losses["lost"].max()]
     if lost > 0:
-        each = "each of " if len(largest) > 1 else ""
+        prefix = "each of " if len(largest) > 1 else ""
         where = (
-            f", {largest['lost'].iloc[0]:.2f} of them in {each}{join_phrases([*largest['test']])}"
+            f", {largest['lost'].iloc[0]:.2f} of them in {prefix}{join_phrases([*largest['test']])}"
         )
     return (
         f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned}"
@@ -354,6 +372,7 @@ def _draw(protocol: Protocol, scores: Points, answer: Answer) -> Figure:
     """The matrices of all tests with the colours of their cells, of the original and its variant
     side by side.
     """
+    # Points of each vehicle as title.
     vehicles = answer.tables["vehicles"]
     points = "; ".join(
         f"{name}: {total:.2f} points"
@@ -364,6 +383,8 @@ def _draw(protocol: Protocol, scores: Points, answer: Answer) -> Figure:
     figure, axes = new_panels(
         title, len(protocol.matrices), 4, (3.75, 2.6), min_width=15.0, title_height=0.0
     )
+
+    # A panel for each matrix.
     for axis, matrix in zip(axes, protocol.matrices, strict=True):
         _draw_matrix(axis, protocol, scores, matrix)
     legend = (
@@ -384,6 +405,7 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
     import seaborn as sns
     from matplotlib.colors import ListedColormap
 
+    # Rows and columns, and the cell at each place.
     columns = [*(f"{value:g}" for value in matrix.column_values), ""]
     rows = [
         f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}"
@@ -396,6 +418,8 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
             for row in range(len(rows))
         ]
     )
+
+    # Colours, with a letter for each.
     is_extended = np.array([cell.range_or_layer == EXTENDED for cell in protocol.cells])
     colours = [np.where(numbers < 0, np.nan, of_vehicle[numbers]) for of_vehicle in scores.colours]
     letters = []
@@ -404,6 +428,8 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
         cased = np.where(is_extended, plain, np.char.upper(plain))
         marked = np.char.add(cased, np.where(of_vehicle != scores.colours[0], "*", ""))
         letters.append(np.where(numbers < 0, "", marked[numbers]))
+
+    # All vehicles beside each other.
     frame = pd.DataFrame(np.hstack(colours), rows, columns * len(colours))
     palette = ListedColormap(["#808080", *(f"#{protocol.colours[colour]}" for colour in COLOURS)])
     limits = {"vmin": -1, "vmax": len(COLOURS) - 1}

@@ -137,8 +137,8 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     if not study.scenario.search:
         return []
     names = join_phrases(study.scenario.search)
-    those = "those" if left_out is None else f"{left_out:,}"
-    left_out_in_words = f"left out: {those} in which the original is not safe"
+    number = "those" if left_out is None else f"{left_out:,}"
+    left_out_in_words = f"left out: {number} in which the original is not safe"
     return [
         f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}.",
         *demanded_in_words(study),

@@ -1,4 +1,4 @@
-"""Records that pass between the stages: observations and commands of an ADS, traces of runs,
+"""Records that pass between packages: observations and commands of an ADS, traces of runs,
 evaluations.
 """
 

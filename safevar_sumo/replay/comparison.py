@@ -22,7 +22,7 @@ from safevar_sumo.results import UNKNOWN
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.bodies import Film
-from safevar_sumo.sumo.network import NetworkFiles, built_network, stage_network
+from safevar_sumo.sumo.network import NetworkFiles, built_network, network_for
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.verification import drive_again
 
@@ -99,7 +99,7 @@ class Comparison:
     @property
     def network(self) -> NetworkFiles:
         """The scenario's network, with the lanes that the scenario's parameters define."""
-        return stage_network(self.point.scenario)
+        return network_for(self.point.scenario)
 
     @cached_property
     def road(self) -> tuple[LaneLine, ...]:

@@ -84,7 +84,7 @@ def evidence(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        True for a bar on the terminal, or a function of a phase, the number done in it, and its
         total.
 
     Returns
@@ -207,7 +207,7 @@ def verify(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        True for a bar on the terminal, or a function of a phase, the number done in it, and its
         total.
 
     Raises

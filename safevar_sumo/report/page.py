@@ -96,7 +96,7 @@ def report(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a stage, the number done in it, and its
+        True for a bar on the terminal, or a function of a phase, the number done in it, and its
         total.
     as_it_is_now
         If results were computed with other files or versions, simulate with the present ones and

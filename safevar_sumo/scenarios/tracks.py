@@ -1,8 +1,8 @@
 """A scenario is who moves how: tracks of bodies, in coordinates of the vehicle's lane.
 
 `x` leads along the lane and `y` to its left; the front of the vehicle under test is at (0, 0) at
-the start. What is seen, measured and hit follows from the tracks (`sumo/stage.py`), so no scenario
-needs to know a road.
+the start. What is seen, measured and hit follows from the tracks (`sumo/traffic.py`), so no
+scenario needs to know a road.
 """
 
 from __future__ import annotations

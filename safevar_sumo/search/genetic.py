@@ -199,7 +199,8 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     domination, Deb et al. 2002).
     """
     infeasible = sorted(
-        (one for one in individuals if one.violation), key=lambda one: one.violation
+        (individual for individual in individuals if individual.violation),
+        key=lambda individual: individual.violation,
     )
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0

@@ -385,8 +385,8 @@ def _plain_arguments(name: str) -> dict[str, Any]:
     variant = getattr(
         importlib.import_module(algorithm.__module__), "Variant", algorithm
     )  # takes those of DE
-    for one in (*algorithm.__mro__[:-2], variant):
-        arguments = {**inspect.signature(one.__init__).parameters, **arguments}
+    for ancestor in (*algorithm.__mro__[:-2], variant):
+        arguments = {**inspect.signature(ancestor.__init__).parameters, **arguments}
     if "ref_points" in arguments:
         arguments.pop("ref_dirs", None)
     return {

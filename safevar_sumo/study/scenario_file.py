@@ -64,7 +64,7 @@ def files_of_scenario(
     points = {}
     for test in tests or (MatrixTest(name=""),):
         axes = [
-            column if any(isinstance(one, str) for one in column) else column[:1]
+            column if any(isinstance(value, str) for value in column) else column[:1]
             for column in test.over.values()
         ]
         for combination in product(*axes):

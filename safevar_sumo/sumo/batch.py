@@ -18,14 +18,14 @@ from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
-from safevar_sumo.sumo.network import copied_network, stage_networks
+from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
-from safevar_sumo.sumo.stage import LaneWorld, Stage
-from safevar_sumo.sumo.stage_world import StageWorld, start_frame
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.sumo.traffic import LaneWorld, Traffic
+from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 
@@ -59,7 +59,9 @@ def reason_for_sumo(system: System) -> str:
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
-    played = (one.scenario for one in system.points if isinstance(one.scenario, WorldScenario))
+    played = (
+        point.scenario for point in system.points if isinstance(point.scenario, WorldScenario)
+    )
     if searched and any(type(scenario).layout is WorldScenario.layout for scenario in played):
         return f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
     return system.scenes.reason_for_sumo(system.points)
@@ -94,19 +96,23 @@ def drive_all(
     scenario = on_road.points[0].scenario
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
-        stage = stage_of(system, encounters)
+        traffic = traffic_of(system, encounters)
 
         # In SUMO, among the other actors that it moves.
         if not is_recorded(system, engine):
-            with open_points_world(system, encounters, stage) as sumo_world:
+            with open_points_world(system, encounters, traffic) as sumo_world:
                 return drive(
-                    on_road, vehicles, sumo_world, observer_of(scenario, sumo_world, stage), listen
+                    on_road,
+                    vehicles,
+                    sumo_world,
+                    observer_of(scenario, sumo_world, traffic),
+                    listen,
                 )
 
         # On a lane, among bodies on tracks, at all points at once.
-        if stage is not None:
-            lane = LaneWorld(stage, _start_speeds(on_road.points, len(settings)), stage.step)
-            return drive(on_road, np.tile(vehicles, (len(system.points), 1)), lane, stage, listen)
+        if traffic is not None:
+            lane = LaneWorld(traffic, _start_speeds(on_road.points, len(settings)), traffic.step)
+            return drive(on_road, np.tile(vehicles, (len(system.points), 1)), lane, traffic, listen)
 
         # In a scene that SUMO has played once.
         world = _recorded_world(system, encounters, scenario)
@@ -131,15 +137,15 @@ def _recorded_world(
     return RecordedWorld(scenes_of_encounters(scene, scenario, len(encounters) // size), size)
 
 
-def observer_of(scenario: Scenario, world: SceneWorld, stage: Stage | None) -> Observer:
-    """Who observes for the vehicles: the stage of tracks, or else the scenario itself."""
-    if stage is not None:
-        return stage
+def observer_of(scenario: Scenario, world: SceneWorld, traffic: Traffic | None) -> Observer:
+    """Who observes for the vehicles: bodies on tracks, or else the scenario itself."""
+    if traffic is not None:
+        return traffic
     assert isinstance(scenario, WorldScenario)
     return SceneObserver(scenario, world)
 
 
-def stage_of(system: System, encounters: FloatArray) -> Stage | None:
+def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
     """The bodies around N vehicles in their encounters, shape (N, k), at every point; None if the
     scenario observes a world itself.
     """
@@ -161,14 +167,18 @@ def stage_of(system: System, encounters: FloatArray) -> Stage | None:
     step = system.scenes.step_of(scenarios[0])
     duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
     n_samples = round(duration / step) + 1
-    return Stage(scenarios, np.reshape(group, -1), n_samples=n_samples, step=step)
+    return Traffic(scenarios, np.reshape(group, -1), n_samples=n_samples, step=step)
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     """The speeds at the start of n vehicles at each point."""
     scenarios = (point.scenario for point in points)
     return np.concatenate(
-        [np.zeros(n) + one.start_speed for one in scenarios if isinstance(one, TrackScenario)]
+        [
+            np.zeros(n) + scenario.start_speed
+            for scenario in scenarios
+            if isinstance(scenario, TrackScenario)
+        ]
     )
 
 
@@ -181,7 +191,7 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
 
 
 def open_points_world(
-    system: System, encounters: FloatArray, stage: Stage | None, start: Start = open_in_process
+    system: System, encounters: FloatArray, traffic: Traffic | None, start: Start = open_in_process
 ) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N encounters,
     shape (N, k).
@@ -198,14 +208,14 @@ def open_points_world(
             encounter(point, dict(zip(names, values, strict=True))).scenario
             for values in encounters.tolist()
         ]
-    networks = stage_networks(scenarios)
+    networks = networks_for(scenarios)
 
-    # The stage moves the other bodies.
+    # Bodies on tracks are moved to their places.
     create: Callable[[Api, int], SumoWorld] = SumoWorld
-    if stage is not None:
+    if traffic is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)
         create = partial(
-            StageWorld, stage=stage, start_speeds=speeds, start=start_frame(networks[0], step)
+            TrafficWorld, traffic=traffic, start_speeds=speeds, start=start_frame(networks[0], step)
         )
     if n_searched:
         return open_varied_world(networks, step, create, start)

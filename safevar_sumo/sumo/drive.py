@@ -85,7 +85,7 @@ def drive(
             if system.sees_nobody:  # the run ends at the place of the encounter
                 scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
             collisions = contacts.count(world, motion.hits, scene)
-            if isinstance(observer, SceneObserver):  # bodies on a stage touch wherever they overlap
+            if isinstance(observer, SceneObserver):  # bodies on tracks touch wherever they overlap
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
             active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_sample)
 

@@ -28,7 +28,7 @@ from safevar_sumo.scenarios import (
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.bodies import Film
-from safevar_sumo.sumo.network import stage_networks
+from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
 
 
@@ -63,11 +63,15 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     # An encounter at every corner of the domains is possible.
     ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
     corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
-    corners = [corner for corner in corners if all(one.allows(corner) for one in study.constraints)]
+    corners = [
+        corner
+        for corner in corners
+        if all(constraint.allows(corner) for constraint in study.constraints)
+    ]
     for point in points:
         try:
             scenarios = [encounter(point, corner).scenario for corner in corners]
-            stage_networks(scenarios)
+            networks_for(scenarios)
             for scenario in scenarios:
                 if isinstance(scenario, TrackScenario):
                     scenario.tracks(np.zeros((1, 1)))

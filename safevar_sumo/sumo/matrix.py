@@ -140,8 +140,8 @@ def drive_and_score(
         batches = [settings[start : start + size] for start in starts]
         return Evaluations.concatenate(
             [
-                drive_and_score(system, each, engine, with_originals=with_originals)
-                for each in batches
+                drive_and_score(system, batch, engine, with_originals=with_originals)
+                for batch in batches
             ]
         )
 
@@ -315,13 +315,19 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
     """
     groups: dict[Hashable, list[Point]] = {}
     for point in system.points:
-        one = point.scenario
+        scenario = point.scenario
         key: Hashable = point.name
-        if isinstance(one, TrackScenario):
+        if isinstance(scenario, TrackScenario):
             n_bodies = (
-                0 if len(system.points) <= size else len(one.tracks(np.zeros((1, 1))))
+                0 if len(system.points) <= size else len(scenario.tracks(np.zeros((1, 1))))
             )  # at time 0
-            key = one.vut_length, one.vut_width, one.sensor_setback, n_bodies, one.network
+            key = (
+                scenario.vut_length,
+                scenario.vut_width,
+                scenario.sensor_setback,
+                n_bodies,
+                scenario.network,
+            )
         groups.setdefault(key, []).append(point)
     for group in groups.values():
         group.sort(key=lambda point: point.scenario.duration)

@@ -318,7 +318,7 @@ def _run_netconvert(network: NetworkFiles, file: Path) -> None:
         )
 
 
-def stage_network(scenario: Scenario) -> NetworkFiles:
+def network_for(scenario: Scenario) -> NetworkFiles:
     """The scenario's network, with lanes and traffic changed by the scenario's parameters.
 
     Raises
@@ -329,18 +329,18 @@ def stage_network(scenario: Scenario) -> NetworkFiles:
     EnvironmentFault
         If the cache cannot be written.
     """
-    return stage_networks([scenario])[0]
+    return networks_for([scenario])[0]
 
 
-def stage_networks(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
+def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """The networks of several scenarios, whose files are read once per network; raises the errors
-    of `stage_network`.
+    of `network_for`.
     """
     networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
-    return [_stage(scenario, networks[scenario.network]) for scenario in scenarios]
+    return [_network_for(scenario, networks[scenario.network]) for scenario in scenarios]
 
 
-def _stage(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
+def _network_for(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
     network = network._replace(lane_changes=_frozen(scenario.lanes(_BuiltRoads(network))))
     return network._replace(traffic_changes=_frozen(scenario.actors(_BuiltRoads(network))))
 

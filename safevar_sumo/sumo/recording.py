@@ -31,9 +31,9 @@ from safevar_sumo.sumo.network import (
     NetworkFiles,
     copied_network,
     is_shipped,
+    network_for,
     open_network,
     options_in,
-    stage_network,
     sumo_version,
 )
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
@@ -159,7 +159,7 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
         return (
             f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
         )
-    network = stage_network(scenario)
+    network = network_for(scenario)
     if scenario.is_user_code:
         return _play(scenario, network, step)
     inputs = (type(scenario).__name__, to_builtins(scenario), network.digests, step)

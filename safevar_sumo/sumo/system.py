@@ -25,7 +25,7 @@ from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
 from safevar_sumo.sumo.models import create_ads, create_scenario, create_vehicle, matrix_points
-from safevar_sumo.sumo.network import copied_network, stage_network
+from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
@@ -109,7 +109,7 @@ class System:
         with ExitStack() as stack:
             world: SceneWorld
             if isinstance(recording, str):
-                network = copied_network(stage_network(scenario), 1)
+                network = copied_network(network_for(scenario), 1)
                 world = stack.enter_context(open_world(network, 1, self.scenes.step))
                 world.enter(None)
             else:
@@ -260,7 +260,8 @@ def _assemble(study: Study) -> System:
     # The points at which settings are simulated, and what is measured there.
     rater = rater_of(study)
     matrix = matrix_points(expand_protocol(study, weather), lookup)
-    has_stops = any(one.brakes_fully for one in (scenario, *(point.scenario for point in matrix)))
+    scenarios = (scenario, *(point.scenario for point in matrix))
+    has_stops = any(member.brakes_fully for member in scenarios)
     measuring = measuring_of(study, lookup, has_stops=has_stops)
     _check_metrics(study, measuring)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):

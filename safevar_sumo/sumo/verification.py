@@ -13,7 +13,7 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.sumo.batch import observer_of, open_points_world, stage_of
+from safevar_sumo.sumo.batch import observer_of, open_points_world, traffic_of
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
@@ -47,10 +47,10 @@ def drive_again(
     vehicles, encounters = system.cut(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
-    stage = stage_of(system, encounters)
-    with user_errors(system.source), open_points_world(system, encounters, stage, start) as world:
+    traffic = traffic_of(system, encounters)
+    with user_errors(system.source), open_points_world(system, encounters, traffic, start) as world:
         motion = enter(on_road, vehicles, world).motion
-        observer = observer_of(point.scenario, world, stage)
+        observer = observer_of(point.scenario, world, traffic)
         is_open = np.ones(n, dtype=bool)
         frame = world.frame
         contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))

@@ -274,6 +274,8 @@ def advance(
     t = np.ones(
         (26, BLOCK)
     )  # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1
+
+    # Vehicles in blocks, each in columns of a table.
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
         t[:16, :count] = cars[:, start : start + count]
@@ -290,6 +292,8 @@ def advance(
                 t[21, i] = s.since_shift
                 t[22, i] = s.throttle
                 t[23, i] = s.brake
+
+        # A braked vehicle that is slower than a slope could move it stands.
         for i in range(count):
             if t[23, i] > 0.0 and t[16, i] < t[15, i]:  # a standstill
                 t[16, i] = 0.0

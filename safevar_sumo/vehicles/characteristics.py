@@ -143,6 +143,8 @@ class Characteristic:
                 if beyond
                 else f"a number in [{self.lower:g}, {self.upper:g}]"
             )
+
+            # A legal value outside the domain has a way to be accepted.
             is_outside_domain = (
                 not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
             )

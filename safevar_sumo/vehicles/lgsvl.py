@@ -166,6 +166,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: float | FloatArray = 0.0,
     ) -> _Prepared:
+        # Inertia of the wheels, and constants of the equations of motion.
         c = characteristics
         substep = step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
@@ -190,6 +191,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             slip_limit=c["tractionControlSlipLimit"],
             friction=np.asarray(FRICTION * road_friction),
         )
+
+        # The speed at which a slope moves the wheels counts as standstill.
         creep_speed = _rim_at(
             prepared,
             np.zeros_like(prepared.mass),
@@ -236,9 +239,13 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """
         p = prepared
         zeros = np.zeros_like(prepared.mass)
+
+        # The force that holds the speed, and the slip that it needs.
         force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.slope_deceleration
         rim = _rim_at(p, speed, force)
         wheel_speed = rim / p.radius
+
+        # The gear in which the engine is not too fast.
         gear = zeros + 1
         for lower_ratio in GEAR_RATIOS[:-1]:
             rpm = p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S)
@@ -246,6 +253,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             gear += is_too_fast
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
+
+        # The pedal that gives the torque.
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
         full_torque = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
         needed_torque = p.damping * wheel_speed + p.radius * force
@@ -341,11 +350,13 @@ def _roll(
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
     """
+    # Engine speed and torque.
     h = p.substep
     steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM_PER_RAD_S
     engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 
+    # Slip of the driven wheels, which traction control limits.
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
     is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
@@ -353,6 +364,7 @@ def _roll(
         is_spinning, -TRACTION_RATE * h, TRACTION_RATE * h
     )
 
+    # Wheel and body, with the stiffness of the tyres.
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = h * p.radius * stiffness
     damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
@@ -366,6 +378,8 @@ def _roll(
         p.inertia + h * p.damping + pull * p.radius - pull * pull / damped_mass
     )
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
+
+    # A braked vehicle that is slower than a slope could move it stands.
     is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(is_held):
         speed[is_held] = ZERO

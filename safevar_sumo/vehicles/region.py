@@ -179,9 +179,13 @@ def region_of(study: Study) -> FeasibleRegion:
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:
         return region
+
+    # The original vehicle satisfies every constraint.
     with about(f"{subject()}: the original vehicle"):
         required = "; the original vehicle must satisfy every constraint"
         region.check(characteristics.original[np.newaxis], otherwise=required)
+
+    # Random settings that do are not too rare.
     shape = (N_PROBES, len(characteristics))
     probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
     if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:

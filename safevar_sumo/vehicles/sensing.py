@@ -110,6 +110,8 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         water: float | FloatArray = 0.0,
     ) -> _PreparedSumo:
         c = characteristics
+
+        # Brakes and drive are those of a vehicle of the reference mass.
         mass_ratio = self.reference_mass / c["mass"]
         decel = c["decel"] * mass_ratio
         return _PreparedSumo(
@@ -274,12 +276,16 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         water: float | FloatArray = 0.0,
     ) -> _PreparedWorn:
         c = characteristics
+
+        # How the payload loads the rear axle.
         mass = self.kerb_mass + c["payload"]
         rear_load = (
             (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"])
             / mass
             / self.wheelbase
         )
+
+        # Tread that is left, and the field of view.
         tread = np.maximum(c["treadDepth"], 0.0)
         tangent: FloatArray | None = None
         if "sensorAngle" in c:

@@ -18,8 +18,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import across_fits, explain, failures
-from safevar_sumo.questions.explain.across_fits import are_causes, ranges_across_fits
+from safevar_sumo.questions.explain import across_sets, explain, failures
+from safevar_sumo.questions.explain.across_sets import are_causes, ranges_across_sets
 from safevar_sumo.questions.explain.causes import (
     BoundaryState,
     Limits,
@@ -290,17 +290,17 @@ def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> No
     holding = [are_causes(model, causes, COLLISION).tolist() for model in models]
     assert holding == [[holds] * len(causes) for holds in (True, False, False, True)]
     monkeypatch.setattr(
-        across_fits, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits]))
+        across_sets, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits]))
     )
     nobody = pd.Series(dtype=float)
     needed = pd.Series({"a": 1.0, "b": 1.0, "c": 0.0})
-    assert ranges_across_fits(models[0], 4, evaluations, COLLISION, needed, nobody) == {
+    assert ranges_across_sets(models[0], 4, evaluations, COLLISION, needed, nobody) == {
         ("unsafe", ""): (0.0, 0.5),
         ("needed", "a"): (1.0, 1.0),
         ("needed", "b"): (0.0, 1.0),
         ("needed", "c"): (0.0, 0.0),
     }
-    safe = ranges_across_fits(
+    safe = ranges_across_sets(
         models[0], 4, evaluations.take([3]), COLLISION, needed.head(0), nobody
     )
     assert safe == {("unsafe", ""): (0.0, 0.0)}, "safe with each"

@@ -14,8 +14,8 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios import TrackScenario
 from safevar_sumo.sumo.drive import drive
-from safevar_sumo.sumo.stage import LaneWorld, Stage
 from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.traffic import LaneWorld, Traffic
 from safevar_sumo.vehicles import Vehicle, calibration_drive
 from safevar_sumo.vehicles.base import SumoType
 
@@ -67,10 +67,10 @@ def ideal(system: System) -> System:
 def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> SimulationRuns:
     """Runs of the original vehicle in N encounters, whose parameters are arrays."""
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
-    stage = Stage([scenario], np.arange(n), n_samples=samples, step=STEP)
+    traffic = Traffic([scenario], np.arange(n), n_samples=samples, step=STEP)
     settings = np.tile(system.characteristics.original, (n, 1))
-    world = LaneWorld(stage, np.zeros(n) + scenario.start_speed, STEP)
-    return drive(replace(system, ads=ads, scenario=scenario), settings, world, stage)
+    world = LaneWorld(traffic, np.zeros(n) + scenario.start_speed, STEP)
+    return drive(replace(system, ads=ads, scenario=scenario), settings, world, traffic)
 
 
 class Mass(NamedTuple):

@@ -117,14 +117,14 @@ def compare(
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
-    originals = [each.evaluate_original() for each in evaluators]
+    originals = [side.evaluate_original() for side in evaluators]
     criteria = _criteria(subjects, evaluators, originals, unsafe, margin)
 
     # The same settings in both.
     pairs, outside = pairs_of(subjects, common, criteria, samples)
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
-    is_rating = all(is_rated(one.study) for one in evaluators)
+    is_rating = all(is_rated(side.study) for side in evaluators)
     tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
@@ -190,7 +190,7 @@ def _numbers(
 
 def _titles(evaluators: Sequence[Evaluator]) -> tuple[str, ...]:
     """What sentences call A and B: the names of their studies if they differ."""
-    names = tuple(one.study.name for one in evaluators)
+    names = tuple(side.study.name for side in evaluators)
     return names if names[0] != names[1] else ("A", "B")
 
 
@@ -204,7 +204,8 @@ def _criteria(
     """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its
     bodies touch.
     """
-    stated = [each.parse_criterion(unsafe) for each in evaluators if unsafe is not None]
+    # The stated criterion, a distance to keep, or what results suggest.
+    stated = [side.parse_criterion(unsafe) for side in evaluators if unsafe is not None]
     if stated:
         criterion = stated[0]
     elif margin is not None:
@@ -214,9 +215,9 @@ def _criteria(
     check_margin(criterion, margin)
     if criterion.is_collision and (margin is not None or not stated):
         criterion = replace(
-            criterion, keep=max(distance_to_keep(one.study, margin) for one in evaluators)
+            criterion, keep=max(distance_to_keep(side.study, margin) for side in evaluators)
         )
-    return [replace(criterion, contact=one.system.contact) for one in evaluators]
+    return [replace(criterion, contact=side.system.contact) for side in evaluators]
 
 
 def _default_criterion(
@@ -233,7 +234,7 @@ def _default_criterion(
         if default == Unsafe():
             return default
         defaults.append(default)
-    return next((one for one in defaults if one.points is None), defaults[0])
+    return next((default for default in defaults if default.points is None), defaults[0])
 
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
@@ -297,6 +298,7 @@ def _verdict(
     difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool
 ) -> Iterator[str]:
     """Whether B is better: in something and worse in nothing, needless braking included."""
+    # Only what is better without anything worse is better.
     a, b = titles
     better, worse, facts = ("; ".join(phrases) for phrases in difference)
     if worse and better:
@@ -328,7 +330,7 @@ def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str
     """Within which limits, and around which originals."""
     if limits:
         yield f"Compared within {join_phrases(limits)}."
-    members = [one.characteristics.members for one in common.evaluators]
+    members = [side.characteristics.members for side in common.evaluators]
     texts = [
         f"{item.name} {item.original:g} and {members[1][column].original:g}{item.suffix}"
         for column, item in enumerate(members[0])

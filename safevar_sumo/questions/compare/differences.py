@@ -104,14 +104,14 @@ def limits_of_both(
     within the user's limits; no interval where the original is unsafe.
     """
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
-    scans = [scan(one, columns, unsafe) for one, unsafe in zip(evaluators, criteria, strict=True)]
-    domains = [one.study.domains for one in evaluators]
+    scans = [scan(side, columns, unsafe) for side, unsafe in zip(evaluators, criteria, strict=True)]
+    domains = [side.study.domains for side in evaluators]
     rows = []
     for a, b in zip(*scans, strict=True):
         name = a.characteristic.name
         in_a, in_b = (
-            _within(one, within(limits, name, of[name]))
-            for one, of in zip((a, b), domains, strict=True)
+            _within(scan_of_side, within(limits, name, of[name]))
+            for scan_of_side, of in zip((a, b), domains, strict=True)
         )
         ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
         ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
@@ -121,11 +121,11 @@ def limits_of_both(
     )
 
 
-def _within(one: OneAtATimeScan, ends: Interval) -> Interval | None:
+def _within(limits_alone: OneAtATimeScan, ends: Interval) -> Interval | None:
     """What is safe alone and between the ends, rounded inwards."""
-    if one.safe is None:
+    if limits_alone.safe is None:
         return None
-    low, high = one.characteristic.rounded_inwards(one.safe)
+    low, high = limits_alone.characteristic.rounded_inwards(limits_alone.safe)
     return max(low, ends[0]), min(high, ends[1])
 
 
@@ -181,11 +181,16 @@ def compare_originals(
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's
     brakes: the numbers, and what they say.
     """
-    in_a, in_b = (bool(unsafe.of(one)[0]) for unsafe, one in zip(criteria, originals, strict=True))
+    # How both end, brake, and are rated.
+    in_a, in_b = (
+        bool(unsafe.of(original)[0]) for unsafe, original in zip(criteria, originals, strict=True)
+    )
     braking = _needless_braking(*evaluators)
     points = _points(evaluators, originals)
     metres = _metres_earlier(*evaluators)
     numbers = {**_ends_of_originals(evaluators, originals), **braking, **points, **metres}
+
+    # What differs, and in whose favour.
     parts = list[Difference]()
     if in_a != in_b:
         phrase = (
@@ -217,15 +222,18 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
     A's does not collide, if there is one. A point that A does not have counts unless A's original
     vehicle collides anywhere.
     """
-    systems = [one.system for one in evaluators]
+    # Collisions of both original vehicles, by point.
+    systems = [side.system for side in evaluators]
     in_a, in_b = (
         {
             result.point.name: result
-            for result in simulate_all_points(system, one.characteristics.original[np.newaxis])
+            for result in simulate_all_points(system, side.characteristics.original[np.newaxis])
         }
-        for system, one in zip(systems, evaluators, strict=True)
+        for system, side in zip(systems, evaluators, strict=True)
     )
     collides_in_a = {name: bool(result.evaluations.collided[0]) for name, result in in_a.items()}
+
+    # Those that are new in B, of which the fastest is named.
     new = [
         (float(-result.evaluations.f_safe[0]), result.point)
         for name, result in in_b.items()
@@ -244,11 +252,11 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
     """The rating points of both original vehicles; empty unless both studies are rated."""
-    if not all(is_rated(one.study) for one in evaluators):
+    if not all(is_rated(side.study) for side in evaluators):
         return {}
     return {
-        f"{side}_points": float(one.column(RATING_POINTS.name)[0])
-        for side, one in zip(SIDES, originals, strict=True)
+        f"{side}_points": float(original.column(RATING_POINTS.name)[0])
+        for side, original in zip(SIDES, originals, strict=True)
     }
 
 
@@ -257,12 +265,12 @@ def _ends_of_originals(
 ) -> JsonObject:
     """How both original vehicles end, with the gap where bodies do not touch at a degree of 0."""
     numbers: JsonObject = {}
-    for side, one, original in zip(SIDES, evaluators, originals, strict=True):
+    for side, evaluator, original in zip(SIDES, evaluators, originals, strict=True):
         numbers |= {
             f"{side}_outcome": str(original.outcome[0]),
             f"{side}_degree": float(original.f_safe[0]),
         }
-        if contact := one.system.contact:
+        if contact := evaluator.system.contact:
             numbers[f"{side}_gap"] = float(original.gaps(contact)[0])
     return numbers
 
@@ -271,12 +279,14 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """In how many of A's benign scenes the original vehicles of A and B brake, None without any;
     and the number of these scenes.
     """
-    systems = [one.system for one in (a, b)]
+    systems = [side.system for side in (a, b)]
     # What a study searches in its scenario, these scenes do not have.
-    systems = [replace(one, characteristics=one.characteristics.vehicle) for one in systems]
+    systems = [
+        replace(system, characteristics=system.characteristics.vehicle) for system in systems
+    ]
     scenes = benign_scenes(a.study, systems[0])
     brakes = [needless_braking(system, scenes) for system in systems]
-    counts = [sum(one) if one else None for one in brakes]
+    counts = [sum(of_side) if of_side else None for of_side in brakes]
     return {
         "a_needless_braking": counts[0],
         "b_needless_braking": counts[1],

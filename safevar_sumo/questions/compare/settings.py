@@ -115,15 +115,18 @@ class CommonDomain(NamedTuple):
             If B's original vehicle does not keep a limit, or the domains of a searched parameter
             have nothing in common.
         """
-        a, b = (one.characteristics for one in evaluators)
+        # The same limits in both, moved by the difference of the original vehicles.
+        a, b = (side.characteristics for side in evaluators)
         second = evaluators[1].study
         with about(second.source):
             check_limits(second.domains, limits, "limits: ")
         shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
-        domains = [one.study.domains for one in evaluators]
+        domains = [side.study.domains for side in evaluators]
         ends = np.array(
             [[within(limits, name, of_study[name]) for name in a.names] for of_study in domains]
         )
+
+        # Where both domains overlap.
         common = cls(evaluators, shift, lower=ends[:, :, 0], upper=ends[:, :, 1])
         lower, upper = common.ends_in_a
         is_empty = lower > upper
@@ -258,7 +261,8 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
         frame = pd.DataFrame({"source": SAMPLE, "solution": "", LINE: lines})
         rounds.append(Pairs(frame, settings, runs))
         failures = np.sum(
-            [unsafe.of(one) for unsafe, one in zip(criteria, runs, strict=True)], axis=0
+            [unsafe.of(evaluations) for unsafe, evaluations in zip(criteria, runs, strict=True)],
+            axis=0,
         )
         step /= 2
         beside = np.where(lines % 2, step, -step)
@@ -276,7 +280,8 @@ def _common_sample(common: CommonDomain, number: int) -> FloatArray:
         settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
         both = common.in_both(settings)
         is_feasible = [
-            one.region.feasible(values) for one, values in zip(common.evaluators, both, strict=True)
+            side.region.feasible(values)
+            for side, values in zip(common.evaluators, both, strict=True)
         ]
         settings = settings[is_feasible[0] & is_feasible[1]]
         if len(settings) >= number or factor >= MAX_FACTOR:

@@ -15,7 +15,7 @@ from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_fits import conclusions_across_fits
+from safevar_sumo.questions.explain.across_sets import conclusions_across_sets
 from safevar_sumo.questions.explain.causes import BOUNDARIES, SUBSETS, count_needed
 from safevar_sumo.questions.explain.failures import (
     TO_EXPLAIN,
@@ -37,7 +37,7 @@ from safevar_sumo.questions.explain.tables import (
     moved_table,
     statistics_tables,
 )
-from safevar_sumo.questions.model_spread import FITS_AT_ONCE
+from safevar_sumo.questions.model_spread import SETS_AT_ONCE
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
@@ -119,10 +119,10 @@ def explain(
         Approximate number of simulations for the minimal causes of all failures; if all would take
         more, a random sample is analysed.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) with
-        which each conclusion is drawn again; 0 leaves this out.
+        Number of parameter sets of the vehicle model (those of [spread]) with which each conclusion
+        is drawn again; 0 leaves this out.
     """
-    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, FITS_AT_ONCE, BOUNDARIES, BORDERS)
+    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, SETS_AT_ONCE, BOUNDARIES, BORDERS)
     study = evaluator.study
 
     # The failures, and the minimal causes of a sample of them.
@@ -142,7 +142,7 @@ def explain(
 
     # The same conclusions with the other parameter sets of the vehicle model.
     shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-    holding, ranges = conclusions_across_fits(evaluator, fits, population, of_chosen, *shares)
+    holding, ranges = conclusions_across_sets(evaluator, fits, population, of_chosen, *shares)
 
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
@@ -226,7 +226,7 @@ def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) ->
 
 
 def _verdict(
-    evaluator: Evaluator, population: Population, kind: str, fits: int, causes: pd.DataFrame
+    evaluator: Evaluator, population: Population, kind: str, sets: int, causes: pd.DataFrame
 ) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
     unsafe = population.unsafe
@@ -236,10 +236,14 @@ def _verdict(
         f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe"
         f" ({unsafe.description})."
     )
+
+    # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
         demand = f" {unsafe.smaller_demand}".rstrip()
         return f"The original itself {words}: no change is needed.{demand} {counts}"
+
+    # Without a cause, how the worst setting and the original end.
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
         ends = [
@@ -259,6 +263,8 @@ def _verdict(
     values = dict(
         zip(members.names, (printed[""].setting if printed else setting).tolist(), strict=True)
     )
+
+    # Its limits, its encounter, and how sure the cause is.
     limits = []
     for item in members:
         if item.name not in leading["boundary"]:
@@ -270,7 +276,11 @@ def _verdict(
     encounter = encounter_in_words(members, values, are_printed=bool(printed))
     where = f"{encounter}, where the original is safe," if encounter else ""
     sure = [robustness_in_words(leading["robust_share"])]
-    sure += [f"in {leading['fits_holding']} of {fits} fitted vehicle models"] if fits else []
+    sure += (
+        [f"in {leading['fits_holding']} of {sets} parameter sets of the vehicle model"]
+        if sets
+        else []
+    )
     notes = f" ({'; '.join(filter(None, sure))})" if any(sure) else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
     return f"With {join_phrases(limits)}{where} the vehicle {verb}{notes}. {counts}"
@@ -300,6 +310,7 @@ def draw_needed(answer: Answer) -> Figure:
         new_figure,
     )
 
+    # Bars over each other, the most necessary characteristic first.
     frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
     figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and needed", 1, 1, size)

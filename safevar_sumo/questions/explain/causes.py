@@ -54,6 +54,7 @@ def find_minimal_causes(
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
+    # What each setting changes; encounters stay as they are.
     characteristics = evaluator.characteristics
     names = characteristics.names
     is_changed = characteristics.changed(settings) & characteristics.of_vehicle
@@ -61,6 +62,8 @@ def find_minimal_causes(
     of_scenario = np.flatnonzero(~characteristics.of_vehicle).tolist()
     originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
+
+    # Subsets by size, those of all settings together.
     with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))) as expect:
         for size in range(max(map(len, changed), default=0) + 1):
             # Where a smaller subset is a cause, no larger one is minimal.
@@ -141,6 +144,7 @@ def count_needed(
         replacement from finitely many failures), the share itself if all failures were analysed.
         Ordered by needed, in_some, changed; no rows if there is no failure.
     """
+    # In how many failures a characteristic is in all causes, or in some.
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
     changed = changed[:, characteristics.of_vehicle]
@@ -150,6 +154,8 @@ def count_needed(
         is_in_cause = np.array([[name in cause.changes for name in names] for cause in group])
         needed += is_in_cause.all(axis=0)
         in_some += is_in_cause.any(axis=0)
+
+    # Of a sample the intervals are those of all failures.
     intervals = [(count / number, count / number) for count in needed.tolist()]
     if len(changed) < failures:  # a sample
         intervals = [clopper_pearson(int(count), number) for count in needed]
@@ -212,7 +218,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     causes = find_minimal_causes(evaluator, examined[names].to_numpy(dtype=float), case.unsafe)
     by_run: dict[tuple[str, int], set[tuple[str, ...]]] = {run: set() for run in case.finished_runs}
     kinds = [
-        {directions(evaluator.characteristics, one.changes) for one in group} for group in causes
+        {directions(evaluator.characteristics, cause.changes) for cause in group}
+        for group in causes
     ]
     for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
         by_run[run].update(group)
@@ -270,6 +277,8 @@ def find_cause_limits(
     """Find the limits of causes."""
     if not causes:
         return []
+
+    # What each cause changes.
     characteristics = evaluator.characteristics
     settings = settings_of(characteristics, causes)
     original = characteristics.with_original_vehicle(settings)
@@ -280,6 +289,8 @@ def find_cause_limits(
     is_scaled = np.concatenate(groups)
     ends = np.repeat(settings, line_counts, axis=0)
     original = np.repeat(original, line_counts, axis=0)
+
+    # A line begins where what it scales is as in the original.
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
         characteristics.threshold,
@@ -291,6 +302,8 @@ def find_cause_limits(
         shares, limits, states = _first_unsafe_shares(
             evaluator, starts, ends, unsafe, thresholds.max(axis=1)
         )
+
+    # The limits of each cause, from its lines.
     first_lines = np.cumsum([0, *line_counts])
     return [
         Limits(

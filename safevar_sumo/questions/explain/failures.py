@@ -93,6 +93,7 @@ def find_failures(
     InputError
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
+    # Settings of the study's domain, or solutions of the results.
     stated = None if criterion is None else evaluator.parse_criterion(criterion)
     named = [SolutionId.parse(text) for text in solutions]
     original = evaluator.evaluate_original()
@@ -106,9 +107,13 @@ def find_failures(
         candidates = _drawn_from(subject, evaluator)
     else:
         candidates = _solutions_of(subject, named)
+
+    # All are simulated here, and judged by one criterion.
     evaluations = evaluator.evaluate(candidates.settings, TO_EXPLAIN)
     unsafe = stated or Unsafe.default_among(evaluations, original)
     names = candidates.names
+
+    # Settings without a valid encounter do not count; a search leaves failures out, too.
     if isinstance(subject, Study):
         left_out = candidates.settings[evaluations.infeasible]
         counts = np.flatnonzero(~evaluations.infeasible)
@@ -119,6 +124,8 @@ def find_failures(
         left_out = _left_out_of_search(subject, unsafe)
         recorded = candidates.recorded
         otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
+
+    # Named settings are explained whatever they do.
     rows = (
         list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     )
@@ -190,10 +197,14 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     minimal cause that these do not have.
     """
     rows = population.rows
+
+    # Named failures are explained all.
     settings = population.evaluations.settings
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
         return Chosen(dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True)))
+
+    # Causes of a sample, and of failures that matter.
     limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = _failures_that_matter(population, evaluator, limit)
@@ -202,6 +213,8 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     causes = dict(zip(analysed, found, strict=True))
     reasons = dict(list(reasons.items())[:top])
     runs = population.evaluations
+
+    # For each distinct cause that is missing, the simplest failure that has it.
     keys = {
         row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]}
         for row in causes
@@ -255,11 +268,14 @@ def compare_at_points(
     system: System, settings: FloatArray, unsafe: Unsafe
 ) -> list[PointComparison]:
     """Compare M settings, shape (M, n), with the original vehicle, each in its own encounter."""
+    # Both vehicles at every point, and where it is unsafe.
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
     is_unsafe = np.stack([unsafe.of(evaluations) for evaluations in at_points])
     worst = worst_points(system, at_points)
+
+    # In words, at the worst point.
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
         names = (

@@ -86,6 +86,7 @@ def _smallest_cause(
     evaluator: Evaluator, failures: Evaluations, population: Population, limit: int
 ) -> JsonObject:
     """The most robust cause of the smallest robust failure, if there is one."""
+    # The smallest robust failure, and its causes.
     unsafe = population.unsafe
     step = evaluator.system.step
     most = limit // len(evaluator.system.points)  # an evaluation simulates a setting at every point
@@ -99,6 +100,8 @@ def _smallest_cause(
     )
     if not causes:
         return {}
+
+    # The most robust of them, if it is robust.
     shares = robust_shares(
         evaluator, settings_of(evaluator.characteristics, causes), step, unsafe
     ).mean(axis=1)

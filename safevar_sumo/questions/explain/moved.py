@@ -50,6 +50,7 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
 
     The driver reacts to any braking of a leader.
     """
+    # The furthest value of each characteristic in the causes.
     system = evaluator.system
     original = evaluator.characteristics.original
     names = list(evaluator.characteristics.names)
@@ -59,6 +60,8 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
         if abs(value - original[k]) > abs(furthest[k] - original[k]):
             furthest[k] = value
     changed = np.flatnonzero(furthest != original).tolist()
+
+    # The border of the encounter that moves, at every point.
     rows = []
     for point in system.points if changed else ():
         border = point.scenario.border
@@ -71,6 +74,8 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
         domain = evaluator.study.scenario.search.get(border, widest)
         study = _with_border(evaluator.study, point, border, domain)
         with_driver = evaluator.for_study(study, verified=0)
+
+        # The new car, and cars with one change each.
         vehicle = original[evaluator.characteristics.of_vehicle]
         cars = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[
             changed
@@ -89,9 +94,10 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
     """The study at one of its points, with a competent driver, and this parameter of the scenario
     alone searched.
     """
+    # The study's parameters at this point.
     parameters = {
         **study.scenario.parameters,
-        **{name: one.original for name, one in study.scenario.search.items()},
+        **{name: domain.original for name, domain in study.scenario.search.items()},
     }
     model = study.scenario.model
     over = dict(point.parameters)
@@ -100,6 +106,8 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
         shared = parameters if test.model in ("", model) else {}
         parameters = {**shared, **test.parameters, **{key: over[key] for key in test.over}}
         model = test.model or model
+
+    # All are fixed but the border.
     fixed = {
         name: value
         for name, value in parameters.items()

@@ -9,7 +9,7 @@ import pandas as pd
 
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_fits import Ranges
+from safevar_sumo.questions.explain.across_sets import Ranges
 from safevar_sumo.questions.explain.causes import (
     Cause,
     count_distinct_causes,
@@ -60,7 +60,7 @@ CAUSE_COLUMNS: Columns = {
     "robust_share": Column(
         "-", "share of the neighbours of these changes that are unsafe, too", ".2f"
     ),
-    "fits_holding": "number of fitted vehicle models in which these changes are a cause, too",
+    "fits_holding": "number of parameter sets with which these changes are a cause, too",
     "avoided_by": Column(
         "", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False
     ),
@@ -110,10 +110,14 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
     """A row of `SOLUTION_COLUMNS` for each chosen failure."""
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
+
+    # The failures that were chosen.
     study = evaluator.study
     failures = population.evaluations.take(list(reasons))
     settings = failures.settings
     unsafe = population.unsafe
+
+    # How they end beside the original, and who would have avoided the collision.
     if is_rated(study):  # each neighbour is simulated in all cells
         factors = STEP_FACTORS[:1]
         comparisons = compare_at_cells(evaluator, settings)
@@ -151,17 +155,23 @@ def causes_table(
     """
     study = evaluator.study
     unsafe = population.unsafe
+
+    # How robust each cause is.
     causes = [cause for group in causes_of for cause in group]
     robust = np.full(len(causes), np.nan)
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
+
+    # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:
         at_original = [cause._replace(encounter={}) for cause in causes]
         settings = settings_of(evaluator.characteristics, at_original)
         elsewhere = unsafe.of(evaluator.evaluate(settings, "causes in the original encounter"))
+
+    # Rows by failure, the most robust cause first.
     solution_of = np.repeat(range(len(solutions)), [len(group) for group in causes_of])
     rows = [
         {
@@ -184,8 +194,8 @@ def causes_table(
 def statistics_tables(
     needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
 ) -> dict[str, pd.DataFrame]:
-    """The tables of characteristics and of drivers, with ranges over the fitted vehicle models."""
-    in_fits = Column("-", "range over the fitted vehicle models", ".2f")
+    """The tables of characteristics and of drivers, with ranges over parameter sets."""
+    in_fits = Column("-", "range over parameter sets of the vehicle model", ".2f")
     of_characteristics = [ranges.get(("needed", str(name))) for name in needed["characteristic"]]
     of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
     return {

@@ -95,6 +95,7 @@ def tables(
     jobs
         Number of worker processes that simulate causes, by default one for each core.
     """
+    # The cases, and the algorithm that is compared.
     cases = _cases_of(results)
     if algorithm:
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
@@ -102,6 +103,8 @@ def tables(
     causes_of_cases = {
         case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs
     }
+
+    # Tables, figures, and the command that gives them.
     answer = answer_questions(cases, Choices(label_of(algorithm), alpha, causes_of_cases))
     if figures is not None:
         save_figures(cases, figures)
@@ -156,6 +159,7 @@ def answer_questions(
     UnanswerableError
         If no question has an answer.
     """
+    # Each table, of every case that can answer it.
     words = titles_of(cases)
     frames = {}
     remarks = []
@@ -181,6 +185,8 @@ def answer_questions(
         shown = {**columns, label: columns[label]._replace(is_shown=len(cases) > 1)}
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
+
+    # Nothing at all is an error; remarks stand once.
     if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
     of_all = [
@@ -258,6 +264,7 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
     """What tests of pooled solutions leave out: algorithms with too few runs, and undefined
     values.
     """
+    # What cannot be significant, or is undefined.
     tested = "algorithm" if table == "rq1" else "baseline"
     with_few_runs = frame.loc[~frame["enough_runs"], tested].unique()
     if len(with_few_runs):

@@ -159,6 +159,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     encounter of a solution, so that TET, TIT and aveDece are undefined; the original's value is the
     mean over these encounters.
     """
+    # The critical solutions and their original vehicles.
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = (
@@ -168,6 +169,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     original = case.original
     if case.study.scenario.search:
         original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
+
+    # Differences from the original, by quantity.
     values = {
         ("avgSD_mD",): np.where(has_collided, np.nan, degrees - safety_degree),
         ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
@@ -176,6 +179,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
         ("aveDece",): original["ave_dece"] - deceleration,
     }
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
+
+    # Relative to the original's values.
     scale = frame["quantity"].map(SAFETY_SCALES).map(original).abs().replace(0.0, np.nan)
     frame["percent"] = 100 * frame["value"] / scale
     return frame

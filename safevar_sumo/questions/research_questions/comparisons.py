@@ -233,6 +233,7 @@ def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     the algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the
     other algorithms.
     """
+    # The first collision of each run; a run without one has needed more.
     ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
     collisions = case.evaluations[
         are_collisions(case.evaluations) & case.scoring.feasible_rows(case.evaluations)
@@ -244,6 +245,8 @@ def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     samples = {
         str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs
     }
+
+    # Medians with intervals, and tests against the reference algorithm.
     reference = choices.algorithm or (NSGA2 if NSGA2 in samples else next(iter(samples)))
     rows = []
     for algorithm, (times, found) in samples.items():
@@ -296,6 +299,8 @@ def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
 def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
     """A row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
+
+    # A test for each algorithm and metric.
     rows = []
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values = _values(case, algorithm, metric, over_runs)

@@ -79,6 +79,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
         If there is no solution.
     """
     reference_front(case)  # raises if there is no solution
+
+    # The front of each algorithm.
     objectives = case.scoring.objectives
     fronts = {
         algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
@@ -90,9 +92,13 @@ def draw_pareto_fronts(case: Case) -> Figure:
         or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
         for objective in objectives
     ]
+
+    # A panel for each pair of objectives.
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
     figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
+
+    # The original vehicle in the same axes.
     known_values = {
         F_DIFF.name: 0.0,
         F_NUM_DIFF.name: 0.0,
@@ -128,6 +134,7 @@ def draw_convergence(case: Case) -> Figure:
     """
     import seaborn as sns
 
+    # Growth over all evaluations, as median and quartiles.
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
     labels = {
@@ -150,6 +157,8 @@ def draw_convergence(case: Case) -> Figure:
         "normalised hypervolume of all settings so far\n(line: median, band: quartiles over runs;\n"
         f"mark: of what a run returns; reference point {REFERENCE_COORDINATE:g})"
     )
+
+    # A mark for what runs return.
     ends = growth.groupby("algorithm", sort=False)["evaluations"].max()
     returned = (
         compute_indicators(case)["hypervolume"]
@@ -184,6 +193,7 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     UnanswerableError
         If no case has an answer.
     """
+    # Counts of each case that has an answer.
     counts_by_case = {}
     errors = []
     for case in cases:
@@ -193,6 +203,8 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
             errors.append(error)
     if not counts_by_case:
         raise errors[0]
+
+    # A panel for each of them.
     title = "number of changed characteristics"
     figure, axes = new_panels(
         title, len(counts_by_case), 3, (3.9, 3.3), min_width=6.4, title_height=0.5
@@ -222,6 +234,8 @@ def draw_changed_characteristics(case: Case) -> Figure:
     import seaborn as sns
 
     _critical_changes(case)  # raises if there are none
+
+    # Shares by characteristic and number of changes, the most frequent first.
     shares = rq32(case)
     order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
     table = shares.pivot(index="characteristic", columns="j", values="percent").loc[
@@ -253,11 +267,15 @@ def draw_change_sizes(case: Case) -> Figure:
     """The distribution of each characteristic's signed changes in the critical solutions."""
     changes_of_solutions = _critical_changes(case)
     title = f"{case.name}: changes in critical solutions"
+
+    # A panel for each characteristic.
     vehicle = case.characteristics.vehicle
     figure, axes = new_panels(title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
     for axis, characteristic, changes in zip(axes, vehicle, changes_of_solutions.T, strict=True):
         low = characteristic.lower - characteristic.original
         high = characteristic.upper - characteristic.original
+
+        # Increases and decreases over its domain.
         increases = changes[changes > 0]
         decreases = changes[changes < 0]
         axis.hist(

@@ -235,11 +235,13 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no evaluations or no solutions.
     """
+    # The same numbers of evaluations for all runs.
     reference = reference_front(case)
     frames = []
     counts = np.linspace(0, case.study.search.evaluations, CURVE_POINTS + 1, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
     for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+        # The front grows by what each stretch adds.
         valid = valid_evaluations(case, group)
         points = normalised(minimised_values(case, valid), reference)
         numbers = valid["evaluation"].to_numpy()

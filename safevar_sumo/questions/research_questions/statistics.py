@@ -189,8 +189,8 @@ def survival_median(
         warnings.simplefilter("ignore")  # of undefined ends of the interval
         ends = curve.confidence_interval(1 - alpha, method="log-log")
 
-    def time_below_half(one: Any) -> float:
-        return next(iter(one.quantiles[one.probabilities <= 0.5]), math.nan)
+    def time_below_half(curve: Any) -> float:
+        return next(iter(curve.quantiles[curve.probabilities <= 0.5]), math.nan)
 
     return time_below_half(curve), (time_below_half(ends.low), time_below_half(ends.high))
 

@@ -1,7 +1,4 @@
-"""Do conclusions hold with the other vehicle models that fit the published data about as well?
-
-These are the parameter sets of a study's table [spread].
-"""
+"""Do conclusions hold with the other parameter sets of the vehicle model, those of [spread]?"""
 
 from __future__ import annotations
 
@@ -34,7 +31,7 @@ MAX_FAILURES = 20
 """Maximum number of failures, those with the fewest changes, whose minimal causes are found with
 each set.
 """
-STAGE = "other fitted vehicle models"
+PHASE = "other parameter sets"
 Ranges = dict[tuple[str, str], Interval]
 """Ranges over parameter sets by kind and name of a share: (`unsafe`, ""), the settings that are
 unsafe; (`needed`, a characteristic), the failures that need it; (`avoided`, a driver), the
@@ -60,24 +57,25 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
             np.vstack([setting, np.where(is_left_out, characteristics.original, setting)])
         )
     starts = np.cumsum([0, *map(len, groups[:-1])])
-    is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), STAGE))
+    is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), PHASE))
     # The first setting of a group, with all changes, is the only unsafe one.
     return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
 
 
-def ranges_across_fits(
+def ranges_across_sets(
     evaluator: Evaluator,
-    fits: int,
+    sets: int,
     evaluations: Evaluations,
     unsafe: Unsafe,
     needed: pd.Series[float],
     avoided: pd.Series[float],
 ) -> Ranges:
-    """The ranges of the shares over the study's own parameters and the first `fits` sets.
+    """The ranges of the shares over the study's own parameters and the first `sets` sets.
 
     With its own parameters, the shares of failures that need a characteristic are `needed`, and of
     collisions that a driver avoids `avoided`.
     """
+    # A sample of vehicles, and of failures with few changes.
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(len(evaluations))
     vehicles = evaluations.settings[shuffled[:MAX_VEHICLES]]
     failures = evaluations.take(unsafe.of(evaluations))
@@ -91,7 +89,7 @@ def ranges_across_fits(
         frame = count_needed(
             of_set.characteristics, changed, [causes[row] for row in rows], len(rows)
         )
-        runs = of_set.evaluate(vehicles, STAGE)
+        runs = of_set.evaluate(vehicles, PHASE)
         avoided_here = avoided
         if not avoided.empty:
             judged, *_ = judge_sample(of_set, runs.take(runs.collided))
@@ -100,8 +98,9 @@ def ranges_across_fits(
             unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here
         )
 
+    # Shares with every set, as differences from those with the study's own parameters.
     shares = _shares_by_kind(unsafe.of(evaluations), needed, avoided)
-    of_sets = across(evaluator, min(fits, MAX_SHARE_SETS), sample_shares)
+    of_sets = across(evaluator, min(sets, MAX_SHARE_SETS), sample_shares)
     samples = pd.concat(of_sets, axis=1).reindex(shares.index)
     # There is no share where a sample has no failure, or no collision.
     of_own_parameters = samples[0].fillna(shares)
@@ -112,25 +111,25 @@ def ranges_across_fits(
     return dict(zip(shares.index, ranges, strict=True))
 
 
-def conclusions_across_fits(
+def conclusions_across_sets(
     evaluator: Evaluator,
-    fits: int,
+    sets: int,
     population: Population,
     causes: Sequence[Sequence[Cause]],
     needed: pd.Series[float],
     avoided: pd.Series[float],
 ) -> tuple[list[BoolArray], Ranges]:
-    """Whether each cause is one, with each of the first `fits` sets, and the result of
-    `ranges_across_fits`; nothing without sets or settings.
+    """Whether each cause is one, with each of the first `sets` sets, and the result of
+    `ranges_across_sets`; nothing without sets or settings.
     """
     unsafe = population.unsafe
     evaluations = population.evaluations
-    if not (fits and evaluator.study.spread and len(evaluations)):
+    if not (sets and evaluator.study.spread and len(evaluations)):
         return [], {}
     evaluator = evaluator.for_study(evaluator.study, verified=0)  # as those of the sets
     flat = [cause for group in causes for cause in group]
-    holding = across(evaluator, fits, lambda each: are_causes(each, flat, unsafe))
-    return holding, ranges_across_fits(evaluator, fits, evaluations, unsafe, needed, avoided)
+    holding = across(evaluator, sets, lambda of_set: are_causes(of_set, flat, unsafe))
+    return holding, ranges_across_sets(evaluator, sets, evaluations, unsafe, needed, avoided)
 
 
 def _shares_by_kind(

@@ -53,7 +53,7 @@ passed, or scenery.
 """
 
 
-class Stage:
+class Traffic:
     """The bodies around N vehicles.
 
     `group`, shape (N,), is the number of each vehicle's scenario; or, where the only one has arrays
@@ -188,29 +188,29 @@ class Stage:
         ranks = []
 
         # Who is nearest of those that are or come into the way?
-        for one in seen:
-            body = self._bodies[one.body]
-            counts: BoolArray = self._row(self._counts[one.body])
-            time_to_arrival = np.maximum(one.gap, 0.0) / np.maximum(
-                one.closing, LEAST_CLOSING_SPEED
+        for found in seen:
+            body = self._bodies[found.body]
+            counts: BoolArray = self._row(self._counts[found.body])
+            time_to_arrival = np.maximum(found.gap, 0.0) / np.maximum(
+                found.closing, LEAST_CLOSING_SPEED
             )
             lateral = self._row(body.track.y)
             drift = self._row(body.vy)
-            lateral_at_arrival = lateral + drift * np.where(one.closing > 0, time_to_arrival, 0.0)
-            comes = (one.closing > 0) & (
+            lateral_at_arrival = lateral + drift * np.where(found.closing > 0, time_to_arrival, 0.0)
+            comes = (found.closing > 0) & (
                 np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width)
             )
             # A leader at the vehicle's speed who makes way is nobody to brake for.
-            leaves = (np.sign(lateral) * drift > 0) & (one.closing <= APPROACH_SPEED)
+            leaves = (np.sign(lateral) * drift > 0) & (found.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
-                one.gap
+                found.gap
                 + OFF_THE_WAY * ~is_in_way
-                + HIDDEN * ~one.visible
-                + PASSED * one.is_passed
+                + HIDDEN * ~found.visible
+                + PASSED * found.is_passed
                 + NOT_MET * ~counts
             )
-            ranks.append(np.where(self._struck == one.body, -np.inf, rank))
+            ranks.append(np.where(self._struck == found.body, -np.inf, rank))
 
         # A scene of which each vehicle sees its own body.
         chosen = np.argmin(np.stack(ranks), axis=0)
@@ -349,15 +349,15 @@ class _Seen(NamedTuple):
 
 
 class LaneWorld:
-    """N vehicles on a stage, which move by SUMO's ballistic update."""
+    """N vehicles on a lane among bodies on tracks, which move by SUMO's ballistic update."""
 
     frame = LANE
 
-    def __init__(self, stage: Stage, start_speeds: FloatArray, step: float) -> None:
-        self.n = stage.n
+    def __init__(self, traffic: Traffic, start_speeds: FloatArray, step: float) -> None:
+        self.n = traffic.n
         self.step_length = step
-        self._stage = stage
-        self._front = np.zeros(stage.n)
+        self._traffic = traffic
+        self._front = np.zeros(traffic.n)
         self._speed = start_speeds
         self._sample = 0
 
@@ -372,17 +372,17 @@ class LaneWorld:
         return self._motion(is_open)
 
     def _motion(self, is_open: BoolArray) -> VehicleStates:
-        hits = self._stage.hits(self._sample, self._front, self._speed, is_open)
+        hits = self._traffic.hits(self._sample, self._front, self._speed, is_open)
         fronts = np.zeros((self.n, 2))
         fronts[:, 0] = self._front
         return VehicleStates(fronts, self._speed, hits)
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
-        return self._stage.bodies(vehicles, self._front, self._speed)
+        return self._traffic.bodies(vehicles, self._front, self._speed)
 
     def vehicle_length(self, actor: str) -> float:
-        return self._stage.length
+        return self._traffic.length
 
     @property
     def vehicle_width(self) -> float:
-        return self._stage.width
+        return self._traffic.width

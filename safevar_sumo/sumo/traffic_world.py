@@ -1,4 +1,4 @@
-"""A stage in SUMO: its bodies are put where their tracks say, and the vehicles under test drive
+"""Bodies on tracks in SUMO: they are put where their tracks say, and the vehicles under test drive
 among them.
 
 SUMO's own word on collisions is not taken: it misses contacts at the side between lanes, and calls
@@ -22,7 +22,7 @@ from safevar_sumo.sumo.bodies import BodyPairs, VehicleStates
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.moving import Sampled, row
 from safevar_sumo.sumo.network import NetworkFiles, copied_network
-from safevar_sumo.sumo.stage import LaneWorld, Stage
+from safevar_sumo.sumo.traffic import LaneWorld, Traffic
 from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 
@@ -81,26 +81,26 @@ class Placed(NamedTuple):
         return cls(track, ids, is_person, np.asarray(x), np.asarray(y), angle)
 
 
-class StageWorld(SumoWorld):
-    """N copies of a road in SUMO with the bodies of a stage.
+class TrafficWorld(SumoWorld):
+    """N copies of a road in SUMO with bodies on tracks.
 
     Vehicles are where they are on `lane`, in its coordinates, to the last bit: SUMO must have them
     at the same places.
     """
 
     def __init__(
-        self, api: Api, n: int, stage: Stage, start_speeds: FloatArray, start: Frame
+        self, api: Api, n: int, traffic: Traffic, start_speeds: FloatArray, start: Frame
     ) -> None:
         super().__init__(api, n)
-        self._stage = stage
+        self._traffic = traffic
         self._start = start
 
-        # Vehicles on a lane, and actors that the stage places.
+        # Vehicles on a lane, and actors that are placed on their tracks.
         self._sample = 0
-        self._lane = LaneWorld(stage, start_speeds, self.step_length)
+        self._lane = LaneWorld(traffic, start_speeds, self.step_length)
         self._actors = [
             Placed.of(track, self.ids(track.name), start)
-            for track in stage.cast
+            for track in traffic.cast
             if track.kind != SCREEN
         ]
 
@@ -184,7 +184,7 @@ class StageWorld(SumoWorld):
         return values
 
     def _at_copies(self, column: Sampled) -> Sampled:
-        values = row(column, self._sample, self._stage.group)
+        values = row(column, self._sample, self._traffic.group)
         return values if len(values) == self.n else np.repeat(values, self.n)
 
     def _checked(self, motion: VehicleStates) -> VehicleStates:
