@@ -72,10 +72,13 @@ class Contents(NamedTuple):
         """The names that an answer has with these values of options, `NAME` for an option that has
         none, and those that a study has `given`, by table; of numbers under "".
         """
+        # Names that values of options give.
         named = defaultdict(lambda: "NAME")
         for option, text in values.items():
             if isinstance(text, str):
                 named[option] = text.partition("=")[0].strip()
+
+        # Names that a study gives, in each table.
         tables = {"": self.numbers, **self.tables}
         for table, names in tables.items():
             of_study = given.get(table, [...])
@@ -92,6 +95,7 @@ class Contents(NamedTuple):
 
     def check_key(self, key: str) -> None:
         """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
+        # A number, a number in a list, or a column.
         name, _, rest = key.rpartition(".")
         names = self.numbers
         wanted = key
@@ -182,6 +186,7 @@ class Answer:
         """Plain values: question, study, verdict, numbers, and of each table its columns and rows;
         null where undefined.
         """
+        # Each table with units and meanings.
         tables = {}
         for name, frame in self.tables.items():
             columns = columns_of(frame).items()
@@ -264,6 +269,7 @@ class Answer:
 
     def print(self, console: Console) -> None:
         """Print the verdict, the tables and the numbers."""
+        # Verdict, tables, and what else there is.
         print_text(console, self.verdict)
         for frame in self._short_tables.values():
             for part in terminal_tables(frame, console.width):
@@ -342,6 +348,7 @@ class Answer:
         InputError
             If there is no such number.
         """
+        # A column, a number, or a number in a list.
         Contents(
             self.numbers, {name: [*map(str, frame)] for name, frame in self.tables.items()}
         ).check_key(key)

@@ -120,6 +120,7 @@ class Option(NamedTuple):
         """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has
         another type or is outside the range.
         """
+        # A table NAME=VALUE, a text, or several.
         if self.is_repeated:
             if isinstance(value, Mapping):
                 value = [f"{name}={inner}" for name, inner in value.items()]
@@ -128,6 +129,8 @@ class Option(NamedTuple):
             return value
         if self.kind not in (int, float):
             return check_text(self.name, value)
+
+        # A number within its limits.
         number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
         words = f"{words} {self.limits}" if self.limits else words
         if (

@@ -68,6 +68,7 @@ class Box:
         In a study that searches its scenario, each corner of the vehicle's characteristics meets
         equally many encounters, drawn anew in each attempt.
         """
+        # Every combination of ends, or some of them.
         of_vehicle = self.region.characteristics.of_vehicle
         is_open = self.lower < self.upper
         worn = np.flatnonzero(of_vehicle & is_open)
@@ -80,6 +81,8 @@ class Box:
         )
         points = np.zeros((len(numbers), len(self.lower)))
         points[:, worn] = numbers[:, np.newaxis] >> np.arange(size) & 1
+
+        # The corners meet several encounters.
         if not (~of_vehicle & is_open).any():
             return self.at(points)
         points = np.tile(points, (MET_BY_CORNERS // len(points), 1))
@@ -140,10 +143,13 @@ def prove(
     """
     import scipy  # takes longer to load than a simulation
 
+    # Samples enough for the bound, if all are safe.
     error = _error_of(attempt)
     settings = draw(proof_size(attempt, share))
     judgement = judge(settings)
     is_unsafe = judgement.unsafe & judgement.counted
+
+    # An upper bound on the share, where a failed simulation counts as unsafe.
     samples = int(np.count_nonzero(judgement.counted))
     failures = int(np.count_nonzero(is_unsafe))
     not_simulated = int(np.count_nonzero(judgement.failed & judgement.counted))

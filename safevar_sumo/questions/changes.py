@@ -78,6 +78,7 @@ def read_changes(
 
 
 def _parse_values(change: str, text: str, original: float, forms: str) -> list[float]:
+    # A percentage of the original, a sweep, or a number.
     if percentage := PERCENTAGE.fullmatch(text):
         if not original:
             raise InputError(

@@ -33,6 +33,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     InputError
         If the study has no such metric.
     """
+    # The study also measures what the criterion is about.
     if unsafe.bound is None:
         return study
     name = unsafe.bound.measure
@@ -44,6 +45,8 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     )
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
+
+    # And counts the point that is worst by it.
     if matrix is not None and not unsafe.is_of_points:
         matrix = replace_in(
             matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}"

@@ -166,6 +166,8 @@ def studies_of_sets(study: Study) -> list[Study]:
             "has no table [spread]",
             "a study that was fitted to data, such as sun or rain",
         )
+
+    # Parameters outside the sets keep their values.
     outside_names = parameters_outside_sets(study)
     sets = {key: values[1:] for key, values in study.spread.items() if key not in outside_names}
     number = len(next(iter(study.spread.values()))) - 1

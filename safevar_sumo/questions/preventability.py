@@ -151,11 +151,14 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
     too, or if he cannot be simulated. The columns are the drivers' names and `point`, the name of
     the point.
     """
+    # Drivers, and those for lanes.
     system = evaluator.system
     drivers = DRIVERS | (OF_LANES if any(point.scenario.border for point in system.points) else {})
     verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=list(drivers)).assign(
         point=""
     )
+
+    # Every collision at its own point.
     for index in np.unique(collisions.points).tolist():
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]

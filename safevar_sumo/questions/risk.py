@@ -98,6 +98,7 @@ def risk(
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
+    # Vehicles as the study says that they vary.
     study = evaluator.study
     model = VariationModel(evaluator.study)
     criterion = evaluator.choose_criterion(unsafe, subject)
@@ -108,6 +109,8 @@ def risk(
         for start in range(0, samples, VEHICLES_PER_CALL):
             vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
             batches.append(evaluator.evaluate(vehicles, SAMPLING))
+
+    # How many are unsafe.
     drawn = Evaluations.concatenate(batches)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures = int(criterion.of(simulated).sum())
@@ -116,6 +119,8 @@ def risk(
         raise SimulationError(
             f"study {study.name!r}: none of {samples} vehicles could be simulated"
         )
+
+    # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
     if model.is_correlated or model.region or study.scenario.search:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
@@ -129,6 +134,8 @@ def risk(
         "interval": [low, high],
         "confidence": confidence,
     }
+
+    # In words.
     verdict = (
         f"{_probability_in_words(study, failures / total)} ({criterion.description}; from"
         f" {100 * low:.3g} to {100 * high:.3g} % with {100 * confidence:g} % confidence,"
@@ -157,6 +164,8 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     if table.empty:
         return ""
     index = "total" if table["degree_total"].notna().any() else "first"
+
+    # The largest share, of all orders if it is known.
     first = table.iloc[0]
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
     words = ""
@@ -166,6 +175,8 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
             f" {name} has the largest share of the safety degree's variance, {share:.2f} ({low:.2f}"
             f" to {high:.2f})."
         )
+
+    # Shares that are too unsure to be told.
     of_output = {
         name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
     }
@@ -189,6 +200,8 @@ def _probability_in_words(study: Study, probability: float) -> str:
             f"{100 * probability:.3g} % of the domain is unsafe, no probability in the field"
             " without [variation]"
         )
+
+    # Distributions other than the uniform one.
     variation = [
         f"{name} {distribution.__struct_config__.tag}"
         for name, distribution in study.variation.items()
@@ -212,6 +225,7 @@ def sobol_indices(
     from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
 
+    # A design in which each characteristic varies alone and with all others.
     names = list(evaluator.characteristics.names)
     seed = evaluator.study.search.seed % 2**32
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
@@ -229,6 +243,7 @@ def sobol_indices(
         indices: Indices = analysis.analyze(problem, output[is_complete], **options)
         return indices
 
+    # Indices of both outputs, over the complete rows.
     outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
@@ -245,6 +260,7 @@ def given_data_indices(
     """
     from SALib.analyze import delta as analysis
 
+    # Characteristics that vary in the sample.
     varies = np.ptp(drawn.settings, axis=0) > 0
     names = [
         name
@@ -268,6 +284,7 @@ def given_data_indices(
             )
         return indices
 
+    # Indices of both outputs, with what is correlated.
     outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
@@ -298,6 +315,8 @@ def _table(
     `indices` maps an index to SALib's key and its meaning.
     """
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
+
+    # An index of each output, with its interval.
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
     for output, of_what in OUTPUTS.items():
@@ -310,6 +329,8 @@ def _table(
             columns |= with_interval(
                 name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f")
             )
+
+    # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)

@@ -191,18 +191,23 @@ def _find_boxes(
     """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to
     those before it is dropped.
     """
+    # Leaves of a tree in which more than half of the vehicles are unsafe.
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
     leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
+
+    # Rounded, without conditions that do not help.
     digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
     rounded = [
         np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes
     ]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
     boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
+
+    # Boxes that add enough unsafe vehicles to those before.
     chosen = list[FloatArray]()
     is_uncovered = is_unsafe.copy()
     least_added = MIN_ADDED_SHARE * np.count_nonzero(is_unsafe)
@@ -228,6 +233,7 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
         return int(np.flatnonzero(means >= least)[-1])
 
+    # Trees that are pruned more and more.
     tree = DecisionTreeClassifier(
         max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0
     )
@@ -237,6 +243,8 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     strengths = strengths[:-1]  # the strongest pruning leaves no condition
     evenly_spaced = np.unique(np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int))
     prunings = {"ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)}
+
+    # The smallest tree that predicts about as well as the best.
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     search = GridSearchCV(
         tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough
@@ -254,6 +262,8 @@ def _boxes_of_leaves(
         counts = tree.value[node][0]
         yield box, float(counts[-1] / counts.sum())
         return
+
+    # Both sides of the node's condition.
     column = int(tree.feature[node])
     threshold = lower[column] + tree.threshold[node] * width[column]
     above = box.copy()

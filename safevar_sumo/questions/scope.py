@@ -33,6 +33,7 @@ def scope_of(study: Study, *, between: bool = True) -> str:
 
     Without `between`, nothing was simulated between the values of a matrix, which are then listed.
     """
+    # What drives in each test.
     points = assemble(study).points
     if study.matrix is None or study.matrix.protocol:
         name = "" if study.matrix is None else str(study.matrix.protocol)
@@ -52,6 +53,8 @@ def scope_of(study: Study, *, between: bool = True) -> str:
             )
             for test, own in points_of_tests(study, points)
         ]
+
+    # Tests with the same scenario and parameters share a phrase.
     phrases = []
     for model, parameters in dict.fromkeys((model, parameters) for model, _, parameters in drives):
         names = [
@@ -73,6 +76,7 @@ def _parameters_in_words(
     """The speeds and other parameters of a test that vary: over its axes, and in a search over the
     scenario.
     """
+    # Axes of the matrix, and searched parameters.
     over = {} if test is None else test.over
     searchable = searchable_in(points[0].scenario)
     phrases = {}
@@ -81,6 +85,8 @@ def _parameters_in_words(
         phrases[name] = f"{_values_in_words(values, between and name in searchable)}{unit}"
     for name, domain in study.scenario.search.items():
         phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
+
+    # Speeds of tests that state none, first.
     speeds = sorted(
         {point.scenario.test_speed for point in points if point.scenario.test_speed is not None}
     )

@@ -207,12 +207,15 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     from safevar_sumo.campaign.identity import identity_of
     from safevar_sumo.sumo.system import assemble
 
+    # Inputs of the results that have changed since.
     manifest = read_manifest(directory)
     study = case.study
     if "imported" in manifest:
         return []
     present = manifest_of(study, identity_of(study, assemble(study), manifest.get("files", {})))
     changes = [text for _, text, matters in manifest_differences(manifest, present) if matters]
+
+    # Without `as_it_is_now` they are refused.
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED
         named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")

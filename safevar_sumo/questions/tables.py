@@ -117,6 +117,7 @@ def plain(value: Any) -> Any:
 
 def cell_text(value: Any, number_format: str = ".4g") -> str:
     """A value for readers; `-` where undefined."""
+    # By the kind of value.
     value = plain(value)
     if value is None:
         return "-"
@@ -150,6 +151,8 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
     if wide is None or frame.empty:
         yield name, frame
         return
+
+    # A table for each value, with a column for each head.
     heads = frame[wide.by].unique()
     title = frame.attrs["title"]
     words = frame.attrs["words"]
@@ -160,6 +163,8 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         column = columns[of_value[0]]
         shown = {label: columns[label] for label in wide.labels}
         shown |= {f"{name}{end}": column._replace(unit="") for name in names for end in ends}
+
+        # A row for each combination of labels.
         rows = []
         for labels, group in frame.groupby([*wide.labels], sort=False):
             by_head = group.set_index(wide.by)[of_value].reindex(heads)
@@ -245,6 +250,7 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     """The table; columns that do not fit stand in further tables, in which the first columns of
     text are repeated, and long texts in lines of their own.
     """
+    # Long texts stand below a table.
     every = list(reader_columns(frame))
     long = [column for column in every if column.is_long]
     columns = [column for column in every if not column.is_long]
@@ -256,6 +262,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
         columns = every
         long = []
+
+    # Blocks that fit into the width, each with the labels.
     labels = list(takewhile(lambda column: not column.is_number, columns))
     if 1 + sum(map(_least_width, labels)) > width:
         labels = labels[:1]
@@ -267,6 +275,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         ):
             blocks.append([*labels])
         blocks[-1].append(column)
+
+    # Bars, blocks, and long texts.
     bars = [bar.blocks for bar in frame.attrs.get("bars", ())]
     if bars and columns:
         yield WholeTable(
@@ -293,6 +303,7 @@ def html_table(frame: pd.DataFrame) -> str:
     """A table with a caption, in which a screen reader finds the headings; texts have the class
     `label`.
     """
+    # Heads and cells, with the head that a phone shows beside each cell.
     columns = list(reader_columns(frame))
     classes = ["" if column.is_number else ' class="label"' for column in columns]
     heads = "".join(
@@ -307,6 +318,8 @@ def html_table(frame: pd.DataFrame) -> str:
         )
         for cells in zip(*(column.texts for column in columns), strict=True)
     ]
+
+    # Bars in a column of their own.
     title = escape(frame.attrs.get("title", ""))
     if bars := frame.attrs.get("bars"):
         heads = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
@@ -329,6 +342,7 @@ def html_table(frame: pd.DataFrame) -> str:
 
 def latex_table(label: str, frame: pd.DataFrame) -> str:
     """A booktabs table that fits into the line."""
+    # Cells and columns by kind.
     readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
     style = (
         readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)

@@ -39,12 +39,16 @@ class VariationModel:
         with about(study.source):
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
+
+        # A distribution for each characteristic.
         distributions = [
             study.variation.get(name, Uniform()) for name in self.characteristics.names
         ]
         self._source = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
         self.is_correlated = bool(study.correlations)
+
+        # A factor with which independent normal numbers become correlated.
         correlations = np.eye(len(distributions))
         for correlation in study.correlations:
             first, second = map(self.characteristics.names.index, correlation.between)
@@ -94,12 +98,15 @@ def _quantile_function(
     characteristic: Characteristic, distribution: Distribution
 ) -> Callable[[FloatArray], FloatArray]:
     """The function that turns cumulative probabilities into values in the characteristic's unit."""
+    # The ends, as stated or those of the domain.
     low = characteristic.lower
     high = characteristic.upper
     original = characteristic.original
     stated = stated_values(distribution)
     lower = stated.get("lower", low)
     width = stated.get("upper", high) - lower
+
+    # The quantiles of each kind of distribution.
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))

@@ -70,6 +70,8 @@ def _write_gif(scene: FlatScene, path: Path) -> None:
     figure, show = draw_scene(scene)
     stride = max(1, round(SECONDS_PER_FRAME / scene.step))
     last = scene.sample_count - 1
+
+    # Fewer frames until the file is small enough.
     while True:
         samples = [
             *range(0, last, stride),
@@ -121,6 +123,7 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     ]
 
     def show(sample: int) -> list[Patch]:
+        # Every body at its place.
         axis.set_xlim(scene.left_ends[sample], scene.left_ends[sample] + scene.width)
         for body, patches, lights in bodies:
             pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
@@ -130,6 +133,8 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
                     patch not in lights or scene.brakes(body, sample)
                 )
                 patch.set_visible(bool(is_shown))
+
+        # The time and both readings.
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
             text.set_text(f"{scene.comparison.name(row)}  {scene.reading(row, sample)}")

@@ -138,11 +138,15 @@ class Comparison:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
         runs = self.runs
         nearest = self.moments[row].nearest
+
+        # A collision, or how else it ends.
         if not math.isnan(runs.closing_speed[row]):
             return f"collides at {runs.closing_speed[row]:.1f} m/s"
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
+
+        # And the metrics that the search minimises.
         values = [
             (metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives
         ]

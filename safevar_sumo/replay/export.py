@@ -171,6 +171,8 @@ def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
         If a characteristic has no counterpart in CARLA, or one of CARLA's has no characteristic.
     """
     names = {**CARLA_PHYSICS, **CARLA_WHEELS}
+
+    # Characteristics that CARLA has, and no other ones.
     if without := [name for name in setting if name not in names]:
         problem = (
             f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no"

@@ -77,6 +77,7 @@ def show_in_gui(
     start = 0.0
 
     def watch(world: SumoWorld) -> None:
+        # The first step colours the vehicles.
         nonlocal start
         sample = next(samples)
         if sample == 0:  # to open the window took a while
@@ -90,6 +91,8 @@ def show_in_gui(
             pictures is not None and sample + 1 in pauses
         ):  # sumo-gui takes it at the end of its next step
             world.api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample + 1:04d}.png"))
+
+        # Pauses, and the pace.
         if sample in pauses:
             time.sleep(rest)
             start += rest

@@ -174,6 +174,7 @@ class _View(NamedTuple):
 
 def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> _View:
     """The whole road or, in a long scene, what a camera that follows the vehicles shows."""
+    # A frame around all bodies.
     x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
     is_vut = np.array([body.is_vut for body in bodies])
     length, half_width = np.array([(body.length, body.width / 2) for body in bodies]).T[
@@ -184,6 +185,8 @@ def _choose_view(bodies: Sequence[FlatBody], sample_count: int) -> _View:
     bottom = float(np.nanmin(y - half_width)) - MARGIN / 2
     height = float(np.nanmax(y + half_width)) + MARGIN / 2 - bottom
     padding = max(0.0, MIN_HEIGHT - height) / 2
+
+    # A long scene is followed by a camera.
     left_ends = np.full(sample_count, left_end)
     width = right_end - left_end
     if width > MAX_LENGTH:

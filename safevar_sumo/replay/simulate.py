@@ -437,10 +437,13 @@ def _verdict(simulation: Simulation) -> list[str]:
 
 
 def _safety_comparison(simulation: Simulation) -> str:
+    # By the stopping distance, if both stop for it.
     stop = simulation.metrics.get(STOPPING_DISTANCE.name, np.nan)
     original_stop = simulation.original.metrics.get(STOPPING_DISTANCE.name, np.nan)
     if np.isfinite(stop / original_stop):
         return f"in {stop / original_stop:.2f} times the distance of the original"
+
+    # Else by the safety degree.
     degree = simulation.metrics[SAFETY_DEGREE]
     original = simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):

@@ -131,6 +131,7 @@ class Packed:
 
     def _check_claims(self, study: Study) -> None:
         """Refuse what no pack claims, before anything is computed."""
+        # Outcomes and runs that the study can have.
         outcomes = self.packed.outcomes
         runs = self.packed.runs
         if unknown := outcomes.keys() - set(Outcome):
@@ -141,6 +142,8 @@ class Packed:
             raise ValueError(
                 f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
             )
+
+        # No question writes a file.
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
@@ -219,6 +222,7 @@ class Packed:
         """What the pack claims, and the functions that compute it again; the manifest is in
         `folder`.
         """
+        # Inputs and study.
         solutions = self.files[SOLUTIONS]
         yield Claim(
             "inputs",
@@ -226,6 +230,8 @@ class Packed:
             lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode(),
         )
         yield Claim("study", self.files[STUDY], self.study_file)
+
+        # The original vehicle, solutions, answers and page.
         yield Claim(
             "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
         )
@@ -233,6 +239,8 @@ class Packed:
         for text, answer in zip(self.packed.questions, json_of(self.files[ANSWERS]), strict=True):
             yield Claim(f"answer {text}", json_bytes(answer), partial(self._answer_json, text))
         yield Claim("report", self.files[PAGE], self.page)
+
+        # The whole search, if it is asked for.
         if search:
             yield Claim(
                 "search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0]
@@ -319,6 +327,8 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
         return study, claim.name, CANNOT, "", " ".join(str(error).split())
     if claim.packed == here:
         return study, claim.name, SAME, "", ""
+
+    # The first lines that differ, around the first character that does.
     lines = claim.packed.decode().splitlines(keepends=True)
     lines_here = here.decode().splitlines(keepends=True)
     pairs = zip_longest(lines, lines_here, fillvalue="nothing")

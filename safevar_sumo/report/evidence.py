@@ -100,6 +100,8 @@ def evidence(
     """
     out = Path(out)
     check_writable(out, "out", (".zip",))
+
+    # Each study once, with its files.
     studies = []
     files = dict[str, bytes]()
     with open_progress(progress) as show:

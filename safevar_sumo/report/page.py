@@ -205,10 +205,13 @@ def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = No
     variant that loses some by the fewest changes. Where the study has speeds, the second asks the
     limits up to some of them.
     """
+    # A rating of the worst solution.
     if is_rated(case.study) and point is None:
         any_unsafe = case.unsafe.rows(case.solutions).any()
         handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
+
+    # Limits, also by speed, and what else a study can answer.
     first, *later = USUAL_QUESTIONS
     questions = [first]
     speeds = usual_values(case.study, SPEED_DIMENSION) if point is None and unsafe is None else []
@@ -345,6 +348,7 @@ def _picture(figure: Figure) -> JsonObject:
     """
     import matplotlib
 
+    # The figure as SVG without its date, with few decimals.
     axis = figure.axes[0]
     buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]

@@ -269,6 +269,7 @@ def _remarks(texts: Sequence[str]) -> pd.DataFrame:
 
 def _conditions(study: ReportedStudy) -> str:
     """The weather or, by test, the points of the matrix."""
+    # One point, one weather, or a matrix.
     points = study.system.matrix
     if study.point:
         return (
@@ -424,6 +425,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
 
 def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it gives."""
+    # The study itself.
     directory = str(study.directory)
     flag = " --as-it-is-now" if study.later_changes else ""
     if study.case.has_runs:
@@ -437,6 +439,8 @@ def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
             " directory"
         )
         yield what, f"python -c {shlex.quote(script)}"
+
+    # Its answers and replays.
     for answer in study.answers:
         if answer.command:
             yield f"The answer {answer.question}", answer.command + flag

@@ -126,6 +126,8 @@ class Journal:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = _open_and_lock(path)
+
+        # What the journal has, without a torn end.
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
@@ -134,6 +136,8 @@ class Journal:
                 )
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
+
+            # A new journal begins with its head.
             if not self.content.size:
                 text = msgspec.json.encode(head)
                 self._checksum = zlib.crc32(text)

@@ -73,12 +73,15 @@ class ResultsDirectory:
         identity: Tables = MappingProxyType({}),
         scoring: Scoring = PUBLISHED_SCORING,
     ) -> None:
+        # The manifest as it would be written now.
         self.path = path
         self._study = study
         folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
         self.manifest = {**manifest_of(study, identity), "folders": folders}
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
+
+        # A directory that an earlier version began keeps its journals' format.
         make_directory(path)
         earlier_manifest = self._earlier_manifest()
         if not earlier_manifest or JOURNALS in earlier_manifest:
@@ -106,6 +109,8 @@ class ResultsDirectory:
         """
         earlier_manifest = self._earlier_manifest()
         remarks = []
+
+        # What differs from the earlier extent.
         if not earlier_manifest:
             return []
         _, _, before = search_extent_of(earlier_manifest)
@@ -236,9 +241,12 @@ def write_imported(
     InputError
         If the directory cannot be written, or holds results of a campaign.
     """
+    # A directory without runs.
     make_directory(path)
     if (path / RUNS).exists():
         raise InputError(path, "holds results of a campaign", "another directory")
+
+    # Solutions and manifest.
     runs = (((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items())
     frame = solutions_frame(study.vehicle.characteristics, runs).drop(columns="run")
     manifest = {

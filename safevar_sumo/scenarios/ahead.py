@@ -311,11 +311,15 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """
         closing_speed = self.test_speed - self._target_speed
         gap = self.gap
+
+        # A target at constant speed.
         if not self._target_brakes:
             if np.any(closing_speed <= 0):
                 problem = f"speed = {np.min(self.speed):g} km/h never reaches the target"
                 raise InputError("", problem, "a slower target")
             return gap / closing_speed
+
+        # A target that brakes: what is left of the gap, before, in and after braking.
         gap_at_braking = gap - closing_speed * self.brakes_at
         b = self.target_deceleration
         speed_lost = self._target_speed - self.target_speed_at(math.inf)
@@ -324,6 +328,8 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         after_braking = (
             self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
         )
+
+        # The time to impact in the phase in which the gap ends.
         root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
         in_braking = self.brakes_at + (root - closing_speed) / b
         braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)

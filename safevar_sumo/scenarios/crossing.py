@@ -254,6 +254,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The target, which moves past the place of the impact, and the parked cars, if any."""
+        # The target's way over time; on foot it stops beyond the path.
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
@@ -264,6 +265,8 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
+
+        # Where it meets the front of the vehicle.
         impact = self.start_speed * start.time_to_impact + start.extent.length / 2
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path

@@ -87,11 +87,14 @@ def _completed(
 
 def _models(tables: Parameters, places: Sequence[str]) -> Iterator[tuple[type, Parameters]]:
     """The weather's class with its values, and those of the scenarios with their defaults."""
+    # The weather's parameters.
     weather = tables.get("weather")
     table = weather_of(
         weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
     )
     yield Weather, msgspec.structs.asdict(table)
+
+    # The scenarios of the tests, or the only one.
     matrix = tables.get("matrix")
     tests = convert_table(matrix, MatrixTable, "matrix").tests if matrix else []
     time_limit = convert_table(tables.get("search"), SearchTable, "search").time_limit

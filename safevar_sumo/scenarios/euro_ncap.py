@@ -121,6 +121,8 @@ class SpeedProfile(NamedTuple):
                 f"acceleration_distance = {run_up:g} m is longer than the distance of"
                 f" {np.min(distance):g} m",
             )
+
+        # It starts so that it arrives in time.
         shortest_time = (distance + run_up) / speed
         begin = time - shortest_time
         if np.any(begin < 0):
@@ -192,6 +194,7 @@ class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
+        # What lies outside the protocol.
         row = TESTS[self.test]
         remarks = []
         if not row.slowest <= self.speed <= row.fastest:

@@ -197,6 +197,7 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         InputError
             If the leader is too slow sideways to get past the standing car.
         """
+        # The leader has left the path when he reaches the standing car.
         speed = self.start_speed
         apart = self.gap / self.start_speed * self.lateral_speed
         if np.any(apart < CAR.width):
@@ -206,6 +207,8 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
             )
             problem = f"gap = {np.min(self.gap):g} m: {moved}"
             raise InputError("", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
+
+        # Both cars.
         front = self.headway * speed + CAR.length
         x = front - CAR.length / 2 + speed * times
         leader = Track("leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed)

@@ -174,11 +174,14 @@ class PedestrianCrossing(
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
+        # The walk at constant speed.
         times = np.arange(samples)[:, np.newaxis]
         speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
         start = LATERAL_START if self.lateral_start is None else self.lateral_start
         lateral = speed * step * times - start
         turned = np.zeros((samples, 1), dtype=bool)
+
+        # He turns round and walks back.
         if self.turns_after is not None:
             beyond = lateral > self.turns_after + ROUNDING
             first = np.where(
@@ -189,6 +192,7 @@ class PedestrianCrossing(
         return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
 
     def begin(self, world: World) -> _Memory:
+        # The path of the pedestrian across the lane.
         frame = Frame.through_origin(world.lane_of(VUT))
         path = frame.crossing_position(world, CROSSING_LANE)
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(
@@ -200,6 +204,8 @@ class PedestrianCrossing(
                 f"the pedestrian begins {lateral.max():.2f} m to the left of the vehicle",
                 "to the right of it, or turns_after = None",
             )
+
+        # Where the vehicle has passed him.
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path + half_width + world.vehicle_length(VUT)
         return _Memory(

@@ -166,10 +166,13 @@ class _Ranges:
         """End each range at the mean of the increased values and the mean of the decreased values,
         over the settings of `window` that are less safe than the original.
         """
+        # Settings that are less safe than the original.
         is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
         if not len(less_safe):
             return
+
+        # Ranges end at their means on both sides.
         for i, original in enumerate(self._characteristics.original):
             values = less_safe.settings[:, i]
             if np.any(values > original):

@@ -84,10 +84,14 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         reproduction = Reproduction(self, problem, rng)
+
+        # The first generation is random.
         first = problem.uniform(min(problem.population, problem.evaluations), rng)
         offspring = [*map(Individual, first.tolist())]
         survivors = list[Individual]()
         used = 0
+
+        # Evaluate the offspring, keep the best, and let them reproduce.
         while offspring:
             used += yield from request_evaluations(offspring, problem)
             alive = survivors + [
@@ -97,6 +101,8 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             offspring = reproduction.draw_offspring(
                 survivors, min(problem.population, problem.evaluations - used)
             )
+
+        # The non-dominated survivors are the result.
         batches = [individual.evaluation for individual in survivors if individual.standing[0] == 0]
         front = [evaluations.take([row]) for evaluations, row in batches]
         return Evaluations.concatenate([problem.original.take([]), *front])
@@ -137,6 +143,7 @@ class Reproduction:
         operators = self._operators
         domains = (self._lower, self._upper)
         with self._randomness():
+            # Two parents, crossed and mutated.
             while population and len(offspring) < number:
                 pair = [
                     Individual(run_tournament(population, operators.tournament_size))
@@ -176,12 +183,15 @@ def request_evaluations(
     individuals: Sequence[Individual], problem: Problem
 ) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
+    # Values of the objectives, and violations.
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring = problem.scoring
     fitness = fitness_class(len(problem.scoring.objectives))
     violations = scoring.violation(evaluated)
     failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
+
+    # Each individual knows its own.
     for row, (individual, values, violation, has_failed) in enumerate(
         zip(individuals, *columns, strict=True)
     ):
@@ -198,6 +208,7 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     individuals follow all feasible ones, each in a rank of its own, by their violation (constrained
     domination, Deb et al. 2002).
     """
+    # Infeasible individuals come after all others, by violation.
     infeasible = sorted(
         (individual for individual in individuals if individual.violation),
         key=lambda individual: individual.violation,
@@ -205,6 +216,8 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
     individuals = [individual for individual in individuals if not individual.violation]
+
+    # Fronts by rank, and within a front by crowding distance.
     sorted_individuals = sorted(
         individuals, key=lambda individual: individual.fitness.wvalues, reverse=True
     )

@@ -269,6 +269,7 @@ def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
     """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains,
     the safer.
     """
+    # A safety degree that is smooth over the domain.
     characteristics = problem.characteristics
     scoring = problem.scoring
     share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
@@ -381,12 +382,16 @@ def _plain_arguments(name: str) -> dict[str, Any]:
     values.
     """
     algorithm = _class_of(name)
+
+    # Arguments of the class and its bases.
     arguments = dict[str, inspect.Parameter]()
     variant = getattr(
         importlib.import_module(algorithm.__module__), "Variant", algorithm
     )  # takes those of DE
     for ancestor in (*algorithm.__mro__[:-2], variant):
         arguments = {**inspect.signature(ancestor.__init__).parameters, **arguments}
+
+    # Those that a study may set.
     if "ref_points" in arguments:
         arguments.pop("ref_dirs", None)
     return {

@@ -120,6 +120,7 @@ def _raw_study(study: StudyLike) -> StudyTables:
 
 def checked_study(raw: StudyTables) -> Study:
     """The study of complete tables; the error of a mistake does not name its source."""
+    # A table that is empty on purpose drops the one of the base.
     tables = dict(raw.tables)
     matrix = tables.get("matrix")
     vehicle = tables.get("vehicle")
@@ -127,6 +128,8 @@ def checked_study(raw: StudyTables) -> Study:
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
+
+    # Records, and what concerns several of them.
     study = convert_table(tables, Study)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
         raise InputError(
@@ -142,6 +145,8 @@ def _without_characteristics(model: object) -> InputError:
     study's base.
     """
     texts = (study_path(name).read_text(encoding="utf-8") for name in study_names())
+
+    # The models of shipped studies.
     models = {
         tables["vehicle"]["model"]
         for text in texts
@@ -166,6 +171,8 @@ def _with_parameters(
     table = tables.get(name)
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
+
+    # Tables within the table are parameters.
     inner_tables = {
         key: value
         for key, value in table.items()
@@ -180,6 +187,7 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table
     by table.
     """
+    # The tables of the file.
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -187,6 +195,8 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
         raise InputError(
             path, f"cannot be read as TOML: {reason}", "the path of a study file"
         ) from None
+
+    # Where it comes from.
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
     origin = Origin(
         called=str(path) if folders else "",
@@ -327,6 +337,8 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     """
     if re.fullmatch(NAME_PATTERN, path.stem):
         study = msgspec.structs.replace(study, name=path.stem)
+
+    # A comment of printable characters.
     lines = (
         "".join(character if character.isprintable() else "?" for character in line)
         for line in comment.splitlines()

@@ -33,6 +33,8 @@ from safevar_sumo.sumo.world import Api, SumoWorld
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
     is_invalid = runs.outcome == Outcome.INVALID_TEST
+
+    # Metrics of runs are undefined in an invalid test.
     metrics = dict[str, FloatArray]()
     with user_errors(system.source):
         for name, measure in system.measuring.measures.items():
@@ -131,6 +133,8 @@ def _recorded_world(
     assert isinstance(scene, Recording)
     if scenario_there is point.scenario:
         return RecordedWorld(scene, len(encounters))
+
+    # Paired vehicles share a scene.
     size = _vehicles_per_encounter(encounters)
     scenario = system.at_encounters(encounters[::size]).scenario
     assert isinstance(scenario, WorldScenario)

@@ -222,11 +222,14 @@ class FirstContacts:
         InputError
             With the time [s].
         """
+        # Who enters a body without a contact that SUMO has reported?
         is_inside = scene.gap < -TOUCH_OVERLAP
         enters = is_inside & ~self._was_inside & is_open & (self.first.side == "")
         self._was_inside = is_inside
         if not np.count_nonzero(enters):
             return
+
+        # Only the front counts, as SUMO reports contacts of the front alone.
         around = world.bodies_around(np.flatnonzero(enters).tolist())
         if not len(around.vehicles):
             return
@@ -318,18 +321,23 @@ def find_touches(own: Body, other: Body) -> Touches:
     began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last,
     or, if they approach each other in neither direction, in the one with the smaller overlap.
     """
+    # Distance, speed and overlap along both axes of the vehicle.
     axes = _axes_of(own)
     distance = _dot(other.middle - own.middle, axes)
     speed = _dot(own.velocity - other.velocity, axes)
     overlap = _joint_extent(own, other, axes) - np.abs(distance)
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
+
+    # How long ago the sides touched that approach each other.
     ages = np.where(
         is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf
     )
     approaches = is_closing.any(axis=0)
     is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
+
+    # The side that touched last, and the place on it.
     ahead, left = distance > 0
     side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
     return Touches(side, age, own.length / 2 - (distance[0] + age * speed[0]))

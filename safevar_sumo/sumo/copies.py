@@ -201,6 +201,8 @@ def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path
     target = platformdirs.user_cache_path("safevar_sumo") / "networks" / folder
     if (target / name).is_file():
         return target / name
+
+    # Built in a folder of its own, and moved to its place as a whole.
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as temporary:

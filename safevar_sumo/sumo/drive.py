@@ -154,11 +154,15 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> Fleet:
     """Put the vehicles of N settings, shape (N, n), onto the road."""
     vehicle = system.vehicle
     n = len(settings)
+
+    # Constants of the vehicles on these roads.
     characteristics = dict(
         zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True)
     )
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
+
+    # Who drives: full braking, the driving system, or a controller that SUMO calls.
     ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
     if not isinstance(ads, TraciController):
         return Fleet(prepared, ads, world.enter(types))
@@ -230,6 +234,8 @@ class _Log:
         self._width = world.vehicle_width
         self._frame = world.frame
         self._positions = np.zeros((capacity, world.n, 2))
+
+        # A column for each quantity of a sample.
         names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
         kinds = {name: bool if name in TRUTHS else float for name in names}
         self._columns = {
@@ -288,11 +294,15 @@ class _Outcomes:
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""
         active = self.is_open & ~over
+
+        # A collision ends a run, and the sample counts.
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
                 active[copy] = True
                 self.is_open[copy] = False
+
+        # Who has moved, stopped, and passed.
         is_standing = speed <= STANDSTILL
         self._has_stopped |= self.is_open & self._has_moved & is_standing
         self._has_moved |= self.is_open & ~is_standing

@@ -94,9 +94,12 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
+    # The scene up to the longest encounter.
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
     layout = scenario.layout(recording, recording.step_length, samples)
     tracks = {name: _extended(track, samples) for name, track in recording.tracks.items()}
+
+    # A pedestrian walks as in each encounter.
     if layout.pedestrian:
         track = recording.tracks[layout.pedestrian]
         frame = Frame.of(recording.lane(recording.first_lanes[VUT]))

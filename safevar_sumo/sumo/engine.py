@@ -106,6 +106,7 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
         )
     import sumo
 
+    # The window opens with the first step.
     api = traci_api()
     with _open(api, "sumo-gui"):
         with (
@@ -192,6 +193,8 @@ def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
         "--xml-validation.net": "never",
         "--xml-validation.routes": "never",
     }
+
+    # What the simulation needs overrules what the user's options say.
     stated = options_in(files.options)
     own = own_options(stated) | {"step-length": repr(step_of(stated) if step is None else step)}
     return [*as_arguments(own), *(str(text) for option in options.items() for text in option)]

@@ -108,6 +108,8 @@ def vehicle_remarks(system: System) -> list[str]:
     speeds = [point.scenario.test_speed or 0.0 for point in system.points]
     if max(speeds) <= fitted_speed:
         return []
+
+    # What the model does beyond the speeds of its fit.
     tables = system.nominal.tables()
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
@@ -173,12 +175,15 @@ def evaluate_matrix(
     With `each`, the evaluations have the rated results at every point, `cells`. Traces are dropped,
     as they would take gigabytes.
     """
+    # Every point once, in groups.
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
         for group in simulate_groups(system, settings, engine)
         for result in group
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
+
+    # The worst point of each setting, and what a rating earns.
     cells = join_cells(quantities)
     evaluations = evaluations_at_worst_points(system, at_points)
     if system.rater is not None:
@@ -258,6 +263,8 @@ def simulate_groups(
 ) -> Iterator[list[PointResult]]:
     """Yield the results of settings at every point, in groups of points that share a simulation."""
     n = len(settings)
+
+    # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     if is_recorded(system, engine) and not len(system.characteristics.scenario):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
@@ -291,6 +298,7 @@ def at_point(study: Study, name: str) -> Study:
     InputError
         If no point has this name.
     """
+    # A point of the matrix by its name.
     check_text("point", name)
     points = [point.name for point in assemble(study).matrix]
     if study.matrix is None or name not in points:
@@ -299,6 +307,8 @@ def at_point(study: Study, name: str) -> Study:
         )
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
         raise InputError("point", repr(name), legal if points else "a study with a matrix")
+
+    # The study at this point alone.
     search = study.search
     if study.matrix.protocol:  # one point has no rating points to search by
         search = replace_in(search, objectives=[*OBJECTIVES])
@@ -344,6 +354,7 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
     collision in a valid test always counts. Without a collision, a point with an invalid test
     counts as the worst, because such a test leaves open whether the setting is safe.
     """
+    # In the order of names, so that ties do not depend on the order of the file.
     order = np.argsort([point.name for point in system.points])
     in_order = [at_points[k] for k in order]
     safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
@@ -351,10 +362,14 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
     is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
     has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
     values = safety_degrees
+
+    # By another measure, collisions first.
     if system.aggregate != WORST:
         name, direction = system.aggregate.split()  # such as "drac >"
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
         measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
         values = np.where(has_collided, safety_degrees, measures)
+
+    # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf
     return np.asarray(order[np.argmin(values, axis=0)])

@@ -59,16 +59,21 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     InputError
         If a measure does not exist, is invalid, or has a name that is taken.
     """
+    # Metrics that the study has anyway.
     further = ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops))
     computed = {**METRICS, **{metric.name: metric for metric, is_meant in further if is_meant}}
     metrics = {**computed, **OPTIONAL_METRICS}
     named = _Named(lookup, {*RESULT_COLUMNS, *metrics, *study.domains}, computed)
+
+    # Those that it names.
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
             raise InputError("", problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
+
+    # Objectives, each once.
     shipped = {**metrics, **OBJECTIVES}
     objectives = [
         named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives
@@ -100,6 +105,7 @@ class _Named:
         """A measure by the name of a shipped one, of a user's class, or of one that was looked up
         before.
         """
+        # A measure of the package, or of the user.
         member = self._lookup.find({**shipped, **self._own}, name, key)
         measure: Measure = member.target
         if member.code is not None:

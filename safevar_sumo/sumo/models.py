@@ -92,10 +92,13 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
 
 def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
+    # The points of each test.
     points: list[Point] = []
     for test in () if study.matrix is None else study.matrix.tests:
         with about(f"{subject()}: test {test.name!r}"):
             points += _points_of(test, study, lookup)
+
+    # Each with a name of its own, of which a study may have only one.
     for name, count in Counter(point.name for point in points).items():
         if count > 1:
             legal = "unique names of tests, and each value once"
@@ -188,6 +191,8 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     """A study's driving system; raises an InputError."""
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
+
+    # An FMU drives one vehicle.
     if table.kind == "fmu":
         path = file_beside(table.model, lookup.folders)
         if not path:
@@ -198,6 +203,8 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
         fleet.max_vehicles = MAX_INSTANCES
         return fleet
+
+    # A class drives one vehicle or all.
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
     return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads

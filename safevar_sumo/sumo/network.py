@@ -82,6 +82,7 @@ def open_network(network: str) -> NetworkFiles:
     InputError
         If the network does not exist, a file is missing, or it is unclear which files to use.
     """
+    # A shipped network, or a folder or file of the user.
     path = NETWORKS / network if is_shipped(network) else Path(network)
     if not is_network(path):
         names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
@@ -91,6 +92,8 @@ def open_network(network: str) -> NetworkFiles:
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )
     folder, roads_file = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
+
+    # All files on which it depends.
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     if (folder / OPTIONS_FILE).is_file():
         names += _sources_of(folder / OPTIONS_FILE)
@@ -132,6 +135,7 @@ def _roads_in(folder: Path) -> str:
     """The recipe in a folder or, without a recipe, its built network; of several the one that
     SUMO's options name.
     """
+    # A recipe comes before a built network; options tell which of several.
     recipes, built = (
         sorted(file.name for file in folder.glob(f"*{end}"))
         for end in (RECIPE_ENDING, NETWORK_ENDING)
@@ -223,6 +227,7 @@ def built_network(network: NetworkFiles) -> Path:
     """The file of the network, which netconvert or the user built, with its changes; raises the
     errors of `copied_network`.
     """
+    # A built network without changed lanes is used as it is.
     original = network._replace(lane_changes=(), traffic_changes=())
     if not network.lane_changes and network.is_built:
         return network.path(network.roads_file)
@@ -260,6 +265,7 @@ def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
     """Run a program of SUMO in a folder; return its exit code, and its errors and warnings."""
     import sumo
 
+    # The program's messages on one line.
     process = subprocess.run(
         [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, "--xml-validation", "never"],
         capture_output=True,

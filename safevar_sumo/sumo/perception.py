@@ -50,6 +50,8 @@ class Perception:
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
         self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
+
+        # A delay line for each number of whole steps.
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []
         if np.ndim(delays) == 0:
@@ -68,12 +70,15 @@ class Perception:
 
         An occluded obstacle appears at rest, infinitely far away.
         """
+        # What the ADS may see, hidden where nobody is visible.
         values = np.empty((len(OCCLUDED) + 1, len(speed)))
         values[-1] = speed  # for the closing speed of then
         for row, quantity in enumerate(OCCLUDED):
             values[row] = getattr(scene, quantity)
         if scene.visible is not ALL_TRUE:
             values[:-1] = np.where(scene.visible, values[:-1], _UNSEEN)
+
+        # As it was when it was sensed.
         seen = np.empty_like(values)
         for k, (vehicles, line) in enumerate(self._lines):
             seen[:, vehicles], next_line = line.delayed(values[:, vehicles])

@@ -100,6 +100,7 @@ class RecordedWorld:
         SimulationError
             If a vehicle leaves its last lane.
         """
+        # Ballistic update, as SUMO's.
         self._before = self._now
         distances = distance_covered(self._before.speeds, speeds, self.step_length)
         if np.count_nonzero(is_open) < self.n:
@@ -107,6 +108,8 @@ class RecordedWorld:
             distances = np.where(is_open, distances, 0.0)
         self._lane_position = self._lane_position + distances
         self.sample += 1
+
+        # On to the next lane of the route.
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
             if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
                 raise SimulationError(
@@ -180,12 +183,15 @@ class RecordedWorld:
         who cross a junction are checked against vehicles whose front is on it
         (`MSLane::detectCollisions`).
         """
+        # Who is near enough to touch somebody?
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
             return {}
         vehicles, actors = np.nonzero(self._is_near() & is_open[:, np.newaxis])
         if not len(vehicles):
             return {}
+
+        # Persons are struck before they move, vehicles after they have moved.
         persons = self._is_person[actors]
         early = self._overlaps(
             self._before, vehicles, actors, persons & self._before.meets_persons[vehicles]
@@ -193,6 +199,8 @@ class RecordedWorld:
         late = self._overlaps(
             self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles]
         )
+
+        # The first actor of each vehicle.
         pairs = np.flatnonzero(early | late)
         struck, first = np.unique(vehicles[pairs], return_index=True)
         pairs = pairs[first]

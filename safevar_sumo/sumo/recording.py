@@ -230,6 +230,8 @@ def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) ->
 def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
     """How all actors except the vehicle under test move."""
     length = round(scenario.duration / world.step_length) + 1
+
+    # The actors at every sample, without the vehicle under test.
     tracks = dict[str, Film]()
     memory = world.begin(scenario)
     for sample in range(length):

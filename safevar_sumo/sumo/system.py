@@ -105,6 +105,8 @@ class System:
         if not scenario.centre_to_centre:
             return 0.0
         assert isinstance(scenario, WorldScenario)
+
+        # The lengths of both bodies, in the recorded scene or in SUMO.
         recording = self.scenes.of(scenario)
         with ExitStack() as stack:
             world: SceneWorld
@@ -200,6 +202,8 @@ class System:
         if not self._has_tau:
             return []
         name = self.ads.tau_parameter
+
+        # A driver with a headway of its own takes the vehicle's tau.
         if not name:
             return [
                 "tau has no effect: it is the headway of SUMO's driver, and the study has"

@@ -178,6 +178,7 @@ class CommandedSpeed:
         """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no
         legal number.
         """
+        # Legal arguments.
         for argument, number in zip(COMMANDS[name], values, strict=True):
             returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
             is_legal = math.isfinite(number) and (
@@ -185,6 +186,8 @@ class CommandedSpeed:
             )
             if not is_legal or (name == "setSpeedMode" and number not in range(-1, 128)):
                 raise InputError(f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS)
+
+        # What would make results random, or leave the lane.
         value, *durations = map(float, values)
         if name == "setImperfection" and value:
             raise InputError(
@@ -197,6 +200,8 @@ class CommandedSpeed:
             raise InputError(
                 "traci.vehicle.setLaneChangeMode", problem, "0, 256 or 512, without changes of lane"
             )
+
+        # What the vehicle does from now on.
         if name == "setSpeedMode":
             self.mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
         elif name == "setSpeed":
@@ -217,9 +222,12 @@ class CommandedSpeed:
         SUMO's own driver would choose `sumo_speed` next [m/s]; `accel` and `decel` are its limits
         [m/s^2].
         """
+        # After its end a command leaves the speed to SUMO.
         change = self._target - speed
         if time > self._end + 0.5 / TICKS:
             return (sumo_speed - speed) / self._step
+
+        # At most as fast as the command, and within the limits of the speed mode.
         change = math.copysign(min(abs(change), self._rate * self._step), change)
         if self.mode & self.LIMIT_TO_SAFE_SPEED:
             change = min(change, sumo_speed - speed)

@@ -90,12 +90,15 @@ class TraciController(Ads):
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
     def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        # The first call is that of `start`.
         initial_trim = memory.initial_trim
         accelerations = np.zeros(len(memory.drivers))
         if initial_trim is None:  # `start` recorded the first step
             initial_trim = trim_at(memory.nominal, seen)
         else:
             memory.traffic.record_step()
+
+        # Each controller steps, if its vehicle is on the road.
         with substitute_traci():
             for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):

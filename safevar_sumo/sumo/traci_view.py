@@ -119,6 +119,7 @@ class SensedTraffic:
         return bool(self._past[copy][-1].own)
 
     def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
+        # The actors of this copy, and what is measured of them.
         api = self._world.api
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
@@ -132,6 +133,8 @@ class SensedTraffic:
             for actor in names[copy, domain]:
                 id_ = copied_id(copy, actor)
                 actors[domain][actor] = {name: get(id_) for name, get in getters.items()}
+
+        # The vehicle itself, and who leads it.
         own = actors["vehicle"].pop(VUT)
         leader = api.vehicle.getLeader(vut, LEADER_RANGE)
         if (
@@ -218,6 +221,7 @@ class TraciView:
         """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the
         leader [m/s].
         """
+        # What SUMO's driver would drive: up to the limit, and behind the leader.
         vehicle = self._api.vehicle
         vut = self._vut
         _, actors, leader = self._traffic.seen[self._copy]
@@ -302,6 +306,8 @@ class TraciView:
             raise refused(
                 domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures"
             )
+
+        # An actor that the sensors see has its value, another one an invalid one.
         actors = self._traffic.seen[self._copy].actors[domain]
         if actor in actors:
             return _original_ids(actors[actor][name])

@@ -148,6 +148,7 @@ class Traffic:
         """Whether a body is on the line between two points: the slab test in the body's own
         axes.
         """
+        # The line of sight in the body's own coordinates.
         dx = to_x - x
         dy = to_y - y
         rx = x - self._row(other.track.x)
@@ -157,6 +158,8 @@ class Traffic:
             left = self._row(other.track.left)
             dx, dy = dx * along + dy * left, dy * along - dx * left
             rx, ry = rx * along + ry * left, ry * along - rx * left
+
+        # Where it enters and leaves the body, along and across.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
         for position, change, size in ((rx, dx, other.track.length), (ry, dy, other.track.width)):
@@ -289,6 +292,7 @@ class Traffic:
         """The distance to the nearest body that still counts, and how fast it shrinks, at all
         samples of a trace whose positions are those of the vehicles' fronts.
         """
+        # In blocks of samples, the distance to the nearest body that is met.
         shape = trace.speed.shape
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
         distance = np.full(shape, np.inf)

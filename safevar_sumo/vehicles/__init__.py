@@ -42,6 +42,7 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
     """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
+    # Values of the SUMO type; tables of the pedals only if somebody reads them.
     types = vehicle.sumo_type(
         vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
     )

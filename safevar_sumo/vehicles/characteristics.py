@@ -295,6 +295,8 @@ class CharacteristicSet:
                 f"is a {type(values).__name__}",
                 "values by characteristic, such as {'mass': 2500}",
             )
+
+        # Legal values in place of the original's.
         setting = self.original.copy()
         for name, value in values.items():
             check_name("", f"there is no characteristic {name!r}", name, self.names)

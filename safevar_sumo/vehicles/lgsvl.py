@@ -281,6 +281,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
+
+        # Steering, pedals and gear once a step.
         lateral, heading, cornering_drag = self._steer(p, state)
         pedal_share = p.step / (
             p.step + self.pedal_lag
@@ -291,6 +293,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             lateral=lateral,
             heading=heading,
         )
+
+        # Engine, wheels and body in substeps.
         gearing = _ratio(p, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
             state = _roll(p, state, gearing, cornering_drag)
@@ -318,6 +322,7 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
     """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from
     the old one to the new one.
     """
+    # Who shifts up or down?
     rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
     up = is_ready & (rpm_share > SHIFT_UP) & (s.gear < LAST_GEAR)

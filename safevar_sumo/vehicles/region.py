@@ -48,6 +48,7 @@ class _Bounds(NamedTuple):
         cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet
     ) -> _Bounds:
         """The computation of a study's constraint."""
+        # Weights by column, and how far the sum may vary.
         table = study.domains
         widths = characteristics.upper - characteristics.lower
         weights = tuple(

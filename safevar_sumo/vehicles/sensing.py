@@ -315,11 +315,15 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
     ) -> tuple[Observation, SensingState]:
         """What sensors see that look aside and lose frames."""
         sensed, state = SensingVehicle.sense(self, prepared, state, seen)
+
+        # An angle of the sensors shifts what is ahead sideways.
         if prepared.tangent is not None:
             distance = np.where(np.isfinite(sensed.gap), sensed.gap, 0.0)
             sensed = sensed._replace(lateral=sensed.lateral + distance * prepared.tangent)
         if prepared.dropout is None:
             return sensed, state
+
+        # A lost frame repeats the one before.
         frame = np.stack([getattr(sensed, name) for name in DELAYED])
         if state.frame is not None:
             number = round(seen.time / prepared.step)

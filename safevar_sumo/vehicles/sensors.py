@@ -58,6 +58,7 @@ class DelayedSignal:
         InputError
             If a delay is longer than any run.
         """
+        # How many steps and which part of a step each delay is.
         longest = float(np.max(delay))
         age = delay / step
         if not longest <= LONGEST_DELAY:
@@ -138,6 +139,7 @@ def sensed_observation(
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility;
     and the history for the next call.
     """
+    # What was sensed `latency` ago, if it is within reach.
     sample = np.empty((len(DELAYED), *seen.gap.shape))
     for row, name in enumerate(DELAYED):
         sample[row] = getattr(seen, name)
@@ -213,9 +215,13 @@ class SensingVehicle(Vehicle):
 
     def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
         p = prepared
+
+        # The brake as it was commanded some time ago.
         commands = state.brake_commands.extended(command.brake)
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
+
+        # The speed at the end of the step, within its limits.
         highest_speed = np.maximum(p.max_speed, state.speed)  # who is faster is not slowed down
         speed = np.minimum(
             np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed

@@ -330,6 +330,8 @@ def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str
     """Within which limits, and around which originals."""
     if limits:
         yield f"Compared within {join_phrases(limits)}."
+
+    # Original values that differ.
     members = [side.characteristics.members for side in common.evaluators]
     texts = [
         f"{item.name} {item.original:g} and {members[1][column].original:g}{item.suffix}"

@@ -103,6 +103,7 @@ def limits_of_both(
     """The table of limits alone with the study's own fit, rounded as `tolerance` rounds them,
     within the user's limits; no interval where the original is unsafe.
     """
+    # Limits of each characteristic alone, in both.
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     scans = [scan(side, columns, unsafe) for side, unsafe in zip(evaluators, criteria, strict=True)]
     domains = [side.study.domains for side in evaluators]

@@ -187,6 +187,7 @@ def in_order_of(a: Study, b: Study) -> Study:
     InputError
         If B has other characteristics or searched parameters, or other units.
     """
+    # The units of both must be the same.
     units_a = {(name, row.unit) for name, row in a.domains.items()}
     units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
@@ -219,6 +220,8 @@ def pairs_of(
     names = list(common.evaluators[0].characteristics.names)
     groups = []
     outside = 0
+
+    # Solutions of each side, as settings of both.
     for side, case in zip("ab", subjects, strict=True):
         if not isinstance(case, Case):
             continue
@@ -245,6 +248,7 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
     after none, and beside a difference. Which of both systems fails does not matter: without a
     difference between them, a line favours none.
     """
+    # Lines from the original to sampled settings.
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))
     starts = np.where(members.of_vehicle, members.original, ends)
@@ -252,6 +256,8 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
     step = 0.5
     rounds = list[Pairs]()
     left = samples if len(ends) else 0
+
+    # On each line, halve the step towards where one of them begins to fail.
     while left and len(rounds) < ROUNDS:
         lines = np.arange(min(len(ends), left))
         left -= len(lines)

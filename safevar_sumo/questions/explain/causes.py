@@ -210,11 +210,14 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     pandas.DataFrame
         Columns algorithm, run, failures (different unsafe solutions), examined, causes.
     """
+    # The failures of each run with the fewest changes.
     names = list(evaluator.characteristics.names)
     keys = ["algorithm", "run"]
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
     failures = failures.sort_values([F_NUM_DIFF.name, F_DIFF.name], kind="stable")
     examined = failures.groupby(keys).head(limit)
+
+    # Kinds of causes: which characteristics change, and in which direction.
     causes = find_minimal_causes(evaluator, examined[names].to_numpy(dtype=float), case.unsafe)
     by_run: dict[tuple[str, int], set[tuple[str, ...]]] = {run: set() for run in case.finished_runs}
     kinds = [
@@ -223,6 +226,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     ]
     for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
         by_run[run].update(group)
+
+    # How many of each run.
     counts = [frame.groupby(keys).size().to_dict() for frame in (failures, examined)]
     rows = [
         (*run, *(count.get(run, 0) for count in counts), len(kinds_of_run))
@@ -346,9 +351,12 @@ def _first_unsafe_shares(
     `lowest`. A setting that cannot be simulated is neither safe nor unsafe; just below the share,
     it gives the state `NOT_SIMULATED`.
     """
+    # The first unsafe share of each line.
     found = find_boundaries(
         starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), PARTS, lowest
     )
+
+    # What ends the line on the safe side.
     is_valid = evaluator.evaluate(found.safe, BOUNDARIES).valid
     is_at_threshold = (found.safe_shares == lowest) & (lowest > 0)
     states = np.select(

@@ -234,6 +234,8 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
 def _failures_that_matter(population: Population, evaluator: Evaluator, limit: int) -> Reasons:
     """The smallest robust failure, and a failure for each of `REASONS`."""
     reasons = Reasons()
+
+    # A robust failure.
     failures = population.evaluations.take(population.rows)
     if not population.rows:
         return reasons
@@ -242,6 +244,8 @@ def _failures_that_matter(population: Population, evaluator: Evaluator, limit: i
         index = find_smallest_robust_failure(evaluator, failures, step, population.unsafe, limit)
         if index is not None:
             reasons[population.rows[index]] = ROBUST
+
+    # The first of each choice.
     for choice, reason in REASONS.items():
         order = np.lexsort([failures.column(name) for name in reversed(CHOICES[choice])])
         row = population.rows[order[0]]

@@ -48,6 +48,7 @@ def margins_table(population: Population, evaluator: Evaluator, limit: int) -> p
     study = evaluator.study
     rows = list[JsonObject]()
     if study.scenario.search and not population.is_named:
+        # Settings that count with the smallest margin.
         margins = dict.fromkeys(factor * study.scenario.margin for factor in FACTORS)
         least = _with_margin(evaluator, min(margins))
         further = least.evaluate(population.left_out, STAGE)
@@ -57,6 +58,8 @@ def margins_table(population: Population, evaluator: Evaluator, limit: int) -> p
             else Evaluations.concatenate([population.evaluations, further])
         )
         contact = evaluator.system.contact
+
+        # Those that count with each margin, and their smallest robust cause.
         for margin in margins:
             counts = runs.valid & (runs.column(ORIGINAL_DEGREE) >= margin + contact)
             fails = counts & population.unsafe.of(runs)

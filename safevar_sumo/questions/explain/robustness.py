@@ -53,6 +53,8 @@ def robust_shares(
     """
     neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed)
     shares = []
+
+    # The share of neighbours that are unsafe, with each length of the time step.
     with evaluator.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)

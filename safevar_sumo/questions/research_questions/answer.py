@@ -213,6 +213,7 @@ def answer_questions(
 
 def _verdict(case: Case) -> str:
     """How many of a case's solutions collide, and how many of NSGA-II's are critical."""
+    # Collisions, and solutions that are less safe than the original.
     collisions = are_collisions(case.solutions).sum()
     text = f"{case.name}: {collisions} of {len(case.solutions)} solutions collide"
     try:
@@ -242,6 +243,7 @@ def _equal_solutions(case: Case) -> str:
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
     """What a case's frame leaves out."""
+    # What each table cannot say.
     remarks = list[str]()
     if table in ("rq1", "rq2"):
         remarks += _on_pooled_tests(table, case, frame, alpha)

@@ -212,12 +212,15 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     with exactly four changes); no row where there is no such solution. Of combinations that are
     equally frequent, those with the earlier characteristics in the study come first.
     """
+    # Combinations of exactly so many characteristics.
     is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
     most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[
         :COMBINATIONS_SHOWN
     ]
+
+    # The most frequent ones, with equal ranks for equal numbers.
     rows = []
     for indices, number in most_frequent:
         rank = 1 + sum(other > number for other in counts.values())

@@ -157,6 +157,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size,
     significant, and a12, the effect size with marks.
     """
+    # An effect, marked if it is significant, with its size.
     tests = rq2_runs(case, choices)
     texts = [
         (
@@ -356,6 +357,7 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
     """The values of every metric and, unless the solutions belong to no run, of every indicator;
     over runs, of the minimal causes.
     """
+    # Metrics of solutions, indicators of fronts, and causes.
     samples = {
         (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
         for algorithm, metric in product(case.algorithms, case.scoring.metrics)

@@ -340,6 +340,7 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     UnanswerableError
         If no figure can be drawn.
     """
+    # Figures of all cases, and of each.
     figures = {}
     errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
@@ -350,6 +351,8 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
             figures[name] = draw_figure()
         except UnanswerableError as error:
             errors.append(error)
+
+    # What cannot be drawn is said.
     if not figures:
         raise errors[0]
     for reason in dict.fromkeys(f"no figure: {error.source}: {error.problem}" for error in errors):

@@ -151,6 +151,8 @@ def describe_rules(case: Case) -> str:
     """
     if case.evaluations.empty:
         return ""
+
+    # Do solutions differ from what nothing in the run dominates?
     columns = ["algorithm", "run", *case.characteristics.names]
     fronts = nondominated_evaluations(case)
     joined = case.solutions[columns].merge(fronts[columns], "outer", indicator=True)
@@ -208,6 +210,8 @@ def few_evaluations(case: Case) -> str:
     """
     if not case.has_runs or case.evaluations.empty or not case.finished_runs:
         return ""
+
+    # Runs that simulate less than is usual.
     counts = count_evaluations(case)
     sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform("sum")
     is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin(

@@ -111,11 +111,14 @@ def signed_rank_test(sample: ArrayLike) -> TwoSampleTest:
 
     The test drops differences of 0 (as Wilcoxon did); the effect size counts them by half.
     """
+    # No test of undefined or equal values.
     differences = np.asarray(sample, dtype=float)
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
     if not differences.any():
         return TwoSampleTest(1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST)
+
+    # The effect, and the exact test if no values are tied.
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values(
         [0.0, *np.abs(differences)]
