@@ -363,12 +363,12 @@ def summarise(results: Results) -> Answer:
     tables = {"algorithms": table}
 
     # Tests that none of so few runs can pass are folded, with a remark.
-    untold = list[str]()
+    untested = list[str]()
     with suppress(UnanswerableError):
         tables |= answer_questions([case], names=RUN_TESTS).tables
-        untold = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]
+        untested = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]
         # The first remark on tests of which none can be significant says how many runs are needed.
-        if few := " ".join(next(remarks_on_runs(name, tables[name]), "") for name in untold):
+        if few := " ".join(next(remarks_on_runs(name, tables[name]), "") for name in untested):
             remarks = tables["remarks"]
             remarks.loc[len(remarks)] = ["all", f"{case.name}: {few}"]
     runs = study.search.runs * len(rows)
@@ -388,5 +388,5 @@ def summarise(results: Results) -> Answer:
             "original_degree": results.original[SAFETY_DEGREE],
         },
         tables=tables,
-        folded=tuple(untold),
+        folded=tuple(untested),
     )

@@ -82,10 +82,10 @@ the finite population), the share itself if all collisions were simulated.
 """
 
 
-def judge_sample(
+def assess_sample(
     evaluator: Evaluator, collisions: Evaluations, max_simulations: int = MAX_SIMULATIONS
 ) -> tuple[pd.DataFrame, int]:
-    """The result of `judge_collisions` for evaluated collisions, of which equal settings count
+    """The result of `assess_collisions` for evaluated collisions, of which equal settings count
     once, and the number of these collisions.
 
     If that takes more than about `max_simulations` simulations, only a random sample is simulated,
@@ -94,7 +94,7 @@ def judge_sample(
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
     sample = shuffled[: max(max_simulations // len(TITLES), 1)]
-    return judge_collisions(evaluator, collisions.take(sample)), len(distinct)
+    return assess_collisions(evaluator, collisions.take(sample)), len(distinct)
 
 
 def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
@@ -106,7 +106,7 @@ def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of
-    `judge_sample`.
+    `assess_sample`.
     """
     # What each driver avoids, of the collisions with a verdict.
     rows = []
@@ -137,13 +137,13 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:
     """The weakest driver who avoids a collision, in words; `verdicts` is a row of
-    `judge_collisions`.
+    `assess_collisions`.
     """
     otherwise = NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
     return next((title for driver, title in TITLES.items() if verdicts[driver] == 1), otherwise)
 
 
-def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
+def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
     """Whether each driver avoids each of M evaluated collisions at its worst point: 1, 0, or NaN
     for no verdict.
 
@@ -165,14 +165,14 @@ def judge_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFr
         study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
         settings = collisions.settings[rows]
         there = system.at(point)
-        verdicts.loc[rows, list(drivers)] = _judge_at_point(
+        verdicts.loc[rows, list(drivers)] = _assess_at_point(
             evaluator.for_study(study), there, settings, drivers
         )
         verdicts.loc[rows, "point"] = point.name
     return verdicts
 
 
-def _judge_at_point(
+def _assess_at_point(
     evaluator: Evaluator,
     system: System,
     settings: FloatArray,

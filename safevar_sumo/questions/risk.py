@@ -176,7 +176,7 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
             f" to {high:.2f})."
         )
 
-    # Shares that are too unsure to be told.
+    # Shares that are too unsure.
     of_output = {
         name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
     }

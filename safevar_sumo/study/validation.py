@@ -53,7 +53,7 @@ NO_KEY = "origin"
 
 
 class _Place(NamedTuple):
-    """Where a mistake is: its path, the value there and the type that it is meant to have, also as
+    """Where a mistake is: its path, the value there and the type that is intended there, also as
     declared; the types above; and the other values of the same table.
     """
 
@@ -76,13 +76,13 @@ def _place(raw: Any, table: Any, prefix: str, location: str) -> _Place:
     declared = [table]
     siblings = dict[str, Any]()
     for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
-        inner = _inner_type(_meant(declared[-1], value), name)
+        inner = _inner_type(_intended_type(declared[-1], value), name)
         siblings = value if isinstance(value, dict) else {}
         key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
         path.append(key)
         value = value[key]
         declared.append(inner)
-    return _Place(path, value, _meant(declared[-1], value), declared, siblings)
+    return _Place(path, value, _intended_type(declared[-1], value), declared, siblings)
 
 
 def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
@@ -96,7 +96,7 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
         return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
         return unknown_name("", place.text, place.value, filter(None, get_args(place.kind)))
-    if problem.startswith("Invalid value"):  # of the key that tells which table is meant
+    if problem.startswith("Invalid value"):  # of the key that names the kind of table
         tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-2])]
         return unknown_name("", place.text, place.value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
@@ -139,7 +139,7 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     places = dict[str, str]()
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
-            inner_keys = getattr(_meant(field.type, {}), "__struct_fields__", ())
+            inner_keys = getattr(_intended_type(field.type, {}), "__struct_fields__", ())
             places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
     places |= {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)
@@ -147,10 +147,10 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     return InputError("", f"{path}: there is no such key{hint}", one_of(own))
 
 
-def _meant(kind: Any, value: Any) -> Any:
-    """The type that a value is meant to have, of several ones."""
+def _intended_type(kind: Any, value: Any) -> Any:
+    """The intended type of a value, of several ones."""
     if get_origin(kind) is Annotated:
-        return _meant(get_args(kind)[0], value)
+        return _intended_type(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
         return kind
     kinds = [

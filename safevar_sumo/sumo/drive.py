@@ -87,7 +87,7 @@ def drive(
             collisions = contacts.count(world, motion.hits, scene)
             if isinstance(observer, SceneObserver):  # bodies on tracks touch wherever they overlap
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
-            active = outcomes.judge(speed, scene.over, collisions, last=sample >= last_sample)
+            active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
 
             # What the driving systems see, and what they command.
             observation = perception.observe(time, speed, scene)
@@ -284,7 +284,7 @@ class _Outcomes:
         self._has_stopped = np.zeros(n, dtype=bool)
         self._is_over = np.zeros(n, dtype=bool)
 
-    def judge(
+    def note_sample(
         self,
         speed: FloatArray,
         over: BoolArray,

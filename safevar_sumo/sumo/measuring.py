@@ -61,7 +61,10 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     """
     # Metrics that the study has anyway.
     further = ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops))
-    computed = {**METRICS, **{metric.name: metric for metric, is_meant in further if is_meant}}
+    computed = {
+        **METRICS,
+        **{metric.name: metric for metric, is_computed in further if is_computed},
+    }
     metrics = {**computed, **OPTIONAL_METRICS}
     named = _Named(lookup, {*RESULT_COLUMNS, *metrics, *study.domains}, computed)
 

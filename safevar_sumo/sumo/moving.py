@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.tracks import SCREEN, first_in_strip
 from safevar_sumo.sumo.bodies import Body
-from safevar_sumo.sumo.cast_check import check_motion, check_shapes, check_start
+from safevar_sumo.sumo.track_check import check_motion, check_shapes, check_start
 
 TIE = 1e-6
 """Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the
@@ -166,7 +166,7 @@ def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
     return values[group] if group is not None and len(values) > 1 else values
 
 
-def cast_of(
+def tracks_of(
     scenarios: Sequence[TrackScenario], times: FloatArray, n_encounters: int, step: float, own: Body
 ) -> list[Track]:
     """The bodies of K scenarios, or of one in N encounters, with columns; body b is that of all
@@ -177,10 +177,10 @@ def cast_of(
     InputError
         If bodies cannot move as a scenario says.
     """
-    casts = [scenario.tracks(times) for scenario in scenarios]
-    for cast in casts:
-        check_shapes(cast, len(times), n_encounters, step)
-    joined = [_joined(tracks) for tracks in zip_longest(*casts, fillvalue=NOBODY)]
+    tracks_of_scenarios = [scenario.tracks(times) for scenario in scenarios]
+    for tracks in tracks_of_scenarios:
+        check_shapes(tracks, len(times), n_encounters, step)
+    joined = [_joined(tracks) for tracks in zip_longest(*tracks_of_scenarios, fillvalue=NOBODY)]
     for track in joined:
         check_motion(track, step)
     check_start(joined, own)

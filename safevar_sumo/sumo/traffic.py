@@ -30,7 +30,7 @@ from safevar_sumo.sumo.bodies import (
     distance_covered,
     find_overlaps,
 )
-from safevar_sumo.sumo.moving import TIE, Moving, Sampled, cast_of, row
+from safevar_sumo.sumo.moving import TIE, Moving, Sampled, row, tracks_of
 from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
@@ -71,16 +71,16 @@ class Traffic:
         own = self._own(np.zeros(1), np.zeros(1))
         n_groups = int(group.max()) + 1
         n_encounters = n_groups if len(scenarios) == 1 else 1
-        self.cast = cast_of(scenarios, times, n_encounters, step, own)
+        self.tracks = tracks_of(scenarios, times, n_encounters, step, own)
         self.n = len(group)
         self.step = step
         # None: all vehicles share a column, or each has its own.
         self.group: IntArray | None = group if 1 < n_groups < self.n else None
-        bodies = [Moving.of(track, step, self.width) for track in self.cast]
+        bodies = [Moving.of(track, step, self.width) for track in self.tracks]
         highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
-        self._met = [
+        self._encountered = [
             k for k, body in enumerate(bodies) if body.level.max() >= min(highest_level.max(), 1)
         ]
         self._bodies = bodies
@@ -109,7 +109,7 @@ class Traffic:
         speed = motion.speeds
         over = ALL_TRUE
         seen = []
-        for k in self._met:
+        for k in self._encountered:
             # How near a body is, and whether the encounter with it is over.
             body = self._bodies[k]
             gap = self._row(body.edge) - front
@@ -235,7 +235,7 @@ class Traffic:
         self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
         rear = front - self.length
-        for k in self._met:
+        for k in self._encountered:
             body = self._bodies[k]
             if foremost <= row(body.edge, sample, None).min():
                 continue
@@ -300,10 +300,12 @@ class Traffic:
         in_conflict = np.zeros(shape, dtype=bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
-            for k in self._met:
+            for k in self._encountered:
                 apart, rate = self._apart(k, samples, trace.position[samples], trace.speed[samples])
                 counts = ~self._ended[k, samples] & self._table(self._counts[k], samples)
-                is_nearer = counts & (apart < distance[samples]) if len(self._met) > 1 else counts
+                is_nearer = (
+                    counts & (apart < distance[samples]) if len(self._encountered) > 1 else counts
+                )
                 np.copyto(distance[samples], apart, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts

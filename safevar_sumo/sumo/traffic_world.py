@@ -100,7 +100,7 @@ class TrafficWorld(SumoWorld):
         self._lane = LaneWorld(traffic, start_speeds, self.step_length)
         self._actors = [
             Placed.of(track, self.ids(track.name), start)
-            for track in traffic.cast
+            for track in traffic.tracks
             if track.kind != SCREEN
         ]
 

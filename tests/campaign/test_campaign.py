@@ -238,7 +238,7 @@ ENDS = {
     "sumo/perception.py": ("Perception.observe",),
     "sumo/recorded_world.py": ("RecordedWorld.enter", "RecordedWorld.step"),
     "sumo/bodies.py": ("FirstContacts.count",),
-    "sumo/drive.py": ("_Log.write", "_Log.trace", "_Outcomes.judge", "_Outcomes.classify"),
+    "sumo/drive.py": ("_Log.write", "_Log.trace", "_Outcomes.note_sample", "_Outcomes.classify"),
     "results/journal.py": ("Journal.append", "Journal.finish"),
     "results/store.py": ("evaluations_frame",),
     "results/manifest.py": ("write_whole",),

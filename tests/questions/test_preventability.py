@@ -23,10 +23,10 @@ from safevar_sumo.questions.explain.moved import find_moved_borders
 from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
 from safevar_sumo.questions.preventability import (
     DRIVERS,
+    assess_collisions,
+    assess_sample,
     avoided_by,
     drivers_frame,
-    judge_collisions,
-    judge_sample,
 )
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
@@ -108,7 +108,7 @@ def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
 def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
     """The weakest driver who avoids each collision."""
     return list(
-        map(avoided_by, judge_collisions(here, collisions(here, *settings)).to_dict("records"))
+        map(avoided_by, assess_collisions(here, collisions(here, *settings)).to_dict("records"))
     )
 
 
@@ -162,7 +162,7 @@ def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_ve
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
     here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(
-        *judge_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
+        *assess_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
     )
     letter, any_braking, *_ = found.to_dict("records")
     assert (letter["no_verdict"], any_braking["share"]) == (2, 1.0)
@@ -179,17 +179,17 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
     every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
-    whole, number = judge_sample(here, Evaluations.concatenate([every, every]))
+    whole, number = assess_sample(here, Evaluations.concatenate([every, every]))
     assert (len(whole), number) == (30, 30)
     letter = drivers_frame(whole, number).iloc[0]
     assert (letter["avoided"], letter["later"], letter["no_verdict"]) == (10, 10, 0)
     assert [letter[name] for name in ("share", "share_low", "share_high", "later_share")] == [
         pytest.approx(1 / 3)
     ] * 4
-    sample, number = judge_sample(here, every, max_simulations=45)
+    sample, number = assess_sample(here, every, max_simulations=45)
     assert (len(sample), number) == (15, 30)
     reverse = every.take(np.arange(30)[::-1])
-    pd.testing.assert_frame_equal(sample, judge_sample(here, reverse, max_simulations=45)[0])
+    pd.testing.assert_frame_equal(sample, assess_sample(here, reverse, max_simulations=45)[0])
     letter = drivers_frame(sample, number).iloc[0]
     hits = letter["avoided"]
     expected = (
@@ -336,7 +336,7 @@ def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
     settings = drawn(assemble(study), 24, 3)
     collisions = evaluator.evaluate(settings, "settings")
     collisions = collisions.take(collisions.collided)
-    verdicts = judge_collisions(evaluator, collisions)
+    verdicts = assess_collisions(evaluator, collisions)
     rows = drivers_frame(verdicts, len(collisions)).set_index("driver")
     assert {"competent_driver", "rss", "fuzzy_safety", "r157"} < {*rows.index}
     counts = rows["avoided"] + rows["no_longer"] + rows["no_verdict"]

@@ -72,7 +72,7 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
     active = []
     for i, (speed, over, crash) in enumerate(samples):
         collisions = {} if crash is None else {0: crash}
-        verdicts = outcomes.judge(
+        verdicts = outcomes.note_sample(
             np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1
         )
         active.append(bool(verdicts[0]))

@@ -51,7 +51,7 @@ MAX_LIMITS_NAMED = 3
 OF_OWN_FIT = "with the study's own fit"
 """In which of the vehicle models that fit the published data the limits are."""
 LEAST_METRES = 0.05
-"""A smaller distance by which a vehicle brakes earlier or later is not told [m]."""
+"""A smaller distance by which a vehicle brakes earlier or later is not mentioned [m]."""
 
 
 class Difference(NamedTuple):
@@ -69,7 +69,7 @@ class Difference(NamedTuple):
         return cls(*([*chain(*phrases)] for phrases in zip(cls(), *parts, strict=True)))
 
     @classmethod
-    def judged(cls, phrase: str, *, is_better: bool) -> Difference:
+    def of(cls, phrase: str, *, is_better: bool) -> Difference:
         """A single phrase."""
         return cls(better=[phrase]) if is_better else cls(worse=[phrase])
 
@@ -92,7 +92,7 @@ def compare_values(quantity: str, p: float, a12: float) -> Difference:
     if not p < ALPHA:
         return Difference()
     is_better = a12 < 0.5
-    return Difference.judged(
+    return Difference.of(
         f"has a {'higher' if is_better else 'lower'} {quantity} (p = {p:.2g})", is_better=is_better
     )
 
@@ -197,7 +197,7 @@ def compare_originals(
         phrase = (
             f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}"
         )
-        parts.append(Difference.judged(phrase, is_better=in_a))
+        parts.append(Difference.of(phrase, is_better=in_a))
     if braking["a_needless_braking"] != braking["b_needless_braking"]:
         before = braking["a_needless_braking"]
         after = braking["b_needless_braking"]
@@ -205,10 +205,10 @@ def compare_originals(
             f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes ({before} in"
             f" {a})"
         )
-        parts.append(Difference.judged(phrase, is_better=after < before))
+        parts.append(Difference.of(phrase, is_better=after < before))
     if points and points["a_points"] != points["b_points"]:
         phrase = f"earns {points['b_points']:.4g} points ({points['a_points']:.4g} in {a})"
-        parts.append(Difference.judged(phrase, is_better=points["b_points"] > points["a_points"]))
+        parts.append(Difference.of(phrase, is_better=points["b_points"] > points["a_points"]))
     onsets = ((metres["metres_earlier"], "earlier"), (metres["metres_later"], "later"))
     phrases = [
         f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES

@@ -45,9 +45,9 @@ from safevar_sumo.questions.preventability import (
     LETTER,
     REFERENCE_DRIVERS,
     TITLES,
+    assess_sample,
     avoided_shares,
     drivers_frame,
-    judge_sample,
 )
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import (
@@ -137,8 +137,10 @@ def explain(
     needed = count_needed(evaluator.characteristics, changed, of_sample, len(population.rows))
     needed = needed if is_caused else needed.head(0)
 
-    # In a rating every vehicle collides in some cell, so that nothing is told of reference drivers.
-    verdicts, collisions = judge_sample(evaluator, runs.take(runs.collided & (not is_rated(study))))
+    # In a rating every vehicle collides in some cell, so that reference drivers are left out.
+    verdicts, collisions = assess_sample(
+        evaluator, runs.take(runs.collided & (not is_rated(study)))
+    )
 
     # The same conclusions with the other parameter sets of the vehicle model.
     shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
@@ -209,7 +211,7 @@ def _counts(population: Population, subject: Study | Case) -> JsonObject:
 
 
 def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) -> JsonObject:
-    """The numbers of all collisions, of those judged that some driver avoids, and that even full
+    """The numbers of all collisions, of those assessed that some driver avoids, and that even full
     braking does not; none in a rated study.
     """
     if is_rated(study):

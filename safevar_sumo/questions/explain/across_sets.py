@@ -17,7 +17,7 @@ from safevar_sumo.questions.explain.causes import (
 )
 from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.model_spread import across
-from safevar_sumo.questions.preventability import avoided_shares, judge_sample
+from safevar_sumo.questions.preventability import assess_sample, avoided_shares
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import BoolArray, Evaluations
 
@@ -92,8 +92,8 @@ def ranges_across_sets(
         runs = of_set.evaluate(vehicles, PHASE)
         avoided_here = avoided
         if not avoided.empty:
-            judged, *_ = judge_sample(of_set, runs.take(runs.collided))
-            avoided_here = avoided_shares(judged)
+            assessed, *_ = assess_sample(of_set, runs.take(runs.collided))
+            avoided_here = avoided_shares(assessed)
         return _shares_by_kind(
             unsafe.of(runs), frame.set_index("characteristic")["needed"], avoided_here
         )

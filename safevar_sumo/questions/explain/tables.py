@@ -26,8 +26,8 @@ from safevar_sumo.questions.explain.moved import COLUMNS as MOVED_COLUMNS, find_
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
+    assess_collisions,
     avoided_by,
-    judge_collisions,
 )
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import number_of
@@ -124,8 +124,8 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
     else:
         factors = STEP_FACTORS
         comparisons = compare_at_points(evaluator.system, settings, unsafe)
-    is_judged = failures.collided & (not is_rated(study))
-    judged = iter(judge_collisions(evaluator, failures.take(is_judged)).to_dict("records"))
+    is_assessed = failures.collided & (not is_rated(study))
+    assessed = iter(assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     columns = {
         "solution": [population.names[row] for row in reasons],
         "reason": [*reasons.values()],
@@ -138,7 +138,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         ),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
-        "avoided_by": [avoided_by(next(judged)) if flag else None for flag in is_judged],
+        "avoided_by": [avoided_by(next(assessed)) if flag else None for flag in is_assessed],
     }
     return pd.DataFrame(columns)
 

@@ -18,11 +18,11 @@ MOST_SPEED = 100.0
 """Largest speed of a body [m/s]; a faster change of its place is a jump."""
 UNIT_TOLERANCE = 1e-6
 """Largest difference of a direction's length from 1 [-]."""
-CAST_KEY = "scenario.model"
+TRACKS_KEY = "scenario.model"
 """The key that errors name; the study stands before it."""
 
 
-def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step: float) -> None:
+def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, step: float) -> None:
     """Refuse actors that share a name, and quantities that are neither numbers nor arrays of all
     samples.
 
@@ -32,16 +32,16 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
         With the actor, the time [s] and what is expected.
     """
     # A name for each actor.
-    for name, count in Counter(track.name for track in cast).items():
+    for name, count in Counter(track.name for track in tracks).items():
         if count > 1:
             raise InputError(
                 "",
-                f"{CAST_KEY}: at 0 s {count} actors are called {name!r}",
+                f"{TRACKS_KEY}: at 0 s {count} actors are called {name!r}",
                 "another name for each actor",
             )
 
     # A number, or a value for each sample and encounter.
-    for track in cast:
+    for track in tracks:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             shape = (1, *np.shape(value))[-2:]  # a number, or one row for all samples
             if (
@@ -56,7 +56,7 @@ def check_shapes(cast: Sequence[Track], n_samples: int, n_encounters: int, step:
                 )
                 raise InputError(
                     "",
-                    f"{CAST_KEY}: {problem}",
+                    f"{TRACKS_KEY}: {problem}",
                     f"a number, or an array of the shape of `times`, {samples}",
                 )
 
@@ -118,11 +118,11 @@ def _refuse(
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
         raise InputError(
-            "", f"{CAST_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected
+            "", f"{TRACKS_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected
         )
 
 
-def check_start(cast: Sequence[Track], own: Body) -> None:
+def check_start(tracks: Sequence[Track], own: Body) -> None:
     """Refuse bodies, whose quantities are columns, that are inside each other or inside the
     vehicle, `own`, at the start.
 
@@ -131,7 +131,7 @@ def check_start(cast: Sequence[Track], own: Body) -> None:
     InputError
         With the actors, the time [s] and what is expected.
     """
-    bodies = {f"actor {track.name!r}": _first(track) for track in cast if track.kind != SCREEN}
+    bodies = {f"actor {track.name!r}": _first(track) for track in tracks if track.kind != SCREEN}
     for (name, body), (other_name, other) in combinations(
         {**bodies, "the vehicle under test": own}.items(), 2
     ):
@@ -140,7 +140,7 @@ def check_start(cast: Sequence[Track], own: Body) -> None:
         if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
             raise InputError(
-                "", f"{CAST_KEY}: {problem}", "bodies that do not overlap at the start"
+                "", f"{TRACKS_KEY}: {problem}", "bodies that do not overlap at the start"
             )
 
 
