@@ -138,9 +138,8 @@ def explain(
     needed = needed if is_caused else needed.head(0)
 
     # In a rating every vehicle collides in some cell, so that reference drivers are left out.
-    verdicts, collisions = assess_sample(
-        evaluator, runs.take(runs.collided & (not is_rated(study)))
-    )
+    is_assessed = runs.collided & (not is_rated(study))
+    verdicts, collisions = assess_sample(evaluator, runs.take(is_assessed))
 
     # The same conclusions with the other parameter sets of the vehicle model.
     shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
