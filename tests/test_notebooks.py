@@ -158,8 +158,8 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     ) == (5, 3)
     printed = "".join(_texts(notebook))
     for result in (
-        "All may go to their limits together",
-        "The probability of an unsafe vehicle is",
+        "may go to their joint limits at the same time",
+        "An unsafe vehicle has a probability of",
         "of them have ",
     ):
         assert result in printed

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -34,9 +34,9 @@ from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.words import (
+    change_texts,
     demanded_in_words,
     ending_in_words,
-    list_of_changes,
     number_of,
     question_command,
 )
@@ -62,6 +62,14 @@ ALGORITHMS: Columns = {
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
     "solutions": "solutions of finished runs",
 }
+CHANGES: Columns = {
+    "characteristic": "characteristic that is changed",
+    "unit": "unit of its values",
+    "original": Column("", "value of the original vehicle", ".10g"),
+    "value": Column("", "value with which the vehicle is unsafe", ".10g"),
+}
+MAX_LISTED = 3
+"""Largest number of changes that the verdict lists; the table has them all."""
 RUN_TESTS = ("rq1-runs", "rq2-runs")
 """The tables of the tests over runs."""
 
@@ -78,6 +86,7 @@ RUN_TESTS = ("rq1-runs", "rq2-runs")
     ),
     *("engine", "evaluations_per_second", "seconds"),
     algorithms=[*ALGORITHMS, ...],
+    fewest=CHANGES,
     **{name: TABLES[name].columns for name in RUN_TESTS},
     remarks=REMARKS,
 )
@@ -197,8 +206,17 @@ def _found(results: Results, system: System, unsafe: str | None, jobs: int | Non
     following = ", ".join(
         question_command(name, directory) + criterion for name in ("explain", "tolerance")
     )
-    verdict = f"{reason or _verdict(results, case, system)} Next: {following}"
-    return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
+    sentence, changes = _verdict(results, case, system)
+    tables = answer.tables
+    if changes:
+        frame = tabulate("The unsafe solution with the fewest changes", CHANGES, changes)
+        tables = {"algorithms": tables["algorithms"], "fewest": frame, **tables}
+    return replace(
+        answer,
+        verdict=f"{reason or sentence} Next: {following}",
+        numbers={"driven": not reason, **answer.numbers},
+        tables=tables,
+    )
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
@@ -262,8 +280,10 @@ def _measured(
     )
 
 
-def _verdict(results: Results, case: Case, system: System) -> str:
-    """How many solutions of a case of the results are unsafe, and how little is enough."""
+def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tuple[Any, ...]]]:
+    """How many solutions of a case of the results are unsafe, and how little is enough; and the
+    rows of `CHANGES` of the solution with the fewest.
+    """
     names = list(system.characteristics.names)
 
     # An original vehicle that is unsafe itself needs no change.
@@ -272,23 +292,21 @@ def _verdict(results: Results, case: Case, system: System) -> str:
             assemble(case.study), system.characteristics.original[np.newaxis]
         )
         if case.unsafe.of(original)[0]:
-            return (
-                f"The original vehicle itself {case.unsafe.breach_in_words(original)}: no change is"
-                " needed."
-            )
+            breach = case.unsafe.breach_in_words(original)
+            return f"The original vehicle itself {breach}: no change is needed.", []
 
     # The solution with the fewest changes, as it is printed, must be unsafe, too.
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
-        return "No solution."
+        return "The search found no solution.", []
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
-        f"{len(failures)} of {len(solutions)} different solutions are unsafe:"
-        f" {case.unsafe.description}."
+        f"The search found {len(solutions)} different solutions; {len(failures)} of them are unsafe"
+        f" ({case.unsafe.description})."
     )
     counts = " ".join([counts, *demanded_in_words(results.study)])
     if failures.empty:
-        return counts
+        return counts, []
     fewest = failures.iloc[0]
     values = fewest[names].to_numpy(dtype=float)
     printed = None if system.rater else _failing_as_printed(system, case, values)
@@ -306,8 +324,16 @@ def _verdict(results: Results, case: Case, system: System) -> str:
     elif case.unsafe.bound:
         ending += f", {case.unsafe.bound.measure} {bounded[case.unsafe.bound.measure]:.3g}"
     by_name = dict(zip(names, values.tolist(), strict=True))
-    changes = list_of_changes(case.characteristics, by_name, are_printed=printed is not None)
-    return f"{counts} With the fewest changes it {ending}: {changes}."
+    are_printed = printed is not None
+    texts = change_texts(case.characteristics, by_name, are_printed=are_printed)
+    rows = [
+        (item.name, item.unit, item.original, by_name[item.name])
+        for item in case.characteristics
+        if by_name[item.name] != item.original
+    ]
+    listed = ", ".join(texts) if len(texts) <= MAX_LISTED else "the table lists them"
+    number = number_of(len(texts), "change")
+    return f"{counts} With the fewest changes the vehicle {ending}: {number} ({listed}).", rows
 
 
 def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:

@@ -156,7 +156,10 @@ class Answer:
     study
         The study that was examined; `list` is about none.
     verdict
-        One or two sentences: what, how far, how sure.
+        Conclusion, evidence and next step in a few sentences; what it covers stands in the last
+        one, which begins with `Scope:`.
+    tested
+        How the conclusion was tested, in sentences that readers see below the tables.
     numbers
         Values by name; NaN or None where undefined.
     tables
@@ -180,6 +183,7 @@ class Answer:
     failures: tuple[str, ...] = ()
     folded: tuple[str, ...] = ()
     command: str = ""
+    tested: str = ""
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
     def to_dict(self) -> JsonObject:
@@ -200,6 +204,7 @@ class Answer:
             "question": self.question,
             "study": getattr(self.study, "name", None),
             "verdict": self.verdict,
+            **({"tested": self.tested} if self.tested else {}),
         }
         return {**head, "numbers": plain(self.numbers), "tables": tables}
 
@@ -256,7 +261,8 @@ class Answer:
         if form == "html":
             first, *later = map(escape, SENTENCE_END.split(self.verdict))
             verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])
-            others = [f"<p>{escape(self._other_tables)}</p>"] if self._other_tables else []
+            texts = filter(None, (self._tested_in_words, self._other_tables))
+            others = [f"<p>{escape(text)}</p>" for text in texts]
             return "\n".join(
                 [f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others]
             )
@@ -270,20 +276,24 @@ class Answer:
     def print(self, console: Console) -> None:
         """Print the verdict, the tables and the numbers."""
         # Verdict, tables, and what else there is.
-        print_text(console, self.verdict)
+        print_text(console, self.verdict.replace(" Scope: ", "\nScope: "))
         for frame in self._short_tables.values():
             for part in terminal_tables(frame, console.width):
                 if isinstance(part, str):
                     print_text(console, part)
                 elif part.row_count:
                     console.print(part)
-        if self._other_tables:
-            print_text(console, self._other_tables)
+        for text in filter(None, (self._tested_in_words, self._other_tables)):
+            print_text(console, text)
         if self.study is not None:  # `list` has checked nothing
             print_text(
                 console,
                 "; ".join(f"{name}: {cell_text(value)}" for name, value in self.numbers.items()),
             )
+
+    @property
+    def _tested_in_words(self) -> str:
+        return f"How this was tested: {self.tested}" if self.tested else ""
 
     @property
     def _reader_tables(self) -> dict[str, pd.DataFrame]:

@@ -53,6 +53,9 @@ UNSURE = 0.5
 """Width of an interval of a share of the variance from which on the verdict says that it is unsure
 [-].
 """
+NO_PROBABILITY = (
+    " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
+)
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
@@ -137,9 +140,9 @@ def risk(
 
     # In words.
     verdict = (
-        f"{_probability_in_words(study, failures / total)} ({criterion.description}; from"
-        f" {100 * low:.3g} to {100 * high:.3g} % with {100 * confidence:g} % confidence,"
-        f" {failures:,} of {total:,} vehicles)."
+        f"{_probability_in_words(study, failures, total)} ({criterion.description};"
+        f" {100 * confidence:g} % confidence interval {100 * low:.3g} to {100 * high:.3g} %)."
+        f"{NO_PROBABILITY if not study.variation else ''}"
     )
     left_out = int(drawn.infeasible.sum())
     if total + left_out < samples:
@@ -193,13 +196,12 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     return words
 
 
-def _probability_in_words(study: Study, probability: float) -> str:
-    """The probability, and how vehicles vary."""
+def _probability_in_words(study: Study, failures: int, total: int) -> str:
+    """The share of unsafe vehicles, and how vehicles vary."""
+    share = f"{100 * failures / total:.3g} %"
     if not study.variation:
-        return (
-            f"{100 * probability:.3g} % of the domain is unsafe, no probability in the field"
-            " without [variation]"
-        )
+        vehicles = f"{total:,} vehicles that were sampled uniformly over the whole domain"
+        return f"Of {vehicles}, {failures:,} are unsafe: {share}"
 
     # Distributions other than the uniform one.
     variation = [
@@ -210,8 +212,8 @@ def _probability_in_words(study: Study, probability: float) -> str:
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
     return (
-        f"The probability of an unsafe vehicle is {100 * probability:.3g} % if vehicles vary as"
-        f" specified, {manner}"
+        f"An unsafe vehicle has a probability of {share} if vehicles vary as specified, {manner}:"
+        f" {failures:,} of {total:,} are unsafe"
     )
 
 

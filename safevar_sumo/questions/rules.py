@@ -108,13 +108,14 @@ def rules(
     # The share of unsafe vehicles, and the rule that covers most of them.
     low, high = clopper_pearson(failures, total)
     drawn = (
-        "drawn as [variation] says"
+        "sampled as [variation] says"
         if study.variation or study.correlations
-        else "over the whole domain"
+        else "sampled uniformly over the whole domain"
     )
     verdict = (
-        f"{100 * failures / total:.2f} % of {total:,} vehicles {drawn} are unsafe "
-        f"({criterion.description}; {100 * low:.2f} % to {100 * high:.2f} %).{remark}"
+        f"Of {total:,} vehicles {drawn}, {100 * failures / total:.2f} % are unsafe"
+        f" ({criterion.description}; 95 % confidence interval {100 * low:.2f} to"
+        f" {100 * high:.2f} %).{remark}"
         f"{_rule_in_words(table, failures / total)}"
     )
     numbers = {

@@ -130,15 +130,13 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
             assert said == pytest.approx(value, abs=10.0**-item.digits)
             printed = case.characteristics.setting({**leading["boundary"], item.name: said})
             assert case.unsafe.of(drive_and_score(assemble(case.study), printed[np.newaxis]))[0]
-    share = f"{100 * leading['robust_share']:.0f} % of its neighbours are unsafe too"
-    assert re.search(
-        rf"^With .* the vehicle collides \(.*{share}; in {leading['fits_holding']} of {FITS} ",
-        verdict,
-    )
+    share = f"{100 * leading['robust_share']:.0f} % of neighbouring vehicles are unsafe, too"
+    assert re.search(rf"^With .* the vehicle collides\. The cause is \w+: .*{share}\.", verdict)
+    assert f"It holds in {leading['fits_holding']} of {FITS} parameter sets" in verdict
     assert leading["solution"] not in verdict
     numbers = explained.numbers
     assert (
-        f"{numbers['failures']} of {numbers['settings']} different solutions of the search are"
+        f"Of {numbers['settings']} different solutions of the search, {numbers['failures']} are"
         " unsafe" in verdict
     )
     drivers = explained.tables["drivers"].set_index("driver")["avoided"]
@@ -381,7 +379,7 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
         f"The original itself has safety degree {degree} m, below 99 m: no change is needed. Demand"
         " less, with"
     )
-    assert answer.verdict.startswith(f"{said} --unsafe. 4 of 4 vehicles")
+    assert answer.verdict.startswith(f"{said} --unsafe. Of 4 vehicles")
     assert [
         len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")
     ] == [0, 0, 0]

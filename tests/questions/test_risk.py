@@ -149,7 +149,7 @@ def test_rules_draw_as_the_variation_says() -> None:
         for ask in (rules, risk)
     )
     assert by_rules.numbers["failures"] == by_risk.numbers["failures"]
-    assert "1,000 vehicles drawn as [variation] says are unsafe" in by_rules.verdict
+    assert "Of 1,000 vehicles sampled as [variation] says, " in by_rules.verdict
     (rule,) = by_rules.tables["rules"]["rule"]
     assert rule.startswith("b below 3")
 

@@ -111,12 +111,9 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.Mo
     monkeypatch.setattr(search, "MAX_ATTEMPTS", 0)
     answer = answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",))
     assert answer.verdict.startswith(
-        "The specified limits are kept with all others as in the original. No limits toget"
+        "The specified limits hold with all other characteristics as in the original. No joint"
     )
-    assert (
-        "1 box was tried, and each held an unsafe vehicle. That is no proof that there are none."
-        in answer.verdict
-    )
+    assert "That is no proof that there are none." in answer.verdict
     assert answer.tables["limits"]["together_low"].isna().all()
     assert [answer.numbers[name] for name in ("box", "boxes", "kept", "attacked")] == [
         False,
@@ -126,8 +123,8 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.Mo
     ]
     assert not answer.failures, "no limit is broken"
     assert answer.values("limits.sentence") == [
-        "A: no limits together were found.",
-        "B: no limits together were found.",
+        "A: no joint limits were found.",
+        "B: no joint limits were found.",
     ]
 
 
@@ -212,7 +209,7 @@ def test_the_names_that_others_read() -> None:
         "fails_at",
         "sentence",
     ]
-    assert record["verdict"].startswith("Keeps all limits")
+    assert record["verdict"].startswith("All limits hold")
     assert "up to 8" in answer.render("text")
     assert len(answer.figure().get_axes()) == 2
 
@@ -245,8 +242,8 @@ def test_limits_that_other_fits_move_are_uncertain() -> None:
         (
             "a <= 6",
             (
-                "Keeps all limits in one model: within them no vehicle that was tried is unsafe"
-                " (collision)."
+                "All limits hold in one vehicle model: no vehicle that was tested within them is"
+                " unsafe (collision)."
             ),
         ),
     ],
@@ -302,9 +299,10 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     assert [row[name] for row in (decel, gain) for name in ("together_low", "together_high")] == [
         None
     ] * 4
-    assert [
-        row["sentence"].endswith(": no limits together were found.") for row in (decel, gain)
-    ] == [True, True]
+    assert [row["sentence"].endswith(": no joint limits were found.") for row in (decel, gain)] == [
+        True,
+        True,
+    ]
 
 
 MANUAL = re.compile(r"(at least|at most) ([\d.]+)")
@@ -392,7 +390,7 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
 @pytest.mark.slow
 def test_gaps_are_between_bumpers() -> None:
     said = run("tolerance", "native", "--characteristics", "decel", "--jobs", "1").stdout
-    assert "no vehicle that was tried keeps less than 0.3 m between bumpers" in said
+    assert "every vehicle that was tested within them keeps at least 0.3 m" in said
     assert "the car keeps less than 0.3 m from a standing vehicle" in said
 
 

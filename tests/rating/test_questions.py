@@ -153,7 +153,7 @@ def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -
     count = (solutions["rating_points"] < 2.2).sum()
     assert count > 0
     assert studied["verdict"].startswith(
-        f"{count} of {len(solutions)} different solutions are unsafe"
+        f"The search found {len(solutions)} different solutions; {count} of them are unsafe"
     )
     found = {}
     for typed in (

@@ -233,10 +233,8 @@ def _verdict(
     unsafe = population.unsafe
     contact = evaluator.system.contact
     runs = population.evaluations
-    counts = (
-        f"{np.count_nonzero(unsafe.of(runs))} of {len(runs)} {kind} are unsafe"
-        f" ({unsafe.description})."
-    )
+    number = np.count_nonzero(unsafe.of(runs))
+    counts = f"Of {len(runs)} {kind}, {number} are unsafe ({unsafe.description})."
 
     # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
@@ -276,28 +274,31 @@ def _verdict(
         limits.append(f"{item.short_name} {side} {text}")
     encounter = encounter_in_words(members, values, are_printed=bool(printed))
     where = f"{encounter}, where the original is safe," if encounter else ""
-    sure = [robustness_in_words(leading["robust_share"])]
-    sure += (
-        [f"in {leading['fits_holding']} of {sets} parameter sets of the vehicle model"]
-        if sets
-        else []
-    )
-    notes = f" ({'; '.join(filter(None, sure))})" if any(sure) else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    return f"With {join_phrases(limits)}{where} the vehicle {verb}{notes}. {counts}"
+    sentences = [
+        f"With {join_phrases(limits)}{where} the vehicle {verb}.",
+        robustness_in_words(leading["robust_share"]),
+    ]
+    if sets:
+        holding = f"{leading['fits_holding']} of {sets}"
+        sentences.append(f"It holds in {holding} parameter sets of the vehicle model.")
+    return " ".join([*filter(None, sentences), counts])
 
 
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     """What a competent driver, and full braking, would have avoided."""
     shares = avoided_shares(verdicts)
-    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
+    titles = {
+        LETTER: "a competent driver would have avoided {}",
+        FULL: "full braking at the first possible moment would have avoided {}",
+    }
     phrases = [
-        f"{title} avoids {share_in_words(shares[name])}"
+        title.format(share_in_words(shares[name]))
         for name, title in titles.items()
         if name in shares
     ]
     number = number_of(len(verdicts), "collision")
-    return f"In the same vehicle, of {number} {join_phrases(phrases)}." if phrases else ""
+    return f"Of {number} in the same vehicle, {join_phrases(phrases)}." if phrases else ""
 
 
 def draw_needed(answer: Answer) -> Figure:

@@ -92,10 +92,12 @@ def find_smallest_robust_failure(
 
 
 def robustness_in_words(share: float) -> str:
-    """How robust a failure is, by the share of its unsafe neighbours: `robust: 84 % of its
-    neighbours are unsafe too`; empty if unknown.
+    """How robust a failure is, by the share of its unsafe neighbours: `The cause is robust: 84 %
+    of neighbouring vehicles are unsafe, too.`; empty if unknown.
     """
     if np.isnan(share):
         return ""
-    phrase = f"{100 * share:.0f} % of its neighbours are unsafe too"
-    return f"robust: {phrase}" if share >= MIN_ROBUST_SHARE else f"borderline: only {phrase}"
+    phrase = f"{100 * share:.0f} % of neighbouring vehicles are unsafe, too"
+    if share >= MIN_ROBUST_SHARE:
+        return f"The cause is robust: {phrase}."
+    return f"The cause is borderline: only {phrase}."

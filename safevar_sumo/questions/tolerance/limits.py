@@ -40,16 +40,18 @@ from safevar_sumo.questions.tolerance.scans import (
 )
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
-from safevar_sumo.questions.tolerance.words import NOT_FALSIFIED, USUAL_BUDGET, verdict_sentences
+from safevar_sumo.questions.tolerance.words import (
+    NOT_FALSIFIED,
+    USUAL_BUDGET,
+    tested_sentences,
+    verdict_sentences,
+)
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles.region import REJECTIONS
 
-LIMITS_TITLE = (
-    "Limits, rounded to the safe side; a car beyond one has the others at theirs unless a sentence"
-    " says which"
-)
+LIMITS_TITLE = "Joint limits, and limits of each characteristic alone, rounded to the safe side"
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
@@ -203,10 +205,12 @@ def answer_limits(asked: Asked) -> Answer:
         *(models, found.alone, together, asked.limits, rows.broken, asked.budget),
         *(nearest, wider, refusal, contacts),
     )
+    tested = tested_sentences(models, together, asked.budget, contacts)
     return Answer(
         question="tolerance",
         study=study,
-        verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
+        verdict=" ".join(sentences),
+        tested=" ".join([*tested, *counted_in_words(study), *constraints_in_words(study)]),
         numbers={
             "unsafe": str(asked.unsafe),
             "margin": asked.unsafe.keep,

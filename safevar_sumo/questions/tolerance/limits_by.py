@@ -28,8 +28,8 @@ from safevar_sumo.questions.tolerance.words import (
     NOT_FALSIFIED,
     USUAL_BUDGET,
     contacts_in_words,
-    failure_in_words,
     rough_in_words,
+    tested_in_words,
 )
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
@@ -72,10 +72,12 @@ def answer_by(asked: Asked, by: Parameter) -> Answer:
         ),
     )
     sentences = [*_sentences(search, levels, frame, reach, contacts), f"Scope: {scopes[-1]}."]
+    tested = " ".join(_tested_sentences(search))
     return Answer(
         question="tolerance",
         study=study,
-        verdict=" ".join([*sentences, *counted_in_words(study), *constraints_in_words(study)]),
+        verdict=" ".join(sentences),
+        tested=tested,
         numbers={
             "unsafe": str(search.unsafe),
             "margin": search.unsafe.keep,
@@ -309,16 +311,15 @@ def _sentences(
     values = f"{join_phrases(f'{value:g}' for value in by.values)}{unit_text(by.unit)}"
     members, left_out = levels[-1].models
     tried = len(members) + len(left_out)
-    fits = "in one model" if tried == 1 else f"in {len(members)} of {tried} fits"
-    failure = failure_in_words(unsafe, len(members))
+    fits = f"in {len(members)} of {tried} parameter sets"
+    if tried == 1:
+        fits = "in one vehicle model"
     counted = _of_counted(search, by.values[-1])
     of_counted = f"{counted}," if counted else ""
     hold = "hold" if search.budget else "were only scanned"
     yield (
-        f"Limits up to {values}{of_counted} {hold} {fits}: within them no vehicle that was tried"
-        f" {failure}."
+        f"Limits up to {values}{of_counted} {hold} {fits}: {tested_in_words(unsafe, len(members))}."
     )
-    yield _tried(search)
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
         yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
@@ -336,16 +337,22 @@ def _original_in_words(search: LevelSearch) -> str:
     return f"The original vehicle itself keeps {margin:g} m only up to {_text(by, keeps)}{touches}."
 
 
-def _tried(search: LevelSearch) -> str:
-    """What was driven beside scans for limits alone."""
-    if not search.budget:
-        return "Not attacked."
-    texts = ["points between those of the study"]
-    if search.evaluator.study.scenario.search:
-        texts = [f"{budget_alone(search.budget):,} aimed at each limit"]
-    if search.limits:
-        texts.append(f"{enough(search.budget):,} aimed at the specified limits")
-    return f"Tried beside scans: {join_phrases(texts)}."
+def _tested_sentences(search: LevelSearch) -> Iterator[str]:
+    """How the limits were tested, and what does not count."""
+    texts = ["scans of each characteristic"]
+    if search.budget and search.evaluator.study.scenario.search:
+        count = f"{budget_alone(search.budget):,}"
+        texts.append(f"{count} simulations for each limit that search for a counterexample")
+    elif search.budget:
+        texts.append("points between those of the study")
+    if search.budget and search.limits:
+        count = f"{enough(search.budget):,}"
+        texts.append(f"{count} such simulations for the specified limits")
+    text = join_phrases(texts)
+    yield f"{text[:1].upper()}{text[1:]}."
+    study = search.evaluator.study
+    yield from counted_in_words(study)
+    yield from constraints_in_words(study)
 
 
 def _limit_texts(search: LevelSearch) -> Iterator[str]:

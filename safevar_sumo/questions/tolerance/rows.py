@@ -246,14 +246,14 @@ def _sentence(
     """A sentence for a maintenance manual: all of these may be obeyed together."""
     name = item.short_name[:1].upper() + item.short_name[1:]
     if box is None:
-        return f"{name}: no limits together were found."
+        return f"{name}: no joint limits were found."
     column = members.names.index(item.name)
     ends: Interval = float(box.lower[column]), float(box.upper[column])
     domain = (item.lower, item.upper)
     if ends[0] == ends[1]:
         return (
-            f"{name}: keep {ends[0]:.10g}{item.suffix}, as in the original: no room was found for"
-            f" it. Scope: {scope}."
+            f"{name}: {ends[0]:.10g}{item.suffix}, as in the original vehicle; no room was found"
+            f" for it. Scope: {scope}."
         )
     keep = " and ".join(
         f"{word} {end:.10g}{item.suffix}"
@@ -265,19 +265,17 @@ def _sentence(
             f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope:"
             f" {scope}."
         )
-    beyond = (
-        ""
-        if failure is None
-        else f"; {_vehicle_in_words(item, box, members, failure)}, {failure.words}"
-    )
-    return f"{name}: keep {keep}{beyond}. Scope: {scope}."
+    beyond = ""
+    if failure is not None:
+        beyond = f" {_vehicle_in_words(item, box, members, failure)}, {failure.words}."
+    return f"{name}: {keep}.{beyond} Scope: {scope}."
 
 
 def _vehicle_in_words(
     item: Characteristic, box: Box, members: CharacteristicSet, failure: Failure
 ) -> str:
-    """The vehicle that fails just beyond a limit: `at 0.81`, with what the table's title does not
-    say of the others.
+    """The vehicle that fails just beyond a limit: `At 0.81, with all others at their limits`, and
+    which of the others are elsewhere.
     """
     named = list[str]()
     for other, value, low, high in zip(members, failure.setting, box.lower, box.upper, strict=True):
@@ -289,4 +287,7 @@ def _vehicle_in_words(
         if other.name != item.name and not other.is_scenario and not is_said:
             named.append(f"{other.name} {limit_text(other, value)}")
     value = failure.setting[members.names.index(item.name)]
-    return f"at {limit_text(item, value)}{f', with {join_phrases(named)}' if named else ''}"
+    others = "with all others at their limits"
+    if named:
+        others = f"with {join_phrases(named)} and all others at their limits"
+    return f"At {limit_text(item, value)}, {others}"

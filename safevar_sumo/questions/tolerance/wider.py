@@ -125,14 +125,15 @@ def _verdict(
     model = models.members[int(found.judges[0])]
     if not found.failures:
         keeps = model.unsafe.value_in_words(model.unsafe.value(found.robustness[0]))
-        return f"they hold: the worst of {found.simulated:,} aimed at them {keeps}.", None
+        simulated = f"{found.simulated:,} simulations that search for a counterexample"
+        return f"the limits hold: the worst of {simulated} {keeps}.", None
     described = [
         failure
         for pair in (lowest, (model, found.settings[0]))
         if pair is not None
         for failure in describe(pair[0], {"": pair[1]}, box).values()
     ]
-    new_car = ", where the new car is safe" if lowest is not None else ""
+    new_car = ", where the original vehicle is safe" if lowest is not None else ""
     first = described[0].words if described else "a car within them is unsafe"
     last = (
         f"; at worst, {described[-1].words}" if len({each.words for each in described}) > 1 else ""

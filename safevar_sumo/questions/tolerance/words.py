@@ -66,46 +66,66 @@ def verdict_sentences(
     refusal: str,
     contacts: Contacts | None,
 ) -> Iterator[str]:
-    """The sentences of the verdict, the decision first; a `refusal` says why no limit can be
-    kept.
+    """The sentences of the verdict: the decision, what decides it, what would do instead, and the
+    scope. A `refusal` says why no limit can be kept.
     """
     unsafe = models.own.unsafe
     study = models.own.evaluator.study
     if refusal:
         yield f"{refusal[:1].upper()}{refusal[1:]}. {unsafe.smaller_demand}".strip()
         return
+
+    # The decision, and how sure it is.
     decision = f"Do not release: {'; '.join(broken)}." if broken else ""
     if rough := f"{rough_in_words(budget)}{decision}".strip():
         yield rough
-    if contacts is not None:
-        share = share_in_words(models.own.evaluator.share_left_out)
-        margin = f"in which the original keeps less than {study.scenario.margin:g} m"
-        yield f"Of the encounters over the domain {share} are left out, {margin}."
-        yield from contacts_in_words(models.own.evaluator, contacts)
     if together is not None:
         yield from _fits_in_words(models, together)
         yield from _nearest_in_words(nearest)
         yield from _box_in_words(models, together, bool(limits), budget)
-    yield f"Scope: {scope_of(study, between=budget > 0)}."
+
+    # What is unsafe within the limits but does not count, or elsewhere.
+    if contacts is not None:
+        yield from contacts_in_words(models.own.evaluator, contacts)
     for name, scope, _, verdict, _ in wider:
         yield f"In the wider scope of {name} ({scope}) {verdict}"
-    if names := [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]:
-        yield f"Unsafe alone, beyond the limits: {join_phrases(names)}."
+    names = [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]
+    if len(names) > 1:
+        yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
+    elif names:
+        yield f"{names[0]} can make the vehicle unsafe on its own."
     else:
-        yield "No single characteristic makes it unsafe."
+        yield "No single characteristic makes the vehicle unsafe on its own."
+    yield f"Scope: {scope_of(study, between=budget > 0)}."
+
+
+def tested_sentences(
+    models: Models, together: LimitsTogether | None, budget: int, contacts: Contacts | None
+) -> Iterator[str]:
+    """How joint limits were tested; nothing without such limits."""
+    study = models.own.evaluator.study
+    if contacts is not None:
+        share = share_in_words(models.own.evaluator.share_left_out)
+        yield (
+            f"Of the encounters over the domain {share} do not count, because the original vehicle"
+            f" itself keeps less than {study.scenario.margin:g} m in them."
+        )
+    if models.left_out:
+        yield (
+            f"Left out: {fit_names(models.left_out)}, in which the original vehicle itself is"
+            " unsafe or keeps too little."
+        )
+    if together is not None and together.box is not None:
+        yield validation_in_words(together, budget)
+        yield _bound_in_words(together)
 
 
 def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
-    """In which fits the specified limits do not hold, and which fits do not count."""
+    """In which parameter sets the specified limits do not hold."""
     if together.broken and len(models.members) > 1:
         kept = f"{len(together.members)} of {len(models.members)}"
         fits = fit_names(sorted(together.broken))
-        yield f"The specified limits hold in {kept} fits of the vehicle, not in {fits}."
-    if models.left_out:
-        yield (
-            f"Left out: {fit_names(models.left_out)}, in which the original itself is unsafe or"
-            " keeps too little."
-        )
+        yield f"The specified limits hold in {kept} parameter sets of the vehicle, not in {fits}."
 
 
 def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
@@ -124,100 +144,111 @@ def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
 def _box_in_words(
     models: Models, together: LimitsTogether, has_limits: bool, budget: int
 ) -> Iterator[str]:
-    """The limits together, and what they were tested with."""
+    """The joint limits, and what was found within them."""
     unsafe = models.own.unsafe
     count = len(together.members)
-    where = (
-        "in one model" if len(models.members) == 1 else f"in {count} of {len(models.members)} fits"
-    )
     if together.box is None:
         if together.boxes:
             kept = (
-                "The specified limits are kept with all others as in the original. "
+                "The specified limits hold with all other characteristics as in the original. "
                 if has_limits
                 else ""
             )
-            boxes = "1 box was" if together.boxes == 1 else f"{together.boxes} boxes were"
+            tested = number_of(together.boxes, "operating range")
             yield (
-                f"{kept}No limits together were found ({unsafe.description}): {boxes} "
-                "tried, and each held an unsafe vehicle. That is no proof that there are none."
+                f"{kept}No joint limits were found ({unsafe.description}): the search tested"
+                f" {tested}, and found an unsafe vehicle in each. That is no proof that there are"
+                " none."
             )
         return
-    decision = "All may go to their limits together"
+    where = "in one vehicle model"
+    if len(models.members) > 1:
+        where = f"in {count} of {len(models.members)} parameter sets"
+    decision = "All characteristics may go to their joint limits at the same time"
     if has_limits:
-        decision = "The limits together below hold" if together.broken else "Keeps all limits"
+        decision = "The joint limits below hold" if together.broken else "All limits hold"
     if not budget:
         decision = (
-            "No search for counterexamples tested the limits together below: they hold at their"
+            "No search for counterexamples tested the joint limits below: they hold at their"
             " corners"
         )
-    yield (
-        f"{decision} {where}: within them no vehicle that was tried"
-        f" {failure_in_words(unsafe, count)}."
-    )
-    yield f"Tried: {validation_in_words(together, budget)}."
+    yield f"{decision} {where}: {tested_in_words(unsafe, count)}."
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
 
 
+def tested_in_words(unsafe: Unsafe, fits: int) -> str:
+    """What every vehicle within limits did that hold in some parameter sets: with others than the
+    study's own, no distance is demanded.
+    """
+    every = "every vehicle that was tested within them"
+    if not unsafe.keep:
+        sets = f" in any of {fits} parameter sets" if fits > 1 else ""
+        return f"no vehicle that was tested within them is unsafe ({unsafe.description}){sets}"
+    others = ""
+    if fits > 1:
+        others = (
+            " with the study's own parameter set, and none collides with"
+            f" {number_of(fits - 1, 'other')}"
+        )
+    return f"{every} keeps at least {unsafe.keep:.3g} m of clearance{others}"
+
+
 def validation_in_words(together: LimitsTogether, budget: int) -> str:
-    """What limits together were tested with: corners, an attack, vehicles drawn at random."""
+    """What joint limits were tested with: corner cases, simulations that search for a
+    counterexample, and random vehicles.
+    """
     searched = len(together.members[0].evaluator.characteristics.scenario) > 0
     met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
     falsification = _falsification_in_words(together, budget)
-    return f"all corners{met}; {falsification}; {_proof_in_words(together)}"
-
-
-def failure_in_words(unsafe: Unsafe, fits: int) -> str:
-    """What no vehicle does within limits that hold in some fits: other fits than the study's own
-    keep no distance.
-    """
-    if not unsafe.keep:
-        return f"is unsafe ({unsafe.description}){f' in any of {fits} fits' if fits > 1 else ''}"
-    between = " between bumpers" if unsafe.contact else ""
-    others = (
-        f" with the study's own fit, and none collides with {number_of(fits - 1, 'other')}"
-        if fits > 1
-        else ""
-    )
-    return f"keeps less than {unsafe.keep:.3g} m{between}{others}"
+    return f"All corner cases{met}; {falsification}; {_sampled_in_words(together)}."
 
 
 def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
-    """The attack: `the worst of 5,000 aimed at them keeps 0.31 m (with the study's own fit 0.67
-    m)`.
+    """The falsification: `20,000 simulations that search for a counterexample (smallest clearance
+    0.36 m)`.
     """
     if together.falsification is None or not budget:
-        return "not attacked"
+        return "no search for a counterexample"
+    simulated = f"{together.falsification.simulated:,} simulations that search for a counterexample"
     least, own = together.least
     unsafe = together.members[0].unsafe
     if not abs(least) < float("inf"):
-        return f"{together.falsification.simulated:,} aimed at them meet nobody"
-    words = unsafe.value_in_words(least)
+        return f"{simulated}, of which none met an encounter that counts"
+
+    # The worst of them, over all parameter sets and with the study's own.
+    worst = unsafe.value_in_words(least)
     of_own = ""
-    if own == own and unsafe.value_in_words(own) != words:
-        of_own = f" (with the study's own fit {unsafe.value_in_words(own).partition(' ')[2]})"
+    if own == own and unsafe.value_in_words(own) != worst:
+        of_own = (
+            f", {unsafe.value_in_words(own).partition(' ')[2]} with the study's own parameter set"
+        )
     between = ""
     if together.between:
-        between = f", at {number_of(together.between, 'point')} between those of the study, too"
+        between = f", also at {number_of(together.between, 'point')} between those of the study"
         if together.between_left_out:
             between += (
-                f" ({together.between_left_out} left out, where the new car keeps too little)"
+                f" ({together.between_left_out} more left out, where the original vehicle keeps too"
+                " little)"
             )
-    return (
-        f"the worst of {together.falsification.simulated:,} aimed at them {words}{of_own}{between}"
-    )
+    return f"{simulated} (the worst {worst}{of_own}){between}"
 
 
-def _proof_in_words(together: LimitsTogether) -> str:
+def _sampled_in_words(together: LimitsTogether) -> str:
     proof = together.proof
     assert proof is not None
     failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
-    bound = (
-        f"at most {100 * proof.at_most:.2f} % of evenly drawn cars are, with {100 * CONFIDENCE:.0f}"
-        " % confidence"
+    unsafe = "none" if not proof.failures else f"{proof.failures}"
+    return f"{proof.samples:,} random vehicles, {unsafe} unsafe{failed}"
+
+
+def _bound_in_words(together: LimitsTogether) -> str:
+    proof = together.proof
+    assert proof is not None
+    return (
+        f"With {100 * CONFIDENCE:.0f} % confidence at most {100 * proof.at_most:.2f} % of uniformly"
+        " sampled vehicles within the limits are unsafe."
     )
-    return f"{proof.failures} of {proof.samples:,} drawn at random are unsafe{failed}: {bound}"
 
 
 def _without_room(models: Models, together: LimitsTogether) -> list[str]:
