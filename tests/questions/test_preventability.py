@@ -121,8 +121,8 @@ def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None
     many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
     assert (
         _avoided_in_words(many)
-        == "Of 1000 collisions in the same vehicle, a competent driver would have avoided nearly all"
-        " and full braking at the first possible moment would have avoided all."
+        == "Of 1000 collisions in the same vehicle, a competent driver would have avoided nearly"
+        " all and full braking at the first possible moment would have avoided all."
     )
     assert _avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
 
