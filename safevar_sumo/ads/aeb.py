@@ -20,7 +20,6 @@ from safevar_sumo.ads.base import (
     blocks_the_way,
     cruise_at,
     is_in_the_way,
-    pedals_for,
     time_to_reach,
 )
 from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
@@ -130,9 +129,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
         stage = self._stage(seen, memory, is_threatened)
         has_intervened = memory.intervened | (stage > NO_BRAKING)
-        pedals = pedals_for(
-            nominal, seen.speed, self.cruise_gain * (cruise_speed - seen.speed), cruise_trim
-        )
+        cruising = self.cruise_gain * (cruise_speed - seen.speed)
+        pedals = self.pedals(cruising, seen.speed, nominal, cruise_trim)
         throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
 
         # A braking stage presses the brake, partly or fully.
@@ -280,7 +278,7 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             -np.minimum(ramp, self.target_acceleration),
             self.cruise_gain * (cruise_speed - seen.speed),
         )
-        pedals = pedals_for(nominal, seen.speed, acceleration, cruise_trim)
+        pedals = self.pedals(acceleration, seen.speed, nominal, cruise_trim)
         return pedals, _AutowareMemory(nominal, step, cruise, decision_time)
 
     def distance(self, speed: FloatArray, obstacle_speed: FloatArray) -> FloatArray:

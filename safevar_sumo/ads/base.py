@@ -8,13 +8,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from itertools import repeat
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation, Quantity
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
@@ -47,6 +47,8 @@ class Ads:
         setting; "" for others.
     RETURNS
         What the methods of a user's class must return.
+    HELPERS
+        Methods that a class may call, and replace by others of the same name.
     """
 
     __slots__ = ()
@@ -57,6 +59,9 @@ class Ads:
         "drive": Returned(({"throttle": SHARE, "brake": SHARE}, {}), like=0),
         "warns": Returned(({"": TRUTH},)),
     }
+    HELPERS: ClassVar[tuple[str, ...]] = ("pedals",)
+    if TYPE_CHECKING:
+        nominal: Nominal
 
     @abstractmethod
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
@@ -71,6 +76,21 @@ class Ads:
     def warns(self, memory: Memory) -> BoolArray | None:
         """Which drivers are warned after `drive`, shape (N,); None if the ADS never warns."""
         return None
+
+    def pedals(
+        self,
+        acceleration: FloatArray,
+        speed: FloatArray,
+        nominal: Nominal | None = None,
+        trim: Trim | None = None,
+    ) -> Command:
+        """Pedals with which the original vehicle has an acceleration [m/s^2] at a speed [m/s] on a
+        dry, level road, shape (N,).
+
+        `nominal` is the original vehicle, by default the attribute `nominal` that `start` has set.
+        A `trim` is added; see `trim_at`.
+        """
+        return pedals_for(nominal or self.nominal, speed, acceleration, trim or NO_TRIM)
 
 
 class FullBrake(Ads):
@@ -89,6 +109,7 @@ class ScalarAds(ABC):
     A study names it as `package.module:Name`; its parameters are the arguments of `__init__`.
     """
 
+    HELPERS: ClassVar[tuple[str, ...]] = ("pedals",)
     nominal: Nominal
     step: float
     warns = False
@@ -106,6 +127,17 @@ class ScalarAds(ABC):
         """Command throttle and brake, each in [0, 1], from an observation whose fields are
         numbers.
         """
+
+    def pedals(
+        self, acceleration: Quantity, speed: Quantity, trim: Trim | None = None
+    ) -> tuple[float, float]:
+        """Throttle and brake with which the original vehicle has an acceleration [m/s^2] at a
+        speed [m/s] on a dry, level road.
+
+        A `trim` is added; see `trim_at`.
+        """
+        throttle, brake = pedals_for(self.nominal, speed, acceleration, trim or NO_TRIM)
+        return float(throttle), float(brake)
 
 
 class PerVehicleAds(Ads):
@@ -159,7 +191,7 @@ def _scalar_observations(seen: Observation) -> Iterator[Observation]:
 
 
 def interpolate_tables(
-    table_speeds: FloatArray, speed: FloatArray, *tables: FloatArray
+    table_speeds: FloatArray, speed: Quantity, *tables: FloatArray
 ) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
     spacing = table_speeds[1]
@@ -227,6 +259,10 @@ class Trim(NamedTuple):
     brake: FloatArray
 
 
+NO_TRIM = Trim(np.zeros(()), np.zeros(()))
+"""The trim on a level road."""
+
+
 def trim_at(nominal: Nominal, seen: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
     is_rolling = seen.speed > 0
@@ -245,7 +281,7 @@ def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple
 
 
 def pedals_for(
-    nominal: Nominal, speed: FloatArray, acceleration: FloatArray, pedal_trim: Trim
+    nominal: Nominal, speed: Quantity, acceleration: Quantity, pedal_trim: Trim
 ) -> Command:
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle
     and a trim.

@@ -18,7 +18,6 @@ from safevar_sumo.ads.base import (
     PositiveParameter,
     Trim,
     is_in_the_way,
-    pedals_for,
     trim_at,
 )
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
@@ -57,7 +56,8 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         initial_trim = trim_at(nominal, seen) if trim is None else trim
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
         acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return pedals_for(nominal, seen.speed, acceleration, initial_trim), (nominal, initial_trim)
+        command = self.pedals(acceleration, seen.speed, nominal, initial_trim)
+        return command, (nominal, initial_trim)
 
     @abstractmethod
     def acceleration_at(

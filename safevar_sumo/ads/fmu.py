@@ -13,20 +13,32 @@ from typing import Any
 
 import numpy as np
 
-from safevar_sumo.ads.base import ScalarAds, Trim, pedals_for, trim_at
+from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
 from safevar_sumo.errors import InputError, check_name, unknown_name
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.study.schema import ModelTable
 
+NOMINAL = "nominal_"
+"""Prefix of what an FMU may be given of the original vehicle."""
+NOMINAL_UNITS: Mapping[str, str] = {
+    "mass": "kg",
+    **dict.fromkeys(("accel", "decel"), "m/s2"),
+    "max_speed": "m/s",
+    "actuator_lag": "s",
+    **dict.fromkeys(("length", "width"), "m"),
+}
+"""The numbers of the original vehicle, and their units."""
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"),
-    **dict.fromkeys(("gap", "lateral", "obstacle_width"), "m"),
+    **dict.fromkeys(("gap", "lateral", "obstacle_width", "obstacle_length"), "m"),
     **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
-    **{"time": "s", "acceleration": "m/s2"},
+    **{"time": "s", "step": "s", "acceleration": "m/s2"},
+    **{f"{NOMINAL}{name}": unit for name, unit in NOMINAL_UNITS.items()},
 }
 """Quantities that an FMU is given or returns, and their units. It is given observations; `detected`
-is 1 while an obstacle is detected. It returns throttle and brake or an acceleration; above 0.5,
+is 1 while an obstacle is detected; the numbers of the original vehicle, such as `nominal_decel`;
+and the `step` between two calls. It returns throttle and brake or an acceleration; above 0.5,
 `warns` is a warning.
 """
 COMMANDS = ("throttle", "brake", "acceleration", "warns")
@@ -75,7 +87,11 @@ class Fmu:
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
 
         # Its variables by the quantities that they take or hold.
-        observed = [name for name in (*Observation._fields, "detected") if name in UNITS]
+        observed = [
+            name
+            for name in UNITS
+            if name in (*Observation._fields, "detected", "step") or name.startswith(NOMINAL)
+        ]
         self.inputs = {
             key: self._variable("input", key, name, observed) for key, name in table.inputs.items()
         }
@@ -162,24 +178,24 @@ class FmuAds(ScalarAds):
 
     def start(self, nominal: Nominal, step: float) -> None:
         super().start(nominal, step)
+        values = nominal._asdict()
+        self._known = {f"{NOMINAL}{name}": values[name] for name in NOMINAL_UNITS} | {"step": step}
         self._slave = self._fmu.code.call("initialisation", self._fmu.new_instance, step)
         self._end = weakref.finalize(self, _free, self._slave)
         self._end.atexit = False
 
     def drive(self, seen: Observation) -> tuple[float, float]:
         outputs = self._fmu.code.call(
-            "doStep", self._step, {**seen._asdict(), "detected": np.isfinite(seen.gap)}
+            "doStep",
+            self._step,
+            {**seen._asdict(), "detected": np.isfinite(seen.gap), **self._known},
         )
         self._calls += 1
         self.warns = outputs.get("warns", 0.0) > 0.5
         if "acceleration" not in outputs:
             return outputs.get("throttle", 0.0), outputs.get("brake", 0.0)
-        now = Observation._make(np.array([value]) for value in seen)
-        self._trim = self._trim or trim_at(self.nominal, now)
-        command = pedals_for(
-            self.nominal, now.speed, np.array([outputs["acceleration"]]), self._trim
-        )
-        return float(command.throttle[0]), float(command.brake[0])
+        self._trim = self._trim or trim_at(self.nominal, seen)
+        return self.pedals(outputs["acceleration"], seen.speed, self._trim)
 
     def _step(self, values: Mapping[str, float]) -> dict[str, float]:
         """Advance the instance with observed values; returns its outputs."""

@@ -9,16 +9,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.ads.base import Ads, DelayLine, Trim, pedals_for
-from safevar_sumo.records import (
-    KMH_PER_MS,
-    ZERO,
-    BoolArray,
-    Command,
-    FloatArray,
-    Nominal,
-    Observation,
-)
+from safevar_sumo.ads.base import Ads, DelayLine
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -182,9 +174,7 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """Pedals for the commanded acceleration, from the calibration table of the original
         vehicle.
         """
-        pedals = pedals_for(
-            memory.nominal, seen.speed, memory.commanded_acceleration, Trim(ZERO, ZERO)
-        )
+        pedals = self.pedals(memory.commanded_acceleration, seen.speed, memory.nominal)
         stops = memory.has_begun_to_stop
         return Command(np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0))
 

@@ -18,7 +18,6 @@ from safevar_sumo.ads.base import (
     Trim,
     blocks_the_way,
     cruise_at,
-    pedals_for,
 )
 from safevar_sumo.records import (
     GRAVITY,
@@ -214,7 +213,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         else:
             acceleration = CRUISE_GAIN * (speed_to_hold - seen.speed)
             acceleration = np.where(is_aware, np.minimum(acceleration, 0.0), acceleration)
-            calm = pedals_for(memory.nominal, seen.speed, acceleration, trim)
+            calm = self.pedals(acceleration, seen.speed, memory.nominal, trim)
 
         # In a danger it brakes by what the vehicle's own deceleration lacks.
         mean, felt, intended = _decelerations(seen, memory, danger, is_endangered, aware_time)

@@ -355,9 +355,10 @@ def contract_of(base: type) -> str:
 
 
 def _methods(base: type) -> dict[str, list[str]]:
-    """The public methods of a class, and the names of their parameters without default and without
-    `self`.
+    """The public methods of a class that the package calls, and the names of their parameters
+    without default and without `self`.
     """
+    helpers = getattr(base, "HELPERS", ())
     return {
         name: [
             parameter.name
@@ -365,7 +366,7 @@ def _methods(base: type) -> dict[str, list[str]]:
             if parameter.default is parameter.empty
         ]
         for name, method in vars(base).items()
-        if inspect.isfunction(method) and not name.startswith("_")
+        if inspect.isfunction(method) and not name.startswith("_") and name not in helpers
     }
 
 

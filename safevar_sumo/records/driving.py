@@ -68,8 +68,9 @@ class Observation(NamedTuple):
     the vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out
     of sight [m]. `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the
     obstacle's own speed along the vehicle's path [m/s], `obstacle_width` its extent across the lane
-    [m], 0 where the scenario does not state it; `obstacle` is the number of the body that it is, of
-    several; `throttle` and `brake` are the pedals' positions [-].
+    [m], `obstacle_length` its extent along the lane [m], both 0 where the scenario does not state
+    them; `obstacle` is the number of the body that it is, of several; `throttle` and `brake` are
+    the pedals' positions [-].
     """
 
     time: float
@@ -84,6 +85,7 @@ class Observation(NamedTuple):
     brake: FloatArray = ZERO
     obstacle_width: FloatArray = ZERO
     obstacle: FloatArray = ZERO
+    obstacle_length: FloatArray = ZERO
 
 
 class Command(NamedTuple):
@@ -113,6 +115,7 @@ class Nominal(NamedTuple):
     `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type;
     `actuator_lag` [s] is the time constant with which its wheels follow the pedals. `tables` drives
     the vehicle on its first call, and returns `speeds`, `full_throttle`, `coasting` and `braking`.
+    `length` and `width` [m] are those of its body in the scenario; 0 outside a run.
     """
 
     mass: float
@@ -121,6 +124,8 @@ class Nominal(NamedTuple):
     max_speed: float
     actuator_lag: float
     tables: Callable[[], PedalTables]
+    length: float = 0.0
+    width: float = 0.0
 
     @property
     def speeds(self) -> FloatArray:
@@ -176,8 +181,8 @@ class Trace:
       all speeds in m/s.
     - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
     - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its
-      length where the scenario states it [m], `obstacle_width` its extent across the lane, 0 where
-      the scenario does not state it [m].
+      extent along the lane and `obstacle_width` its extent across it, 0 where the scenario does not
+      state them [m].
     - `visible`: nothing hides the obstacle.
     """
 
@@ -242,6 +247,7 @@ class SimulationRuns:
     acted, NaN if no speed is prescribed [m/s]; `acted_early` the time at which the system acted
     while the motion of others still depended on the vehicle, NaN otherwise [s]; `warning_ttc` the
     time to collision at which the system first warned its driver, NaN if it never did [s].
+    `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
     """
 
     trace: Trace
@@ -252,6 +258,7 @@ class SimulationRuns:
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
     acted_early: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
+    centre_to_centre: bool = False
 
     @cached_property
     def is_approach(self) -> BoolArray:
@@ -287,6 +294,7 @@ class SimulationRuns:
             test_speed_error=select(self.test_speed_error),
             acted_early=select(self.acted_early),
             warning_ttc=select(self.warning_ttc),
+            centre_to_centre=self.centre_to_centre,
         )
 
     def nearest(self, vehicle: int) -> int | None:
@@ -303,11 +311,13 @@ class SimulationRuns:
 
     @property
     def middles_apart(self) -> float:
-        """How far the middles of bodies that touch are apart [m], in a scenario that states the
-        obstacle's length; else 0.
+        """How far the middles of bodies that touch are apart [m], in a scenario that measures
+        between middles; else 0.
         """
+        if not self.centre_to_centre:
+            return 0.0
         length = float(np.max(self.trace.obstacle_length))
-        return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS) if length else 0.0
+        return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS)
 
     @property
     def closing_speed(self) -> FloatArray:

@@ -39,7 +39,7 @@ class Scene(NamedTuple):
     quantities.
 
     `over` is true where the encounter has ended for good, `visible` where the obstacle is not
-    occluded. A scenario whose `centre_to_centre` is true states the obstacle's length [m].
+    occluded. A scenario whose `centre_to_centre` is true states the `obstacle_length`.
     """
 
     gap: FloatArray

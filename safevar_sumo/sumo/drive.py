@@ -67,7 +67,10 @@ def drive(
     # Vehicles, driving systems and what is noted of the runs, at the start.
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
-    memory = ads.start(n, system.nominal, step)
+    nominal = system.nominal._replace(
+        length=float(world.vehicle_length(VUT)), width=float(world.vehicle_width)
+    )
+    memory = ads.start(n, nominal, step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
     is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
@@ -139,6 +142,7 @@ def _runs(
         test_speed_error=robot.error,
         acted_early=robot.acted_early,
         warning_ttc=outcomes.warning_ttc,
+        centre_to_centre=points[0].scenario.centre_to_centre,
     )
 
 

@@ -39,9 +39,9 @@ class Moving(NamedTuple):
     ----------
     track
         The body's track with such columns.
-    edge, far, half_width
+    edge, far, half_length, half_width
         Position along the lane of the body's rear (of who faces along the lane, of its first point
-        in the vehicle's path) and of its far end; half its extent across the lane [m].
+        in the vehicle's path) and of its far end; half its extent along and across the lane [m].
     vx, vy, least_vx, most_vx
         Speeds along the lane and to its left; the least and largest speed along it from now on
         [m/s].
@@ -60,6 +60,7 @@ class Moving(NamedTuple):
     track: Track
     edge: FloatArray
     far: FloatArray
+    half_length: FloatArray
     half_width: FloatArray
     vx: FloatArray
     vy: FloatArray
@@ -110,6 +111,7 @@ class Moving(NamedTuple):
             track=track,
             edge=edge,
             far=track.x + half_length,
+            half_length=slim(half_length),
             half_width=half_width,
             vx=vx,
             vy=vy,

@@ -29,6 +29,7 @@ OCCLUDED = {
     "lateral_speed": 0.0,
     "obstacle_speed": 0.0,
     "obstacle_width": 0.0,
+    "obstacle_length": 0.0,
     "obstacle": 0.0,
 }
 """What is observed of an occluded obstacle [m, m/s]."""

@@ -180,6 +180,7 @@ class Traffic:
             over=np.broadcast_to(over, self.n),
             obstacle_speed=zeros + self._row(body.vx),
             visible=seen.visible,
+            obstacle_length=zeros + 2 * self._row(body.half_length),
             obstacle_width=zeros + 2 * self._row(body.half_width),
             obstacle=zeros + seen.body,
         )

@@ -124,6 +124,7 @@ DELAYED = (
     "lateral_speed",
     "obstacle_speed",
     "obstacle_width",
+    "obstacle_length",
     "obstacle",
 )
 """What sensors report of an obstacle."""
