@@ -25,6 +25,7 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched
+from tests.made_up import HAS_AD_RSS
 
 collect_ignore = (
     [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
@@ -112,7 +113,17 @@ def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(local, "ProcessWorker", WORKER_PROCESSES)
 
 
-@pytest.fixture(params=[name for name in study_names() if not is_rated(load_study(name))])
+SLOW_STUDIES = ("wear_idm", "wear_rss")
+"""Studies whose driving systems are called for each vehicle, and are slow."""
+
+
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
+        for name in study_names()
+        if not is_rated(load_study(name)) and (name != "wear_rss" or HAS_AD_RSS)
+    ]
+)
 def any_system(request: pytest.FixtureRequest) -> System:
     """The system of each shipped study in turn, except a study that is rated in thousands of
     cells.

@@ -4,6 +4,8 @@ degrees.
 
 from __future__ import annotations
 
+import platform
+import sys
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,11 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
+
+HAS_AD_RSS = (
+    sys.platform == "linux" and platform.machine() == "x86_64" and sys.version_info < (3, 14)
+)
+"""Whether there are wheels of ad-rss; setup.cfg says the same."""
 
 
 def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:

@@ -161,7 +161,8 @@ class PerVehicleAds(Ads):
             for i in open_rows(
                 np.ones(len(memory), dtype=bool)
             ).tolist():  # vehicles whose run has not ended
-                pedals[i] = self._checked_pedals(memory[i].drive(observations[i]))
+                command = self._code.call("drive", memory[i].drive, observations[i])
+                pedals[i] = self._checked_pedals(command)
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:

@@ -207,4 +207,6 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     # A class drives one vehicle or all.
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
-    return PerVehicleAds(create, member.code) if member.code and isinstance(ads, ScalarAds) else ads
+    if not isinstance(ads, ScalarAds):
+        return ads
+    return PerVehicleAds(create, member.code or UserCode(f"ads.model = {table.model!r}"))

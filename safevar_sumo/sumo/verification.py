@@ -64,7 +64,8 @@ def drive_again(
                 values[name][sample] = getattr(scene, name)
             is_open = is_open & trace.active[sample]
             is_open[[*collisions]] = False
-            if not is_open.any() or sample + 1 == len(trace.time):
+            # A trace may be longer than the point's runs, which end before those of other points.
+            if sample + 1 == len(trace.time) or not (is_open & trace.active[sample + 1]).any():
                 break
             motion = world.step(trace.speed[sample + 1], is_open)
     return values

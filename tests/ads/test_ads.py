@@ -33,7 +33,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import seen
+from tests.made_up import HAS_AD_RSS, seen
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
@@ -43,13 +43,16 @@ NATIVE = load_study("native")
 SYSTEMS = {
     name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name))))
     for name in ADS
+    if name != "ad_rss" or HAS_AD_RSS
 }
 TAKE_OVER = {
+    "ad_rss",
     "aeb",
     "autoware_aeb",
     "competent_driver",
     "full_braking",
     "fuzzy_safety",
+    "highway_idm",
     "r157",
     "rss",
 }
@@ -72,7 +75,7 @@ KNOWN = Nominal(
 )
 
 
-@pytest.fixture(params=sorted(ADS))
+@pytest.fixture(params=sorted(SYSTEMS))
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

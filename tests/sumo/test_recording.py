@@ -25,12 +25,12 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import at_point
+from safevar_sumo.sumo.matrix import at_point, evaluate
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.in_process import json_of, run
-from tests.made_up import drawn
+from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
 CLAIM = """
@@ -128,6 +128,20 @@ def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reac
     engine = read_manifest(Path("results/it"))["engine"]
     assert engine["name"] == "sumo"
     assert "'reacting'" in engine["reason"]
+
+
+def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_own_end() -> None:
+    """A car that follows is under way to the end of both runs."""
+    tests = [
+        {"name": f"{seconds:g}", "parameters": {"test": "CCRm", "time_after": seconds}}
+        for seconds in (1.0, 2.0)
+    ]
+    ads = {"model": "idm", "parameters": {}}
+    car = {"model": "car_to_car", "parameters": {}}
+    system = assemble(load_study("wear", ads=ads, scenario=car, matrix={"tests": tests}))
+    outcomes = evaluate(system, original_of(system)).outcome.tolist()
+    assert outcomes == ["timeout"]
+    verify_in_sumo(system, original_of(system))
 
 
 def test_driven_speeds_lead_to_the_same_places_and_collisions_in_sumo(any_system: System) -> None:

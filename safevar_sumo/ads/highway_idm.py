@@ -1,0 +1,57 @@
+"""highway-env's IDMVehicle (PyPI highway-env, MIT) as a driving system: its own `acceleration` is
+the acceleration that it commands.
+"""
+
+from __future__ import annotations
+
+from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import Observation
+
+ROAD_LENGTH = 10_000.0
+"""Length of the straight road on which highway-env's vehicles are [m]."""
+
+
+class HighwayIdm(ScalarAds):
+    """Drives with the acceleration of highway-env's IDMVehicle behind whoever is in the way, else
+    on a free road.
+
+    The library's own numbers count: at most 6 m/s^2, comfortably 3 and -5 m/s^2, a headway of 1.5 s
+    and a gap of 5 m at standstill. Needs the extra `highway-env`.
+
+    Parameters
+    ----------
+    target_speed
+        The speed that it wishes [m/s], by default the initial speed.
+    corridor
+        Half the width of the corridor that it watches [m].
+    """
+
+    def __init__(self, target_speed: float | None = None, corridor: float = CORRIDOR) -> None:
+        try:
+            from highway_env.road.road import Road, RoadNetwork
+            from highway_env.vehicle.behavior import IDMVehicle
+        except ImportError:
+            raise InputError(
+                "",
+                "ads.model = 'highway_idm' needs highway-env",
+                "in the checkout: pip install '.[highway-env]'",
+            ) from None
+        self.target_speed = target_speed
+        self.corridor = corridor
+        network = RoadNetwork.straight_road_network(1, length=ROAD_LENGTH, speed_limit=None)
+        road = Road(network, record_history=False)
+        self._me, self._front = (IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
+
+    def drive(self, seen: Observation) -> tuple[float, float]:
+        me, front = self._me, self._front
+        me.speed = float(seen.speed)
+        if self.target_speed is None:
+            self.target_speed = me.speed
+        me.target_speed = self.target_speed
+        is_led = bool(is_in_the_way(seen, self.corridor))
+        if is_led:  # distances of the library are between the middles of its own vehicles
+            front.position[0] = seen.gap + (me.LENGTH + front.LENGTH) / 2
+            front.speed = float(seen.obstacle_speed)
+        wish = me.acceleration(me, front if is_led else None)
+        return self.pedals(min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), seen.speed)
