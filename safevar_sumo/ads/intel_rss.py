@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way
@@ -18,26 +19,45 @@ ROLLING_OUT = 1.0
 """Deceleration after a demand to brake, while somebody is in the way [m/s^2]: assumption."""
 FASTEST = 100.0
 """Speed up to which the library's rule plans an acceleration within the response time [m/s]."""
-LATERAL_ACCELERATION, LATERAL_BRAKING = 0.2, -0.8
-"""Accelerations of the lateral rule [m/s^2], which needs numbers and does not decide here: whoever
-is in the way overlaps.
-"""
-NEVER_LEAVES = 1000.0
-"""Distance to the end of the intersection that the library asks for [m]: there is none."""
-UNSTRUCTURED = {
-    "pedestrian_turning_radius": 2.0,
-    "drive_away_max_angle": 2.4,
-    "vehicle_yaw_rate_change": 0.3,
-    "vehicle_min_radius": 3.5,
-    "vehicle_trajectory_calculation_step": 0.2,
-    "vehicle_front_intermediate_yaw_rate_change_ratio_steps": 4,
-    "vehicle_brake_intermediate_acceleration_steps": 1,
-    "vehicle_continue_forward_intermediate_yaw_rate_change_ratio_steps": 3,
-    "pedestrian_continue_forward_intermediate_heading_change_ratio_steps": 3,
-    "pedestrian_brake_intermediate_acceleration_steps": 3,
-    "pedestrian_front_intermediate_heading_change_ratio_steps": 4,
+OBJECT = {
+    "structured_object_state.is_in_correct_lane": True,
+    "structured_object_state.has_priority": False,
+    "structured_object_state.velocity.speed_lat_min": 0.0,
+    "structured_object_state.velocity.speed_lat_max": 0.0,
+    "structured_object_state.distance_to_enter_intersection": 0.0,
+    "structured_object_state.distance_to_leave_intersection": 1000.0,
+    # For situations without lanes: not used here, but checked by the library.
+    "unstructured_object_state.yaw": 0.0,
+    "unstructured_object_state.steering_angle": 0.0,
+    "unstructured_object_state.yaw_rate": 0.0,
+    "unstructured_object_state.dimension.length": 4.9,
+    "unstructured_object_state.dimension.width": 2.1,
+    "unstructured_object_state.center_point.x": 0.0,
+    "unstructured_object_state.center_point.y": 0.0,
+    "unstructured_object_state.speed_range.minimum": 0.0,
+    "unstructured_object_state.speed_range.maximum": 0.0,
 }
-"""Settings for situations without lanes, in SI units: not used here, but checked by the library."""
+"""An object on its lane, in SI units: no intersection is near."""
+DYNAMICS = {
+    # The lateral rule does not decide here: whoever is in the way overlaps.
+    "alpha_lat.accel_max": 0.2,
+    "alpha_lat.brake_min": -0.8,
+    "lateral_fluctuation_margin": 0.0,
+    "max_speed_on_acceleration": FASTEST,
+    # For situations without lanes.
+    "unstructured_settings.pedestrian_turning_radius": 2.0,
+    "unstructured_settings.drive_away_max_angle": 2.4,
+    "unstructured_settings.vehicle_yaw_rate_change": 0.3,
+    "unstructured_settings.vehicle_min_radius": 3.5,
+    "unstructured_settings.vehicle_trajectory_calculation_step": 0.2,
+    "unstructured_settings.vehicle_front_intermediate_yaw_rate_change_ratio_steps": 4,
+    "unstructured_settings.vehicle_brake_intermediate_acceleration_steps": 1,
+    "unstructured_settings.vehicle_continue_forward_intermediate_yaw_rate_change_ratio_steps": 3,
+    "unstructured_settings.pedestrian_continue_forward_intermediate_heading_change_ratio_steps": 3,
+    "unstructured_settings.pedestrian_brake_intermediate_acceleration_steps": 3,
+    "unstructured_settings.pedestrian_front_intermediate_heading_change_ratio_steps": 4,
+}
+"""What the library asks for besides the parameters of its longitudinal rule, in SI units."""
 
 
 class AdRss(ScalarAds):
@@ -167,58 +187,39 @@ class _Rule:
         return bool(response.longitudinal_response.name != "None")
 
     def _dynamics_of(self, rule: Mapping[str, float]) -> Any:
-        physics = self._physics
-        dynamics = self._rss.world.RssDynamics()
-        longitudinal = dynamics.alpha_lon
-        longitudinal.accel_max = physics.Acceleration(rule["accel_max"])
-        longitudinal.brake_max = physics.Acceleration(-rule["brake_max"])
-        brake_min = physics.Acceleration(-rule["brake_min"])
-        longitudinal.brake_min = longitudinal.brake_min_correct = brake_min
-        dynamics.alpha_lat.accel_max = physics.Acceleration(LATERAL_ACCELERATION)
-        dynamics.alpha_lat.brake_min = physics.Acceleration(LATERAL_BRAKING)
-        dynamics.lateral_fluctuation_margin = physics.Distance(0.0)
-        dynamics.response_time = physics.Duration(rule["response_time"])
-        dynamics.max_speed_on_acceleration = physics.Speed(FASTEST)
-        kept = rule["min_longitudinal_safety_distance"]
-        dynamics.min_longitudinal_safety_distance = physics.Distance(kept)
-        for name, value in UNSTRUCTURED.items():
-            settings = dynamics.unstructured_settings
-            kind = type(getattr(settings, name))
-            setattr(settings, name, kind(value))
-        return dynamics
+        longitudinal = {
+            "alpha_lon.accel_max": rule["accel_max"],
+            "alpha_lon.brake_max": -rule["brake_max"],
+            "alpha_lon.brake_min": -rule["brake_min"],
+            "alpha_lon.brake_min_correct": -rule["brake_min"],
+        }
+        kept = {name: rule[name] for name in ("response_time", "min_longitudinal_safety_distance")}
+        return filled(self._rss.world.RssDynamics(), {**longitudinal, **kept, **DYNAMICS})
 
     def _behind(self) -> Any:
         """The ego vehicle behind another one in the same direction, in its way."""
         core = self._rss.core
-        kinds = self._rss.world.ObjectType
+        world = self._rss.world
         pair = core.RelativeConstellation()
-        pair.constellation_id = pair.object_id = 1
-        pair.ego_id = 0
-        pair.constellation_type = self._rss.world.ConstellationType.SameDirection
-        pair.ego_state = self._object(kinds.EgoVehicle)
-        pair.other_state = self._object(kinds.OtherVehicle)
-        place = pair.relative_position
-        place.longitudinal_position = core.LongitudinalRelativePosition.AtBack
-        place.lateral_position = core.LateralRelativePosition.Overlap
-        place.lateral_distance = self._physics.Distance(0.0)
-        return pair
+        for state, kind in ((pair.ego_state, "EgoVehicle"), (pair.other_state, "OtherVehicle")):
+            state.object_type = getattr(world.ObjectType, kind)
+            state.dynamics = self._dynamics
+            filled(state, OBJECT)
+        place = {
+            "constellation_id": 1,
+            "object_id": 1,
+            "constellation_type": world.ConstellationType.SameDirection,
+            "relative_position.longitudinal_position": core.LongitudinalRelativePosition.AtBack,
+            "relative_position.lateral_position": core.LateralRelativePosition.Overlap,
+            "relative_position.lateral_distance": 0.0,
+        }
+        return filled(pair, place)
 
-    def _object(self, kind: Any) -> Any:
-        physics = self._physics
-        state = self._rss.core.RelativeObjectState()
-        state.object_type = kind
-        state.dynamics = self._dynamics
-        on_lane = state.structured_object_state
-        on_lane.is_in_correct_lane = True
-        on_lane.has_priority = False
-        on_lane.velocity.speed_lat_min = on_lane.velocity.speed_lat_max = physics.Speed(0.0)
-        on_lane.distance_to_enter_intersection = physics.Distance(0.0)
-        on_lane.distance_to_leave_intersection = physics.Distance(NEVER_LEAVES)
-        # For situations without lanes: not used here, but checked by the library.
-        free = state.unstructured_object_state
-        free.yaw, free.steering_angle = physics.Angle(0.0), physics.Angle(0.0)
-        free.yaw_rate = physics.AngularVelocity(0.0)
-        free.dimension.length, free.dimension.width = physics.Distance(4.9), physics.Distance(2.1)
-        free.center_point.x = free.center_point.y = physics.Distance(0.0)
-        free.speed_range.minimum = free.speed_range.maximum = physics.Speed(0.0)
-        return state
+
+def filled(target: Any, values: Mapping[str, Any]) -> Any:
+    """An object of the library after its attributes, by their dotted names, got these values."""
+    for path, value in values.items():
+        *owners, name = path.split(".")
+        owner = reduce(getattr, owners, target)
+        setattr(owner, name, type(getattr(owner, name))(value))
+    return target

@@ -175,7 +175,11 @@ def study(
     # Measured or searched.
     if dry_run:
         with open_pool(jobs, cluster) as pool:
-            return _measured(loaded, system, len(keys), engine, batch, pool)
+            used, reason = choose_engine(system, engine)
+            size = batch or settings_per_batch(system, used)
+            task = Task(study=loaded, engine=used, batch_size=size)
+            speed = measure_speed(task, pool, len(keys))
+            return _forecast(loaded, len(keys), speed, f"{used}: {reason}")
     try:
         results = run(
             loaded,

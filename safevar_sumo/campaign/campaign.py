@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.ads import PerVehicleAds
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
@@ -32,6 +33,8 @@ BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of all runs of a share fill, at most."""
 MAX_RUNS = 256
 """Maximum number of runs in a share: each keeps a file open."""
+PROBE_TIME = 5.0
+"""Time of a measurement with a driving system that is called for each vehicle, roughly [s]."""
 PROBE_VEHICLES = 4000
 """Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
 ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
@@ -220,19 +223,28 @@ def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     )
 
 
-def measure_speed(task: Task, pool: Pool) -> float:
-    """Evaluations per second of all workers, measured with one batch of random settings for each;
-    the search costs little beside them.
+def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
+    """Evaluations per second of all workers, or of as many as have one of the `runs`, measured with
+    one batch of random settings for each; the search costs little beside them.
     """
+    workers = min(pool.workers, runs or pool.workers)
     system = system_of(task.study)
     characteristics = system.characteristics
     size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
     rng = np.random.default_rng(task.study.search.seed)
-    shape = (pool.workers, size, len(characteristics))
-    jobs = [
-        (task, rows) for rows in rng.uniform(characteristics.lower, characteristics.upper, shape)
-    ]
-    carry_out(evaluate_settings, jobs, pool)  # workers load the study, and warm up
+    shape = (workers, size, len(characteristics))
+    settings = rng.uniform(characteristics.lower, characteristics.upper, shape)
+
+    def simulate(number: int) -> None:
+        carry_out(evaluate_settings, [(task, rows[:number]) for rows in settings], pool)
+
+    # Workers load the study and warm up; a driving system that is slow gets a smaller batch.
+    is_called_for_each = isinstance(system.ads, PerVehicleAds)
+    simulate(1 if is_called_for_each else size)
+    if is_called_for_each:
+        start = time.perf_counter()
+        simulate(1)
+        size = min(max(int(PROBE_TIME / (time.perf_counter() - start)), 1), size)
     start = time.perf_counter()
-    carry_out(evaluate_settings, jobs, pool)
-    return pool.workers * size / (time.perf_counter() - start)
+    simulate(size)
+    return workers * size / (time.perf_counter() - start)

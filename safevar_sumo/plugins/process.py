@@ -12,9 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+import platformdirs
+
 from safevar_sumo.plugins.files import Files, digests, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
+SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
+"""Folders of the system: what libraries read there, such as time zones, is no file of the user."""
 WRITING = os.O_WRONLY | os.O_RDWR
 """Flags of a file that is not only read."""
 
@@ -94,9 +98,19 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
         if is_user_file(file) and file.startswith(tuple(own_folders))
     }
     use.modules.update(digests((Path(file) for file in files if os.path.isfile(file)), folders))
+    caches = (
+        f"{path}{os.sep}"  # such as lists of fonts
+        for path in (platformdirs.user_cache_path(), platformdirs.user_config_path())
+    )
+    not_the_users = (*SYSTEM_FOLDERS, *caches)
     data = (path for path in opened - files if os.path.isfile(path) and not path.endswith(".pyc"))
     use.opened.extend(
-        sorted(name_of_file(Path(path), folders) for path in data if is_user_file(path))
+        sorted(
+            name_of_file(Path(path), folders)
+            for path in data
+            if is_user_file(path)
+            and (path.startswith(tuple(own_folders)) or not path.startswith(not_the_users))
+        )
     )
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from inspect import getdoc
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import pandas as pd
@@ -16,6 +16,7 @@ from safevar_sumo.errors import check_name
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.ask import Range
 from safevar_sumo.questions.check_scenario import TABLES, check_scenario
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
@@ -30,7 +31,11 @@ from safevar_sumo.scenarios import (
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import DESCRIPTIONS
 from safevar_sumo.study import free_parameters, study_names, unit_text
+from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from safevar_sumo.plugins.check.trials import Extent
 
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
@@ -169,8 +174,13 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
         yield name, description, "; ".join(domains)
 
 
-@contents("passed", findings=FINDINGS, **TABLES)
-def check(name: str, ego: str | None = None) -> Answer:
+@contents("passed", "vehicles", "points", findings=FINDINGS, **TABLES)
+def check(
+    name: str,
+    *,
+    ego: str | None = None,
+    vehicles: Annotated[int | None, Range(1, 10_000)] = None,
+) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
     the promises that results rest on.
 
@@ -183,13 +193,17 @@ def check(name: str, ego: str | None = None) -> Answer:
     ----------
     ego
         The vehicle under test in a file of OpenSCENARIO; Ego if it is left out.
+    vehicles
+        Number of vehicles that are simulated; by default up to 100, as many as take at most 60 s.
     """
     if name.endswith(".xosc"):
         return check_scenario(name, ego or "Ego", FINDINGS)
     from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check  # loads SUMO
 
     study = study_to_check(name)
-    findings = check_study(study)
+    extents: list[Extent] = []
+    with open_progress(True) as progress:
+        findings = check_study(study, vehicles=vehicles, progress=progress, tell=extents.append)
     rows = [
         (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
         for item in findings
@@ -197,7 +211,26 @@ def check(name: str, ego: str | None = None) -> Answer:
     return Answer(
         question="check",
         study=study,
-        verdict=f"{name}: {number_of(len(findings), 'finding') if findings else 'passed'}.",
-        numbers={"passed": not findings},
+        verdict=(
+            f"{name}: {number_of(len(findings), 'finding') if findings else 'passed'}."
+            f"{''.join(map(_extent_in_words, extents))}"
+        ),
+        numbers={
+            "passed": not findings,
+            "vehicles": extents[0].vehicles if extents else 0,
+            "points": extents[0].points if extents else 0,
+        },
         tables={"findings": tabulate("Findings", FINDINGS, rows)},
     )
+
+
+def _extent_in_words(extent: Extent) -> str:
+    """What was simulated, and what was not tried."""
+    points = number_of(extent.points, "point")
+    text = f" {number_of(extent.vehicles, 'vehicle')} at {points} of the study."
+    left = []
+    if extent.points < extent.all_points:
+        left.append(f"the other {extent.all_points - extent.points} points")
+    if extent.vehicles < extent.all_vehicles:
+        left.append(f"more vehicles (--vehicles {extent.all_vehicles})")
+    return f"{text} Not tried: {' and '.join(left)}." if left else text

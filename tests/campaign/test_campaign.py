@@ -191,6 +191,29 @@ def test_the_speed_of_a_study_is_that_of_all_workers(
     assert sorted(pool.sizes) == [200] * 2 * workers, "those before are not measured"
 
 
+def test_a_search_of_fewer_runs_than_workers_has_the_speed_of_as_many_workers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pool = FormulaPool(4)
+    seconds = iter([10.0, 14.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
+    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool, 2) == 2 * 200 / 4
+
+
+def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """0.5 s for one vehicle: ten are enough."""
+    pool = FormulaPool(1)
+    seconds = iter([0.0, 0.5, 1.0, 6.0])
+    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
+    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    study = load_study("smoke", ads={"model": "highway_idm", "parameters": {}})
+    assert measure_speed(Task(study=study, batch_size=200), pool) == 10 / 5
+    assert pool.sizes == [1, 1, 10]
+
+
 def test_sumo_repeats_each_unsafe_solution_of_a_share_once_and_200_other_settings() -> None:
     """Of 5,000 settings half collide, and those are solutions twice; without a collision, less than
     half of the original's safety degree is unsafe.

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import platformdirs
 import portalocker
 import pytest
 
@@ -19,6 +21,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.identity import files_of
 from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.plugins.process import record_use
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import load_runs, manifest, read_manifest
 from safevar_sumo.shipped import NETWORKS
@@ -324,3 +327,19 @@ def test_every_step_on_the_disk_may_fail(stays: bool, tiny: Study, tmp_path: Pat
             break
     assert number < MOST_STEPS - 1, "no step is left that has not failed"
     assert errors > 15
+
+
+def test_what_libraries_read_in_folders_of_the_system_is_no_file_of_the_user(
+    in_tmp: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Such as lists of fonts and time zones; a user's file elsewhere is."""
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "gap.txt"
+    elsewhere.write_text("8.0")
+    cached = platformdirs.user_cache_path() / "fonts.txt"
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    cached.write_text("Arial")
+    paths = [elsewhere, cached, Path(np.__file__), Path(os.__file__), Path("/etc/hosts")]
+    code = f"for path in {[str(path) for path in paths]}:\n    open(path, 'rb').close()\n"
+    with record_use([]) as use:
+        exec(compile(code, str(in_tmp / "mine.py"), "exec"))
+    assert use.opened == [elsewhere.as_posix()]

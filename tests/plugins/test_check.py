@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.plugins.check import check_study, study_to_check
+from safevar_sumo.plugins.check import check_study, study_to_check, trials
 from tests.in_process import files_of, json_of, run
 
 SCALAR = """import random
@@ -312,3 +312,28 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "self.far = seen.gap"))
     passed = json_of("check", "mine.toml")
     assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("longest", "options", "vehicles"),
+    [(60.0, (), 100), (0.0, (), 3), (0.0, ("--vehicles", "7"), 7)],
+)
+def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
+    longest: float,
+    options: tuple[str, ...],
+    vehicles: int,
+    in_tmp: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As many as the time allows, unless their number is given."""
+    monkeypatch.setattr(trials, "LONGEST", longest)
+    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "pass"))
+    test = '[[matrix.tests]]\nname = "it"\nover = { turns_after = [0.5, 0.6, 0.7, 0.8, 0.9] }\n'
+    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + test)
+    answer = json_of("check", "mine.toml", *options)
+    assert answer["numbers"] == {"passed": True, "vehicles": vehicles, "points": 3}
+    assert (
+        f"{vehicles} vehicles at 3 points of the study. Not tried: the other 2 points"
+        in (answer["verdict"])
+    )
+    assert ("more vehicles (--vehicles 100)" in answer["verdict"]) == (vehicles == 3)

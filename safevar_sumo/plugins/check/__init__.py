@@ -89,9 +89,9 @@ def study_to_check(name: str) -> Study:
     )
 
 
-def check_study(study: Study) -> list[Finding]:
-    """Check the user code of a study."""
-    findings = list(find_defects(study))
+def check_study(study: Study, **how: Any) -> list[Finding]:
+    """Check the user code of a study; for `how` see `try_simulations`."""
+    findings = list(find_defects(study, **how))
     if findings:
         return findings
     system = assemble(study)
@@ -126,12 +126,14 @@ def refuse_defects(study: Study) -> None:
         )
 
 
-def find_defects(study: Study) -> Iterator[Finding]:
-    """The first defect of what is simulated, all of it in one trial, and of each user algorithm."""
+def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
+    """The first defect of what is simulated, all of it in one trial, and of each user algorithm;
+    for `how` see `try_simulations`.
+    """
     unload_user_modules()
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
-    yield from _first_defect(study, simulated, try_simulations(study))
+    yield from _first_defect(study, simulated, try_simulations(study, **how))
     for key, name in names:
         if key == "search.algorithms":
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))

@@ -4,6 +4,7 @@ repeated.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -20,10 +21,17 @@ from safevar_sumo.sumo import is_recorded
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
-SIMULATED, SIMULATED_BY_TRACI = 100, 20
-"""Numbers of settings that are simulated; with a TraCI controller, which is slower, fewer."""
+SIMULATED = 100
+"""Number of settings that are simulated, unless that takes longer than `LONGEST`."""
+LONGEST = 60.0
+"""Longest time of the simulations [s]."""
+LEAST_SIMULATED = 3
+"""Least number of settings, however slow the code: the original, and the ends of the domains."""
+TIMED, RUNS_OF_ALL = 2, 5
+"""Number of settings whose time is taken; in how many runs all settings are simulated, roughly."""
 SMALLER_BATCHES = 4
 """Number of batches into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
@@ -42,26 +50,41 @@ class FailedCheck(NamedTuple):
     input: str = ""
 
 
-def try_simulations(study: Study) -> Iterator[FailedCheck]:
-    """Simulate a study with the original vehicle, the corners of the domains and random
-    settings.
+class Extent(NamedTuple):
+    """How many vehicles are simulated, of how many if time allows, and at how many points of the
+    study.
+    """
+
+    vehicles: int
+    all_vehicles: int
+    points: int
+    all_points: int
+
+
+def try_simulations(
+    study: Study,
+    vehicles: int | None = None,
+    progress: Progress = show_no_progress,
+    tell: Callable[[Extent], None] = lambda extent: None,
+) -> Iterator[FailedCheck]:
+    """Simulate a study with the original vehicle, the corners of the domains and random settings:
+    so many `vehicles`, by default as many as the time allows. `tell` is called with their number.
     """
     # The settings that are tried.
     region = region_of(study)
-    settings = region.repaired(
-        region.characteristics.filter(
-            _settings(
-                region.characteristics,
-                SIMULATED_BY_TRACI if study.ads.kind == "traci" else SIMULATED,
-            )
-        )
-    )
+    many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
+    settings = region.repaired(region.characteristics.filter(many))
+    system = _system(study)
+    number = vehicles or _affordable(system, settings)
+    settings = settings[:number]
+    all_points = len(assemble(study).points)
+    tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points))
 
     def load() -> Callable[[_Rows], ResultColumns]:
         system = _system(study)
         return lambda rows: drive_and_score(system, settings[rows]).results
 
-    yield from _try(load, region.characteristics, settings)
+    yield from _try(load, region.characteristics, settings, progress)
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
@@ -72,6 +95,15 @@ def try_simulations(study: Study) -> Iterator[FailedCheck]:
             found, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
             yield FailedCheck("contract", found, reacts, setting)
+
+
+def _affordable(system: System, settings: FloatArray) -> int:
+    """The number of settings whose simulations take at most `LONGEST`, by the time of a few."""
+    drive_and_score(system, settings[:TIMED])  # loads what any first simulation loads
+    start = time.perf_counter()
+    drive_and_score(system, settings[:TIMED])
+    seconds = RUNS_OF_ALL * (time.perf_counter() - start) / TIMED
+    return min(max(int(LONGEST / seconds), LEAST_SIMULATED), SIMULATED)
 
 
 def try_algorithm(study: Study, name: str) -> Iterator[FailedCheck]:
@@ -95,11 +127,14 @@ def _try(
     load: Callable[[], Callable[[_Rows], ResultColumns]],
     characteristics: CharacteristicSet,
     settings: FloatArray,
+    progress: Progress,
 ) -> Iterator[FailedCheck]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     # All settings at once, with code that is loaded anew for the other runs.
     run = load()
     all_rows = np.arange(len(settings))
+    total = RUNS_OF_ALL * len(settings)
+    progress("vehicles", done := 0, total)
     outputs = run(all_rows)
     run_anew = load()
     other_runs = [
@@ -107,12 +142,13 @@ def _try(
         (run_anew, "order", "in another order", all_rows[::-1]),
         *(
             (run_anew, "alone", "in a smaller batch", rows)
-            for rows in np.array_split(all_rows, SMALLER_BATCHES)
+            for rows in np.array_split(all_rows, min(SMALLER_BATCHES, len(all_rows)))
         ),
         (run_anew, "alone", "alone", all_rows[:1]),
         (run_anew, "alone", "alone", all_rows[-1:]),
     ]
     for other_run, check, circumstance, rows in other_runs:
+        progress("vehicles", done := done + len(rows), total)
         other_outputs = other_run(rows)
         for row, difference in differences(
             {name: values[rows] for name, values in outputs.items()}, other_outputs
@@ -145,11 +181,8 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
         np.where(is_odd, upper, lower),
     ]
     return np.concatenate(
-        [
-            corners,
-            np.random.default_rng(0).uniform(lower, upper, (count - len(corners), len(lower))),
-        ]
-    )
+        [corners, np.random.default_rng(0).uniform(lower, upper, (count, len(lower)))]
+    )[:count]
 
 
 def _system(study: Study) -> System:
