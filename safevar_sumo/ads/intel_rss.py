@@ -12,51 +12,13 @@ from typing import Any
 from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
+from safevar_sumo.shipped import shipped_table
 
 RULE = ("response_time", "accel_max", "brake_min", "brake_max", "min_longitudinal_safety_distance")
 """The parameters of the rule."""
 ROLLING_OUT = 1.0
 """Deceleration after a demand to brake, while somebody is in the way [m/s^2]: assumption."""
-FASTEST = 100.0
-"""Speed up to which the library's rule plans an acceleration within the response time [m/s]."""
-OBJECT = {
-    "structured_object_state.is_in_correct_lane": True,
-    "structured_object_state.has_priority": False,
-    "structured_object_state.velocity.speed_lat_min": 0.0,
-    "structured_object_state.velocity.speed_lat_max": 0.0,
-    "structured_object_state.distance_to_enter_intersection": 0.0,
-    "structured_object_state.distance_to_leave_intersection": 1000.0,
-    # For situations without lanes: not used here, but checked by the library.
-    "unstructured_object_state.yaw": 0.0,
-    "unstructured_object_state.steering_angle": 0.0,
-    "unstructured_object_state.yaw_rate": 0.0,
-    "unstructured_object_state.dimension.length": 4.9,
-    "unstructured_object_state.dimension.width": 2.1,
-    "unstructured_object_state.center_point.x": 0.0,
-    "unstructured_object_state.center_point.y": 0.0,
-    "unstructured_object_state.speed_range.minimum": 0.0,
-    "unstructured_object_state.speed_range.maximum": 0.0,
-}
-"""An object on its lane, in SI units: no intersection is near."""
-DYNAMICS = {
-    # The lateral rule does not decide here: whoever is in the way overlaps.
-    "alpha_lat.accel_max": 0.2,
-    "alpha_lat.brake_min": -0.8,
-    "lateral_fluctuation_margin": 0.0,
-    "max_speed_on_acceleration": FASTEST,
-    # For situations without lanes.
-    "unstructured_settings.pedestrian_turning_radius": 2.0,
-    "unstructured_settings.drive_away_max_angle": 2.4,
-    "unstructured_settings.vehicle_yaw_rate_change": 0.3,
-    "unstructured_settings.vehicle_min_radius": 3.5,
-    "unstructured_settings.vehicle_trajectory_calculation_step": 0.2,
-    "unstructured_settings.vehicle_front_intermediate_yaw_rate_change_ratio_steps": 4,
-    "unstructured_settings.vehicle_brake_intermediate_acceleration_steps": 1,
-    "unstructured_settings.vehicle_continue_forward_intermediate_yaw_rate_change_ratio_steps": 3,
-    "unstructured_settings.pedestrian_continue_forward_intermediate_heading_change_ratio_steps": 3,
-    "unstructured_settings.pedestrian_brake_intermediate_acceleration_steps": 3,
-    "unstructured_settings.pedestrian_front_intermediate_heading_change_ratio_steps": 4,
-}
+SITUATION = shipped_table("ads/ad_rss.toml")
 """What the library asks for besides the parameters of its longitudinal rule, in SI units."""
 
 
@@ -194,7 +156,9 @@ class _Rule:
             "alpha_lon.brake_min_correct": -rule["brake_min"],
         }
         kept = {name: rule[name] for name in ("response_time", "min_longitudinal_safety_distance")}
-        return filled(self._rss.world.RssDynamics(), {**longitudinal, **kept, **DYNAMICS})
+        return filled(
+            self._rss.world.RssDynamics(), {**longitudinal, **kept, **SITUATION["dynamics"]}
+        )
 
     def _behind(self) -> Any:
         """The ego vehicle behind another one in the same direction, in its way."""
@@ -204,7 +168,7 @@ class _Rule:
         for state, kind in ((pair.ego_state, "EgoVehicle"), (pair.other_state, "OtherVehicle")):
             state.object_type = getattr(world.ObjectType, kind)
             state.dynamics = self._dynamics
-            filled(state, OBJECT)
+            filled(state, SITUATION["object"])
         place = {
             "constellation_id": 1,
             "object_id": 1,

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import about
-from safevar_sumo.metrics import Scoring, time_to_collision
+from safevar_sumo.metrics import (
+    IMPACT_EXCESS,
+    IMPACT_SPEED,
+    Scoring,
+    impact_in_words,
+    time_to_collision,
+)
 from safevar_sumo.questions.words import OUTCOME_VERBS
 from safevar_sumo.records import (
     STANDSTILL,
@@ -237,6 +243,9 @@ class Simulation:
     def verdict(self) -> str:
         """How the simulation ended, in words."""
         safety_degree = self.metrics[SAFETY_DEGREE]
+        if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
+            impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
+            return f"has an {impact_in_words(*impact)}"
         if self.outcome is Outcome.COLLISION:
             return f"collides at {-safety_degree:.2f} m/s"
         distance = distance_in_words(safety_degree, self.runs.middles_apart)

@@ -19,7 +19,7 @@ from safevar_sumo.campaign.campaign import choose_engine, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, RATING_POINTS, Unsafe, impact_in_words
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Jobs, Range
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
@@ -325,6 +325,10 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     # How it ends, and what it changes.
     if system.rater:
         ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
+    elif case.unsafe.is_of_impacts:
+        ending = (
+            f"has an {impact_in_words(bounded[IMPACT_SPEED.name], bounded[IMPACT_EXCESS.name])}"
+        )
     elif case.unsafe.bound:
         ending += f", {case.unsafe.bound.measure} {bounded[case.unsafe.bound.measure]:.3g}"
     by_name = dict(zip(names, values.tolist(), strict=True))

@@ -12,6 +12,7 @@ import numpy as np
 from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
 from safevar_sumo.metrics.conflicts import conflict
 from safevar_sumo.records import (
+    LEAST_CLOSING_SPEED,
     STANDSTILL,
     TIME_DECIMALS,
     BoolArray,
@@ -283,11 +284,69 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     vehicles = np.arange(trace.speed.shape[1])
     is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
     begin = np.maximum(np.argmax(is_pressed, axis=0) - 1, 0)
-    has_stopped = is_pressed.any(axis=0) & (trace.speed[-1] <= STANDSTILL)
     distance = trace.position[-1] - trace.position[begin, vehicles]
-    return mask_collisions(runs, np.where(has_stopped, distance, np.nan))
+    return _of_stops(runs, np.where(is_pressed.any(axis=0), distance, np.nan))
 
 
+def _of_stops(runs: SimulationRuns, values: FloatArray) -> FloatArray:
+    """Values of vehicles that have stopped, shape (N,), NaN for others."""
+    return mask_collisions(runs, np.where(runs.trace.speed[-1] <= STANDSTILL, values, np.nan))
+
+
+def stop_from_pedal(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Distance from the first command to brake to standstill [m]; shape (N,), NaN for a vehicle
+    that does not brake or stop.
+    """
+    trace = runs.trace
+    is_commanded = trace.brake > 0
+    begin = np.argmax(is_commanded, axis=0)
+    distance = trace.position[-1] - trace.position[begin, np.arange(len(begin))]
+    return _of_stops(runs, np.where(is_commanded.any(axis=0), distance, np.nan))
+
+
+MFDD_SHARES = 0.8, 0.1
+"""Shares of the first speed between which the mean fully developed deceleration counts."""
+
+
+@np.errstate(all="ignore")  # of vehicles that do not stop
+def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Mean fully developed deceleration of UN R13-H, (v_b^2 - v_e^2) / (2 (s_e - s_b)) [m/s^2],
+    with the places s_b and s_e where the speed is 80 and 10 % of the first one; shape (N,), NaN for
+    a vehicle that does not stop.
+    """
+    trace = runs.trace
+    first = trace.speed[0]
+    places = []
+    for share in MFDD_SHARES:
+        # The step in which the speed falls below that share, and the part of its way until then:
+        # with a constant deceleration squares of speeds are linear over the way.
+        after = np.argmax(trace.speed <= share * first, axis=0)
+        samples = np.stack([np.maximum(after - 1, 0), after])
+        squares, ways = (
+            np.take_along_axis(values, samples, axis=0)
+            for values in (trace.speed**2, trace.position)
+        )
+        part = (squares[0] - (share * first) ** 2) / (squares[0] - squares[1])
+        places.append(ways[0] + part * (ways[1] - ways[0]))
+    begin, end = MFDD_SHARES
+    return _of_stops(runs, (begin**2 - end**2) * first**2 / (2 * (places[1] - places[0])))
+
+
+STOP_FROM_PEDAL = Measure(
+    name="stop_from_pedal",
+    title="stop from pedal",
+    unit="m",
+    more_is_unsafe=True,
+    function=stop_from_pedal,
+    description="Distance from the first command to brake to standstill, with the brake's delay.",
+)
+MFDD = Measure(
+    name="mfdd",
+    title="MFDD",
+    unit="m/s^2",
+    function=mean_fully_developed_deceleration,
+    description="Mean fully developed deceleration, between 80 and 10 % of the first speed.",
+)
 STOPPING_DISTANCE = Measure(
     name="stopping_distance",
     title="stop",
@@ -297,6 +356,43 @@ STOPPING_DISTANCE = Measure(
     description=(
         "Distance from the first brake force to standstill; every study of the scenario stop"
         " has it."
+    ),
+)
+
+
+def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Relative speed at contact along the vehicle's lane [m/s], at least `LEAST_CLOSING_SPEED`;
+    shape (N,), NaN without a collision.
+    """
+    return np.asarray(np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED))
+
+
+def impact_excess(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """Relative speed at contact above the one that the test case allows [m/s]; without a contact
+    minus the least clearance [m]. Shape (N,), NaN where there was no encounter.
+    """
+    excess = impact_speed(runs, thresholds) - runs.allowed_impact_speed
+    clearance = safety_degree(runs, thresholds) - runs.middles_apart
+    return np.where(np.isnan(runs.collision_speed), -clearance, excess)
+
+
+IMPACT_SPEED = Measure(
+    name="impact_speed",
+    title="impact speed",
+    unit="m/s",
+    more_is_unsafe=True,
+    function=impact_speed,
+    description="Relative speed at contact along the vehicle's lane [m/s].",
+)
+IMPACT_EXCESS = Measure(
+    name="impact_excess",
+    title="impact excess",
+    unit="m/s, m",
+    more_is_unsafe=True,
+    function=impact_excess,
+    description=(
+        "Relative speed at contact above the allowed_impact_speed of the test case [m/s], or"
+        " without a contact minus the clearance [m]; every study with it has impact_speed, too."
     ),
 )
 

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
-from safevar_sumo.metrics.measures import RATING_POINTS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, Quantity
+from safevar_sumo.metrics.measures import IMPACT_EXCESS, IMPACT_SPEED, RATING_POINTS
+from safevar_sumo.records import KMH_PER_MS, BoolArray, Evaluations, FloatArray, Outcome, Quantity
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables
 
@@ -44,6 +44,8 @@ DEFAULT_MARGIN = 0.3
 """Distance to keep in a study that states no error of its model [m]."""
 LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
+ALLOWED_ROUNDING = 0.01
+"""Allowed speed of an impact below which none is allowed [km/h]."""
 POINT_LOSS, POINT_DECIMALS = 1.0, 6
 """The default limit in a rated study: the original's points minus this loss, to this many decimals.
 """
@@ -102,6 +104,16 @@ class Unsafe:
         )
 
     @property
+    def is_of_impacts(self) -> bool:
+        """Whether a bound on the impact decides, which may be allowed."""
+        return self.bound is not None and self.bound.measure == IMPACT_EXCESS.name
+
+    @property
+    def _stands_alone(self) -> bool:
+        """Whether a collision is not unsafe in itself."""
+        return self.is_of_points or self.is_of_impacts
+
+    @property
     def worst(self) -> Callable[..., float]:
         """Which of several values is the worst: `min`, or `max` where a bound forbids large
         ones.
@@ -116,7 +128,7 @@ class Unsafe:
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.bound is not None:
-            return f"{self.bound}{'' if self.is_of_points else ', or a collision'}"
+            return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
         if self.below is None:
             kept = self._keep_in_words
             where = ", from bumper to bumper" if self.contact else ""
@@ -169,7 +181,7 @@ class Unsafe:
         if self.bound is not None:
             name, comparison, limit = self.bound
             is_beyond = COMPARISONS[comparison](column(name), limit)
-            return is_beyond if self.is_of_points else collides | is_beyond
+            return is_beyond if self._stands_alone else collides | is_beyond
         return (
             collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
         )
@@ -185,7 +197,7 @@ class Unsafe:
         else:
             difference = evaluations.column(self.bound.measure) - self.bound.limit
             robustness = -difference if self.bound.worst_is_largest else difference
-            if not self.is_of_points:
+            if not self._stands_alone:
                 robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
         return np.where(
@@ -220,6 +232,9 @@ class Unsafe:
             return (
                 f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
             )
+        if self.is_of_impacts and vehicle.collided[0]:
+            columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
+            return f"has an {impact_in_words(*columns)}"
         if self.bound is not None:
             measure, comparison, limit = self.bound
             value = float(vehicle.column(measure)[0])
@@ -329,6 +344,13 @@ class Unsafe:
                 CRITERIA,
             )
         return unsafe
+
+
+def impact_in_words(speed: float, excess: float) -> str:
+    """An impact [m/s] and its excess, such as `impact at 12 km/h where 15 is allowed`."""
+    allowed = KMH_PER_MS * (speed - excess)
+    words = f"{allowed:.3g} is" if allowed >= ALLOWED_ROUNDING else "none is"
+    return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} allowed"
 
 
 def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:

@@ -247,10 +247,15 @@ class Question:
         # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
-            criterion = next(
-                (values.get(option.name) for option in self.options if option.metavar == CRITERION),
-                None,
-            )
+            option = next((one.name for one in self.options if one.metavar == CRITERION), "")
+            criterion = values.get(option)
+            cites = ""
+            # A study's own criterion stands where nothing else is asked for.
+            if option and all(values.get(name) is None for name in (option, "margin", "by")):
+                criterion = study.unsafe.criterion or None
+                values = {**values, option: criterion}
+                if study.unsafe.source:
+                    cites = f"Criterion: {criterion} ({study.unsafe.source})."
             if criterion is not None:
                 unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
@@ -267,7 +272,9 @@ class Question:
             # An answer about a driving system that fails by itself begins with that.
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
-        verdict = " ".join(filter(None, (reason, answer.verdict, _undefined_in_words(evaluator))))
+        verdict = " ".join(
+            filter(None, (reason, answer.verdict, cites, _undefined_in_words(evaluator)))
+        )
         return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
 
     def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:

@@ -119,6 +119,8 @@ class Case:
     @property
     def unsafe(self) -> Unsafe:
         """The criterion for unsafe solutions, by default that of `Unsafe.default`."""
+        if self.stated is None and self.study.unsafe.criterion:
+            return Unsafe.parse(self.study.unsafe.criterion)
         return self.stated or Unsafe.default(self.original, self.solutions["outcome"])
 
     @property

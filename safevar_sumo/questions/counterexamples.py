@@ -109,6 +109,8 @@ def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
         )
+        if model.unsafe.is_of_impacts and runs.collided[row]:
+            how = f"the car {model.unsafe.breach_in_words(runs.take(np.array([row])))}"
         where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
         failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters))
     return failures

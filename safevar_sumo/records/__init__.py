@@ -6,6 +6,7 @@ from safevar_sumo.records.driving import (
     ALL_TRUE as ALL_TRUE,
     GRAVITY as GRAVITY,
     KMH_PER_MS as KMH_PER_MS,
+    LEAST_CLOSING_SPEED as LEAST_CLOSING_SPEED,
     NO_CONTACT as NO_CONTACT,
     STANDSTILL as STANDSTILL,
     TIME_DECIMALS as TIME_DECIMALS,

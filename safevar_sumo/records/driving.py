@@ -248,6 +248,7 @@ class SimulationRuns:
     while the motion of others still depended on the vehicle, NaN otherwise [s]; `warning_ttc` the
     time to collision at which the system first warned its driver, NaN if it never did [s].
     `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
+    `allowed_impact_speed` is the relative speed up to which the test case allows an impact [m/s].
     """
 
     trace: Trace
@@ -259,6 +260,7 @@ class SimulationRuns:
     acted_early: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
     centre_to_centre: bool = False
+    allowed_impact_speed: FloatArray = field(default_factory=lambda: ZERO)
 
     @cached_property
     def is_approach(self) -> BoolArray:
@@ -295,6 +297,7 @@ class SimulationRuns:
             acted_early=select(self.acted_early),
             warning_ttc=select(self.warning_ttc),
             centre_to_centre=self.centre_to_centre,
+            allowed_impact_speed=select(self.allowed_impact_speed),
         )
 
     def nearest(self, vehicle: int) -> int | None:

@@ -254,7 +254,13 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
             {**row, **row.get("contact", {})} for row in records
         ]  # side and place are columns
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
-        failing = [row["point"] for row in points if row["outcome"] == Outcome.COLLISION]
+        allowed = {point.name: point.allowed_impact_speed for point in system.matrix}
+        failing = [
+            row["point"]
+            for row in points
+            if row["outcome"] == Outcome.COLLISION
+            and row["relative_impact_speed"] > allowed[row["point"]]
+        ]
         verdict.append(points_in_words(failing, len(points)))
 
     # The model's own uncertainty.

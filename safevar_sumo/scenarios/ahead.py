@@ -143,7 +143,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     test: Literal["CPLA", "CBLA"] = "CPLA"
     target: Literal["adult", "child", "cyclist"] | None = None
     target_speed: (
-        Annotated[float, Meta(gt=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")]
+        Annotated[float, Meta(ge=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")]
         | None
     ) = None
     acceleration_distance: Metres | None = None
@@ -178,7 +178,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     @property
     def _profile(self) -> SpeedProfile:
         return SpeedProfile(
-            0.0, self.parameter("target_speed") * KMH, self.parameter("acceleration_distance")
+            0.0,
+            np.float64(self.parameter("target_speed")) * KMH,  # 0 of a target that stands
+            self.parameter("acceleration_distance"),
         )
 
 

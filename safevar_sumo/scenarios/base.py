@@ -326,13 +326,14 @@ SPEED_DIMENSION = "speed"
 
 class Point(NamedTuple):
     """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
-    the study's others.
+    the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
     """
 
     scenario: Scenario
     weather: Weather
     name: str = ""
     parameters: tuple[tuple[str, Any], ...] = ()
+    allowed_impact_speed: float = 0.0
 
 
 class PreCrash(StrEnum):

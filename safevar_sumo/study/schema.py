@@ -218,7 +218,8 @@ class MatrixTest(Table, frozen=True, kw_only=True):
     in each of the `weathers`.
 
     `parameters` are added to those of the study's scenario; a test with a `model` of its own has
-    only its own parameters. A weather is a name or a table.
+    only its own parameters. A weather is a name or a table. An impact is allowed up to a relative
+    speed of `allowed_impact_speed` [km/h], by which the metric `impact_excess` counts.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -226,6 +227,7 @@ class MatrixTest(Table, frozen=True, kw_only=True):
     parameters: Parameters = {}
     over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
     weathers: list[str | Weather] = []
+    allowed_impact_speed: Annotated[float, Meta(ge=0, le=250)] = 0.0
 
     def __post_init__(self) -> None:
         for name in self.parameters.keys() & self.over.keys():
@@ -259,6 +261,15 @@ class MatrixTable(Table, frozen=True, kw_only=True):
             raise mistake(
                 f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
             )
+
+
+class UnsafeTable(Table, frozen=True, kw_only=True):
+    """What a study calls unsafe, unless `--unsafe` says otherwise: a `criterion` as of that option,
+    and its `source`, such as a regulation.
+    """
+
+    criterion: str = ""
+    source: str = ""
 
 
 class RepairTable(Table, frozen=True, kw_only=True):
@@ -306,7 +317,7 @@ class Study(Table, frozen=True, kw_only=True):
     `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits`
     are the values, by name, up to which characteristics may wear in service; `repair` states what a
     repair of the ADS may change; `wider` names a study of the same vehicle in a wider scope, in
-    which limits are tried as well.
+    which limits are tried as well; `unsafe` is what the study calls so.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
@@ -335,6 +346,7 @@ class Study(Table, frozen=True, kw_only=True):
     limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
     repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
     wider: Annotated[str, WITHOUT_EFFECT, OF_STUDY] = ""
+    unsafe: Annotated[UnsafeTable, WITHOUT_EFFECT] = UnsafeTable()
     origin: Origin = Origin()
 
     def __post_init__(self) -> None:

@@ -143,6 +143,9 @@ def _runs(
         acted_early=robot.acted_early,
         warning_ttc=outcomes.warning_ttc,
         centre_to_centre=points[0].scenario.centre_to_centre,
+        allowed_impact_speed=np.asarray(
+            per_vehicle([point.allowed_impact_speed for point in points], size)
+        ),
     )
 
 

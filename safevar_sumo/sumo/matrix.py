@@ -14,7 +14,7 @@ import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, check_text
-from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
+from safevar_sumo.metrics import IMPACT_EXCESS, RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import (
     Evaluations,
@@ -368,7 +368,9 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
         name, direction = system.aggregate.split()  # such as "drac >"
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
         measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
-        values = np.where(has_collided, safety_degrees, measures)
+        # An impact may be allowed: then the measure says how bad a collision is.
+        by_measure = ~has_collided | (name == IMPACT_EXCESS.name)
+        values = np.where(by_measure, measures, safety_degrees)
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf

@@ -10,6 +10,8 @@ from safevar_sumo.metrics import (
     F_DIFF,
     F_NUM_DIFF,
     F_SAFE,
+    IMPACT_EXCESS,
+    IMPACT_SPEED,
     METRICS,
     OBJECTIVES,
     OPTIONAL_METRICS,
@@ -81,6 +83,8 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     objectives = [
         named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives
     ]
+    if IMPACT_EXCESS.name in named.computed:
+        named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)  # sentences have both
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
         problem = f"search.objectives: one of {', '.join(names)} is named twice"

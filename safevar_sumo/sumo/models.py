@@ -18,6 +18,7 @@ from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds
 from safevar_sumo.errors import InputError, about, check_name, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
+from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import (
     SCENARIOS,
     Point,
@@ -125,7 +126,8 @@ def _points_of(test: MatrixTest, study: Study, lookup: Lookup) -> Iterator[Point
                 [test.name, *(f"{key} {value}" for key, value in over.items()), weather.name]
             )
             parameters = {"test": test.name, **over, "weather": weather.name}
-            yield Point(scenario, weather, name, tuple(parameters.items()))
+            allowed = test.allowed_impact_speed / KMH_PER_MS
+            yield Point(scenario, weather, name, tuple(parameters.items()), allowed)
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:

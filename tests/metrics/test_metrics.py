@@ -18,6 +18,7 @@ from safevar_sumo.metrics import (
     Measure,
     Scoring,
     Unsafe,
+    impact_in_words,
     time_to_collision,
 )
 from safevar_sumo.records import (
@@ -28,11 +29,13 @@ from safevar_sumo.records import (
     Outcome,
     SimulationRuns,
 )
-from safevar_sumo.study import MetricsTable
+from safevar_sumo.study import MetricsTable, load_study
 from tests.made_up import made_up_evaluations, made_up_runs
 
 STEP = 0.01
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
+IMPACTS = "impact_speed", "impact_excess"
+STOPS = "stopping_distance", "stop_from_pedal", "mfdd"
 
 
 def braking_run(
@@ -347,7 +350,9 @@ def test_rms_agrees_with_scipys_filters() -> None:
     )
 
 
-@pytest.mark.parametrize("name", sorted(OPTIONAL_METRICS.keys() - {"stopping_distance"}))
+@pytest.mark.parametrize(
+    "name", sorted(OPTIONAL_METRICS.keys() - {"stopping_distance", "impact_excess", "impact_speed"})
+)
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
     speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
     assert np.array_equal(
@@ -380,3 +385,76 @@ def test_what_an_unsafe_vehicle_does_is_said_with_its_value(
     )
     assert unsafe.of(vehicle)[0]
     assert unsafe.breach_in_words(vehicle) == words
+
+
+def braked(speed: FloatArray, delay: float, step: float) -> SimulationRuns:
+    """A car that is at a speed [m/s] at each sample, whose brake is commanded from the start."""
+    position = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * step)])
+    columns = {
+        "position": position[:, np.newaxis],
+        "brake": np.ones((len(speed), 1)),
+        "pedal": (np.arange(len(speed)) * step >= delay - 1e-9)[:, np.newaxis].astype(float),
+    }
+    return made_up_runs(step, speed[:, np.newaxis], **columns)
+
+
+def test_a_stop_is_that_of_a_constant_deceleration_after_a_delay() -> None:
+    """From 100 km/h at 6 m/s^2 after 0.2 s: v^2 / (2 a) from the brake force, v t more from the
+    pedal; the mean deceleration, whatever the delay, is that one.
+    """
+    speed, deceleration, delay, step = 100 / 3.6, 6.0, 0.2, 0.01
+    times = np.arange(600) * step
+    run = braked(
+        np.maximum(speed - deceleration * np.maximum(times - delay, 0.0), 0.0), delay, step
+    )
+    metrics = {name: OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0] for name in STOPS}
+    stop = speed**2 / (2 * deceleration)
+    assert metrics["stopping_distance"] == pytest.approx(stop, abs=1.5 * speed * step)
+    assert metrics["stop_from_pedal"] == pytest.approx(stop + speed * delay, abs=0.01)
+    assert metrics["mfdd"] == pytest.approx(deceleration, rel=1e-4)
+    half = braked(np.linspace(speed, speed / 2, 60), 0.0, step)
+    assert all(np.isnan(OPTIONAL_METRICS[name].function(half, THRESHOLDS)[0]) for name in STOPS)
+
+
+def test_the_law_allows_70_m_from_100_km_h_and_a_stricter_mean_deceleration() -> None:
+    """0.1 v + 0.006 v^2; a car that just keeps 6.43 m/s^2 stops in 60 m and its delay's way."""
+    assert pytest.approx(70.0) == 0.1 * 100 + 0.006 * 100**2
+    assert pytest.approx(60.0, abs=0.05) == (100 / 3.6) ** 2 / (2 * 6.43)
+    criterion = load_study("r13h").unsafe
+    assert criterion.criterion == "mfdd < 6.43"
+    assert "not checked against the regulation's text" in criterion.source
+
+
+@pytest.mark.parametrize(
+    ("allowed", "speed", "excess", "words"),
+    [
+        (15 / 3.6, 12 / 3.6, -3 / 3.6, "impact at 12 km/h where 15 is allowed"),
+        (15 / 3.6, 18 / 3.6, 3 / 3.6, "impact at 18 km/h where 15 is allowed"),
+        (0.0, 12 / 3.6, 12 / 3.6, "impact at 12 km/h where none is allowed"),
+    ],
+)
+def test_an_impact_counts_above_the_speed_that_is_allowed(
+    allowed: float, speed: float, excess: float, words: str
+) -> None:
+    run = made_up_runs(0.1, np.full((2, 1), speed), gap=-1.0, collision_speed=speed)
+    run = dataclasses.replace(run, allowed_impact_speed=np.array(allowed))
+    found = [OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0] for name in IMPACTS]
+    assert found == pytest.approx([speed, excess])
+    assert impact_in_words(*found) == words
+    columns = {"safety_degree": -speed, **dict(zip(IMPACTS, found, strict=True))}
+    metrics = {name: np.array([value]) for name, value in columns.items()}
+    evaluations = made_up_evaluations([-speed], metrics=metrics)
+    criterion = Unsafe.parse("impact_excess > 0")
+    assert criterion.of(evaluations).tolist() == [excess > 0]
+    assert np.sign(criterion.left(evaluations)[0]) == -np.sign(excess)
+    assert criterion.description == "impact_excess > 0"
+    if excess > 0:
+        assert criterion.breach_in_words(evaluations) == f"has an {words}"
+
+
+def test_without_a_contact_the_excess_is_minus_the_clearance() -> None:
+    gap = np.array([[5.0], [2.0], [2.5]])
+    run = made_up_runs(0.1, np.full((3, 1), 3.0), gap=gap)
+    run = dataclasses.replace(run, allowed_impact_speed=np.array(4.0))
+    assert OPTIONAL_METRICS["impact_excess"].function(run, THRESHOLDS)[0] == -2.0
+    assert np.isnan(OPTIONAL_METRICS["impact_speed"].function(run, THRESHOLDS)[0])

@@ -1,0 +1,112 @@
+"""Tests of regulations: the closed forms of their encounters, impacts that they allow, and studies
+that contradict themselves.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.scenarios import Along, CarToCar
+from safevar_sumo.study import load_study
+from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool, run
+from tests.made_up import original_of
+
+KMH = 1 / 3.6
+ALLOWED = {20: 0, 30: 0, 40: 0, 41: 10, 42: 10, 43: 15, 45: 15, 46: 25, 50: 25, 51: 30, 55: 30}
+"""R152's second step as proposed: test speeds and allowed impact speeds [km/h]."""
+
+
+@pytest.mark.parametrize("reaction", [0.3, 0.75, 1.2])
+def test_what_a_braking_leader_leaves_is_that_of_the_closed_form(reaction: float) -> None:
+    """80 km/h, 12 m, 5 m/s^2: 36.7 - 22.2 T m at the end, with 10 m/s^2 after T."""
+    speed = 80 * KMH
+    test = CarToCar(
+        test="CCRb", speed=80.0, headway=12 / speed, target_deceleration=5.0, final_speed=0.0
+    )
+    times = np.arange(0.0, 12.0, 0.01)[:, np.newaxis]
+    (leader,) = test.tracks(times)
+    rear = float(leader.x[-1, 0]) - leader.length / 2
+    own = speed * (test.brakes_at + reaction) + speed**2 / (2 * 10.0)
+    assert rear - own == pytest.approx(36.7 - 22.2 * reaction, abs=0.05)
+    assert leader.speed[-1, 0] == 0.0
+
+
+def test_a_person_on_the_road_may_stand() -> None:
+    times = np.arange(0.0, 6.0, 0.5)[:, np.newaxis]
+    for speed, way in ((0.0, 0.0), (5.0, 5 * KMH * 5.5 - 1.0)):
+        (person,) = Along(speed=50.0, target_speed=speed).tracks(times)
+        covered = float(np.broadcast_to(person.x, times.shape)[-1, 0]) - float(person.x[0, 0])
+        assert covered == pytest.approx(way, abs=0.02)
+
+
+def test_r152_allows_the_impact_of_the_higher_row() -> None:
+    points = assemble(load_study("r152")).points
+    found = {point.scenario.speed: point.allowed_impact_speed / KMH for point in points}
+    assert found == pytest.approx({**ALLOWED, 56: 35, 60: 35})
+
+
+@pytest.mark.parametrize("name", ["r152", "r152_laden", "fmvss127"])
+def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
+    system = assemble(load_study(name))
+    original = evaluate(system, original_of(system))
+    assert not original.collided[0]
+    mass = system.nominal.mass
+    assert mass - assemble(load_study("wear")).nominal.mass == (450 if name == "r152_laden" else 0)
+
+
+FAST = "impact at 35 km/h, speed 60, clear"
+
+
+def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_no_failure(
+    in_tmp: Path,
+) -> None:
+    """Sensors that reach 15 m: the car hits at 60 km/h, where that is allowed, and stops short
+    elsewhere.
+    """
+    system = assemble(load_study("r152"))
+    setting = original_of(system).copy()
+    setting[0, system.characteristics.names.index("sensorRange")] = 15.0
+    (hit,) = (one for one in simulate_all_points(system, setting) if one.evaluations.collided[0])
+    assert hit.point.name == FAST
+    speed = float(hit.runs.relative_speed[0])
+    assert 10 * KMH < speed < 35 * KMH
+    alone = evaluate(system.at(hit.point), setting)
+    assert alone.column("impact_excess")[0] == pytest.approx(speed - 35 * KMH)
+    worst = evaluate(system, setting)
+    assert worst.outcome.tolist() == ["stopped"]
+    assert worst.column("impact_excess")[0] == -worst.f_safe[0] > speed - 35 * KMH
+    told = run("simulate", "r152", "--set", "sensorRange=15", "--point", FAST).stdout
+    assert f"has an impact at {speed / KMH:.3g} km/h where 35 is allowed" in told
+    assert "Fails at 0 of 13" in run("simulate", "r152", "--set", "sensorRange=15").stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[[matrix.tests]]\nname = "it"\nallowed_impact_speed = -5', "allowed_impact_speed"),
+        ('[matrix]\naggregate = "worst"', "matrix.aggregate = 'worst', and test"),
+        ('[unsafe]\ncriterion = "impact_exces > 0"', "impact_exces"),
+        ('[unsafe]\ncriterion = "hard"', "'hard'"),
+    ],
+)
+def test_a_study_that_contradicts_itself_is_refused(text: str, message: str, in_tmp: Path) -> None:
+    (in_tmp / "own.toml").write_text(f'extends = "r152"\nname = "own"\n{text}\n')
+    told = run("explain", "own.toml", expect=2).stderr
+    assert message in told
+    assert "Traceback" not in told
+    assert len(told.strip().splitlines()) <= 2
+
+
+@pytest.mark.slow
+def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> None:
+    answer = sv.rules("r152", samples=40, pool=InlinePool())
+    assert "Criterion: impact_excess > 0 (UN R152" in answer.verdict
+    assert "not checked against the regulation's text" in answer.verdict
+    stated = sv.rules("r152", samples=40, unsafe="collision", pool=InlinePool())
+    assert "Criterion:" not in stated.verdict
