@@ -15,7 +15,7 @@ from typing import Any, get_args
 import msgspec
 from msgspec.inspect import type_info
 
-from safevar_sumo import openscenario
+from safevar_sumo import ads, openscenario
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
@@ -252,8 +252,18 @@ def refusals() -> str:
     return _table(("part", "message"), [(part, f"`{message}`") for part, message in found])
 
 
+def published_systems() -> str:
+    """The source of the driving systems that are put in front of published libraries."""
+    folder = Path(ads.__file__).parent
+    parts = [(name, (folder / name).read_text()) for name in ("highway_idm.py", "intel_rss.py")]
+    return "\n".join(
+        f"`safevar_sumo/ads/{name}`:\n\n```python\n{text}```\n" for name, text in parts
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
+    "published_systems": published_systems,
     "refusals": refusals,
     "characteristics": characteristics,
     "study_keys": study_keys,

@@ -27,7 +27,9 @@ FORMAT = 5
 RESULTS = 10
 """Version number of the package's results, raised whenever they change (enforced by tests/golden).
 """
-SIMULATORS = ("libsumo", "eclipse-sumo")
+LIBRARIES = {"ad_rss": ("ad-rss",), "highway_idm": ("highway-env",)}
+"""Packages of shipped driving systems, named in the manifest of a study that they drive."""
+SIMULATORS = ("libsumo", "eclipse-sumo", *sum(LIBRARIES.values(), ()))
 """Packages on whose versions a single simulation depends."""
 PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
 PYMOO_PACKAGES = ("pymoo", "cma")
@@ -164,7 +166,12 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
         "study": tables_of(study),
         **identity,
         "versions": {
-            name: version(name) for name in (*PACKAGES, *(PYMOO_PACKAGES if has_pymoo else ()))
+            name: version(name)
+            for name in (
+                *PACKAGES,
+                *(PYMOO_PACKAGES if has_pymoo else ()),
+                *LIBRARIES.get(study.ads.model, ()),
+            )
         },
     }
 
