@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from itertools import repeat
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation, Quantity
 
@@ -138,6 +140,17 @@ class ScalarAds(ABC):
         """
         throttle, brake = pedals_for(self.nominal, speed, acceleration, trim or NO_TRIM)
         return float(throttle), float(brake)
+
+
+def library(model: str, extra: str, module: str) -> Any:
+    """A module of the library of a shipped driving system; raises an InputError without the
+    extra.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        where = f"in the checkout: pip install '.[{extra}]'"
+        raise InputError("", f"ads.model = {model!r} needs {extra}", where) from None
 
 
 class PerVehicleAds(Ads):

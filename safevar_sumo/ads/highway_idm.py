@@ -4,8 +4,7 @@ the acceleration that it commands.
 
 from __future__ import annotations
 
-from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way
-from safevar_sumo.errors import InputError
+from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
 from safevar_sumo.records import Observation
 
 ROAD_LENGTH = 10_000.0
@@ -28,20 +27,13 @@ class HighwayIdm(ScalarAds):
     """
 
     def __init__(self, target_speed: float | None = None, corridor: float = CORRIDOR) -> None:
-        try:
-            from highway_env.road.road import Road, RoadNetwork
-            from highway_env.vehicle.behavior import IDMVehicle
-        except ImportError:
-            raise InputError(
-                "",
-                "ads.model = 'highway_idm' needs highway-env",
-                "in the checkout: pip install '.[highway-env]'",
-            ) from None
+        roads = library("highway_idm", "highway-env", "highway_env.road.road")
+        vehicles = library("highway_idm", "highway-env", "highway_env.vehicle.behavior")
         self.target_speed = target_speed
         self.corridor = corridor
-        network = RoadNetwork.straight_road_network(1, length=ROAD_LENGTH, speed_limit=None)
-        road = Road(network, record_history=False)
-        self._me, self._front = (IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
+        network = roads.RoadNetwork.straight_road_network(1, length=ROAD_LENGTH, speed_limit=None)
+        road = roads.Road(network, record_history=False)
+        self._me, self._front = (vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
 
     def drive(self, seen: Observation) -> tuple[float, float]:
         me, front = self._me, self._front

@@ -9,17 +9,12 @@ from collections.abc import Mapping
 from functools import reduce
 from typing import Any
 
-from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way
-from safevar_sumo.errors import InputError
+from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
 from safevar_sumo.records import Observation
 from safevar_sumo.shipped import shipped_table
 
-RULE = ("response_time", "accel_max", "brake_min", "brake_max", "min_longitudinal_safety_distance")
-"""The parameters of the rule."""
 ROLLING_OUT = 1.0
 """Deceleration after a demand to brake, while somebody is in the way [m/s^2]: assumption."""
-SITUATION = shipped_table("ads/ad_rss.toml")
-"""What the library asks for besides the parameters of its longitudinal rule, in SI units."""
 
 
 class AdRss(ScalarAds):
@@ -66,15 +61,16 @@ class AdRss(ScalarAds):
         self.cruise_speed = cruise_speed
         self.corridor = corridor
         self.has_braked = False
-        self._rss = _imported()
+        with warnings.catch_warnings():  # about converters that both modules register
+            warnings.simplefilter("ignore")
+            library("ad_rss", "ad-rss", "ad_physics")  # the types of the next one
+            self._library = library("ad_rss", "ad-rss", "ad_rss")
         self._rule: _Rule | None = None
 
     def drive(self, seen: Observation) -> tuple[float, float]:
         if self.cruise_speed is None:
             self.cruise_speed = float(seen.speed)
-        if self._rule is None:
-            numbers = {name: getattr(self, name) for name in RULE}
-            self._rule = _Rule(self._rss, numbers)
+        self._rule = self._rule or _Rule(self._library, self)
         is_blocked = bool(is_in_the_way(seen, self.corridor))
         if is_blocked and self._rule.demands_braking(
             float(seen.speed), float(seen.gap), float(seen.obstacle_speed)
@@ -86,36 +82,33 @@ class AdRss(ScalarAds):
         return self.pedals(self.cruise_speed - seen.speed, seen.speed)
 
 
-def _imported() -> Any:
-    """The library; raises an InputError without the extra."""
-    try:
-        with warnings.catch_warnings():  # about converters that both modules register
-            warnings.simplefilter("ignore")
-            import ad_physics  # noqa: F401  (the types of the next one)
-            import ad_rss
-    except ImportError:
-        raise InputError(
-            "",
-            "ads.model = 'ad_rss' needs ad-rss, for CPython 3.11 to 3.13 on Linux (x86-64)",
-            "in the checkout: pip install '.[ad-rss]'",
-        ) from None
-    ad_rss.rss.core.setLogLevel("off")  # what it refuses is an error here
-    return ad_rss
-
-
 class _Rule:
-    """The library's check with the `numbers` of a rule, and its objects of the situation."""
+    """The library's check with the parameters of a driver, and its objects of the situation."""
 
-    def __init__(self, library: Any, numbers: Mapping[str, float]) -> None:
-        self._rss, self._physics = library.rss, library.physics
-        self._numbers = numbers
+    def __init__(self, library: Any, driver: AdRss) -> None:
+        self._rss = library.rss
+        self._physics = library.physics
+        self._rss.core.setLogLevel("off")  # what it refuses is an error here
+        tables = shipped_table("ads/ad_rss.toml")
         self._check = self._rss.core.RssSituationChecking()
         self._resolve = self._rss.core.RssResponseResolving()
-        self._time_index = 0
-        self._dynamics = self._dynamics_of(numbers)
+        self._rule = {
+            "response_time": driver.response_time,
+            "alpha_lon.accel_max": driver.accel_max,
+            "alpha_lon.brake_min": -driver.brake_min,
+            "alpha_lon.brake_min_correct": -driver.brake_min,
+            "alpha_lon.brake_max": -driver.brake_max,
+            "min_longitudinal_safety_distance": driver.min_longitudinal_safety_distance,
+        }
+        dynamics = filled(self._rss.world.RssDynamics(), {**tables["dynamics"], **self._rule})
         self._situation = self._rss.core.RssSituationSnapshot()
-        self._situation.default_ego_vehicle_rss_dynamics = self._dynamics
-        self._pair = self._behind()
+        self._situation.default_ego_vehicle_rss_dynamics = dynamics
+
+        # The ego vehicle is behind another one in the same direction, in its way.
+        self._pair = filled(self._rss.core.RelativeConstellation(), tables["pair"])
+        for state in (self._pair.ego_state, self._pair.other_state):
+            state.dynamics = dynamics
+            filled(state, tables["object"])
 
     def demands_braking(self, speed: float, gap: float, leader_speed: float) -> bool:
         """Whether the library demands longitudinal braking at a speed [m/s] and a gap [m] behind a
@@ -132,8 +125,7 @@ class _Rule:
             velocity = state.structured_object_state.velocity
             velocity.speed_lon_min = velocity.speed_lon_max = physics.Speed(max(value, 0.0))
         self._pair.relative_position.longitudinal_distance = physics.Distance(max(gap, 0.0))
-        self._time_index += 1
-        self._situation.time_index = self._time_index
+        self._situation.time_index += 1
         del self._situation.constellations[:]
         self._situation.constellations.append(self._pair)
 
@@ -142,42 +134,11 @@ class _Rule:
         response = self._rss.state.ProperResponse()
         is_legal = self._check.checkSituation(self._situation, states)
         if not (is_legal and self._resolve.provideProperResponse(states, response)):
+            rule = ", ".join(f"{name} = {value:g}" for name, value in self._rule.items())
             raise ValueError(
-                f"ad-rss refuses {speed:g} m/s, {gap:g} m behind {leader_speed:g} m/s, with"
-                f" {', '.join(f'{name} = {value:g}' for name, value in self._numbers.items())}"
+                f"ad-rss refuses {speed:g} m/s, {gap:g} m behind {leader_speed:g} m/s, with {rule}"
             )
         return bool(response.longitudinal_response.name != "None")
-
-    def _dynamics_of(self, rule: Mapping[str, float]) -> Any:
-        longitudinal = {
-            "alpha_lon.accel_max": rule["accel_max"],
-            "alpha_lon.brake_max": -rule["brake_max"],
-            "alpha_lon.brake_min": -rule["brake_min"],
-            "alpha_lon.brake_min_correct": -rule["brake_min"],
-        }
-        kept = {name: rule[name] for name in ("response_time", "min_longitudinal_safety_distance")}
-        return filled(
-            self._rss.world.RssDynamics(), {**longitudinal, **kept, **SITUATION["dynamics"]}
-        )
-
-    def _behind(self) -> Any:
-        """The ego vehicle behind another one in the same direction, in its way."""
-        core = self._rss.core
-        world = self._rss.world
-        pair = core.RelativeConstellation()
-        for state, kind in ((pair.ego_state, "EgoVehicle"), (pair.other_state, "OtherVehicle")):
-            state.object_type = getattr(world.ObjectType, kind)
-            state.dynamics = self._dynamics
-            filled(state, SITUATION["object"])
-        place = {
-            "constellation_id": 1,
-            "object_id": 1,
-            "constellation_type": world.ConstellationType.SameDirection,
-            "relative_position.longitudinal_position": core.LongitudinalRelativePosition.AtBack,
-            "relative_position.lateral_position": core.LateralRelativePosition.Overlap,
-            "relative_position.lateral_distance": 0.0,
-        }
-        return filled(pair, place)
 
 
 def filled(target: Any, values: Mapping[str, Any]) -> Any:
@@ -185,5 +146,6 @@ def filled(target: Any, values: Mapping[str, Any]) -> Any:
     for path, value in values.items():
         *owners, name = path.split(".")
         owner = reduce(getattr, owners, target)
-        setattr(owner, name, type(getattr(owner, name))(value))
+        kind = type(getattr(owner, name))
+        setattr(owner, name, getattr(kind, value) if isinstance(value, str) else kind(value))
     return target

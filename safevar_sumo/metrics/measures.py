@@ -313,23 +313,16 @@ def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsT
     """Mean fully developed deceleration of UN R13-H, (v_b^2 - v_e^2) / (2 (s_e - s_b)) [m/s^2],
     with the places s_b and s_e where the speed is 80 and 10 % of the first one; shape (N,), NaN for
     a vehicle that does not stop.
+
+    With a constant deceleration in a step, squares of speeds are linear over the way.
     """
     trace = runs.trace
-    first = trace.speed[0]
-    places = []
-    for share in MFDD_SHARES:
-        # The step in which the speed falls below that share, and the part of its way until then:
-        # with a constant deceleration squares of speeds are linear over the way.
-        after = np.argmax(trace.speed <= share * first, axis=0)
-        samples = np.stack([np.maximum(after - 1, 0), after])
-        squares, ways = (
-            np.take_along_axis(values, samples, axis=0)
-            for values in (trace.speed**2, trace.position)
-        )
-        part = (squares[0] - (share * first) ** 2) / (squares[0] - squares[1])
-        places.append(ways[0] + part * (ways[1] - ways[0]))
-    begin, end = MFDD_SHARES
-    return _of_stops(runs, (begin**2 - end**2) * first**2 / (2 * (places[1] - places[0])))
+    squares = trace.speed * trace.speed
+    wanted = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
+    columns = zip(wanted.T, squares.T, trace.position.T, strict=True)
+    places = np.array([np.interp(-levels, -square, way) for levels, square, way in columns])
+    ways = 2 * (places[:, 1] - places[:, 0])
+    return _of_stops(runs, (wanted[0] - wanted[1]) / ways)
 
 
 STOP_FROM_PEDAL = Measure(

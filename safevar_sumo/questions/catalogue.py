@@ -217,8 +217,8 @@ def check(
         ),
         numbers={
             "passed": not findings,
-            "vehicles": extents[0].vehicles if extents else 0,
-            "points": extents[0].points if extents else 0,
+            "vehicles": sum(extent.vehicles for extent in extents),
+            "points": sum(extent.points for extent in extents),
         },
         tables={"findings": tabulate("Findings", FINDINGS, rows)},
     )

@@ -39,6 +39,8 @@ from safevar_sumo.study.parameters import FreeParameter, searched
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 WORST = "worst"
 """The aggregate of a matrix by which the least safety degree decides."""
+BY_EXCESS = "impact_excess >"
+"""The aggregate of a matrix in which impacts may be allowed."""
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Parameters = dict[str, Any]
 Tables = Mapping[str, Any]
@@ -261,6 +263,9 @@ class MatrixTable(Table, frozen=True, kw_only=True):
             raise mistake(
                 f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
             )
+        if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
+            problem = f"aggregate = {self.aggregate!r}, and a test allows an impact"
+            raise mistake(problem, f"{BY_EXCESS!r}, or no allowed_impact_speed")
 
 
 class UnsafeTable(Table, frozen=True, kw_only=True):

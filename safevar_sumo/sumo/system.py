@@ -14,13 +14,12 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.metrics import IMPACT_EXCESS
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
-from safevar_sumo.study import WORST, MatrixTable, MetricsTable, Study, Weather
+from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
@@ -238,14 +237,6 @@ class System:
         return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
 
 
-def check_impacts(matrix: MatrixTable, aggregate: str) -> None:
-    """Refuse tests that allow an impact where something else decides which point is the worst."""
-    allowing = next((test for test in matrix.tests if test.allowed_impact_speed), None)
-    if allowing is not None and aggregate != f"{IMPACT_EXCESS.name} >":
-        problem = f"matrix.aggregate = {aggregate!r}, and test {allowing.name!r} allows an impact"
-        raise InputError("", problem, f"'{IMPACT_EXCESS.name} >', or no allowed_impact_speed")
-
-
 def assemble(study: Study) -> System:
     """Load the study's models and create them with their parameters.
 
@@ -287,8 +278,6 @@ def _assemble(study: Study) -> System:
     has_stops = any(member.brakes_fully for member in scenarios)
     measuring = measuring_of(study, lookup, has_stops=has_stops)
     _check_metrics(study, measuring)
-    if study.matrix is not None:
-        check_impacts(study.matrix, study.matrix.aggregate)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         check_network(network)
     if not (matrix or study.scenario.search):

@@ -22,7 +22,7 @@ from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import evaluate
 from safevar_sumo.sumo.system import System, assemble
 from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
-from tests.made_up import drawn, original_of
+from tests.made_up import original_of
 
 WISHES = [(1.0, (1.0 + COASTING) / (FULL + COASTING), 0.0), (-5.0, 0.0, (5.0 - COASTING) / BRAKING)]
 """Accelerations, and the pedals of `KNOWN` for them."""
@@ -69,17 +69,6 @@ def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
     study = load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
     system = assemble(study)
     assert evaluate(system, original_of(system)).outcome.tolist() == ["stopped"]
-
-
-def test_one_law_over_numbers_and_over_arrays_drives_the_same(in_tmp: Path) -> None:
-    source = Path(__file__).read_text()
-    (in_tmp / "laws.py").write_text(source)
-    results = []
-    for name in ("Wishes", "ArrayWishes"):
-        ads = {"model": f"laws:{name}"}
-        system = assemble(load_study("wear", matrix=None, scenario=STANDING, ads=ads))
-        results.append(evaluate(system, drawn(system, 8, 3)).f_safe)
-    np.testing.assert_array_equal(*results)
 
 
 class Listens(Ads):

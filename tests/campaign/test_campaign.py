@@ -179,26 +179,17 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
         carried_out(study, tmp_path)
 
 
-@pytest.mark.parametrize("workers", [1, 4])
-def test_the_speed_of_a_study_is_that_of_all_workers(
-    workers: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("workers", "runs"), [(1, None), (4, None), (2, 2)])
+def test_the_speed_of_a_study_is_that_of_all_workers_that_have_a_run(
+    workers: int, runs: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pool = FormulaPool(workers)
+    pool = FormulaPool(4 if runs else workers)
     seconds = iter([10.0, 14.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
     monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
-    assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool) == workers * 200 / 4
+    task = Task(study=load_study("smoke"), batch_size=200)
+    assert measure_speed(task, pool, runs) == workers * 200 / 4
     assert sorted(pool.sizes) == [200] * 2 * workers, "those before are not measured"
-
-
-def test_a_search_of_fewer_runs_than_workers_has_the_speed_of_as_many_workers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pool = FormulaPool(4)
-    seconds = iter([10.0, 14.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
-    assert measure_speed(Task(study=load_study("smoke"), batch_size=200), pool, 2) == 2 * 200 / 4
 
 
 def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(

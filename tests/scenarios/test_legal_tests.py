@@ -90,7 +90,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     ("text", "message"),
     [
         ('[[matrix.tests]]\nname = "it"\nallowed_impact_speed = -5', "allowed_impact_speed"),
-        ('[matrix]\naggregate = "worst"', "matrix.aggregate = 'worst', and test"),
+        ('[matrix]\naggregate = "worst"', "aggregate = 'worst', and a test allows an impact"),
         ('[unsafe]\ncriterion = "impact_exces > 0"', "impact_exces"),
         ('[unsafe]\ncriterion = "hard"', "'hard'"),
     ],

@@ -30,7 +30,7 @@ LONGEST = 60.0
 """Longest time of the simulations [s]."""
 LEAST_SIMULATED = 3
 """Least number of settings, however slow the code: the original, and the ends of the domains."""
-TIMED, RUNS_OF_ALL = 2, 5
+TIMED, RUNS_OF_ALL = 5, 5
 """Number of settings whose time is taken; in how many runs all settings are simulated, roughly."""
 SMALLER_BATCHES = 4
 """Number of batches into which the settings are divided for the check `alone`."""
