@@ -175,11 +175,7 @@ def study(
     # Measured or searched.
     if dry_run:
         with open_pool(jobs, cluster) as pool:
-            used, reason = choose_engine(system, engine)
-            size = batch or settings_per_batch(system, used)
-            task = Task(study=loaded, engine=used, batch_size=size)
-            speed = measure_speed(task, pool, len(keys))
-            return _forecast(loaded, len(keys), speed, f"{used}: {reason}")
+            return _measured(loaded, system, len(keys), engine, batch, pool)
     try:
         results = run(
             loaded,
@@ -259,7 +255,7 @@ def _measured(
     # The speed on this machine.
     used, reason = choose_engine(system, engine)
     task = Task(study=study, engine=used, batch_size=batch or settings_per_batch(system, used))
-    rate = measure_speed(task, pool)
+    rate = measure_speed(task, pool, runs)
 
     # The time that follows for all evaluations.
     evaluations = runs * study.search.evaluations

@@ -176,10 +176,7 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
 
 @contents("passed", "vehicles", "points", findings=FINDINGS, **TABLES)
 def check(
-    name: str,
-    *,
-    ego: str | None = None,
-    vehicles: Annotated[int | None, Range(1, 10_000)] = None,
+    name: str, *, ego: str | None = None, vehicles: Annotated[int | None, Range(1, 10_000)] = None
 ) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
     the promises that results rest on.

@@ -249,12 +249,12 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
-def _check_speed(scenario: Scenario, max_speed: float) -> None:
-    """Refuse a test that is faster than the original vehicle, or than any test."""
+def _check_speed(scenario: Scenario, nominal: Nominal) -> None:
+    """Refuse a file's scene that is faster than the original vehicle, or than any test."""
+    name = getattr(scenario, "ego", "")
     speed = float(np.max([scenario.test_speed or 0.0, scenario.profile_highest]))
-    highest = min(max_speed, MAX_TEST_SPEED)
+    highest = min(nominal.max_speed, MAX_TEST_SPEED) if name else np.inf
     if speed > highest:
-        name = getattr(scenario, "ego", "the vehicle under test")
         problem = f"{name} drives at {speed:.1f} m/s, faster than the study's vehicle can"
         raise InputError("", problem, f"at most {highest:.1f} m/s, or another vehicle")
 
@@ -295,7 +295,7 @@ def _assemble(study: Study) -> System:
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
     for one in (scenario, *(point.scenario for point in matrix)):
-        _check_speed(one, nominal.max_speed)
+        _check_speed(one, nominal)
     if study.vehicle.model not in VEHICLES:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(

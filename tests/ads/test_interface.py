@@ -14,12 +14,12 @@ from pythonfmu.builder import FmuBuilder
 
 from safevar_sumo.ads import Ads, ScalarAds
 from safevar_sumo.ads.base import Trim
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios.tracks import BODIES
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.batch import drive_all
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
 from tests.made_up import original_of
@@ -68,7 +68,7 @@ def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
     )
     study = load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
     system = assemble(study)
-    assert evaluate(system, original_of(system)).outcome.tolist() == ["stopped"]
+    assert drive_and_score(system, original_of(system)).outcome.tolist() == ["stopped"]
 
 
 class Listens(Ads):
@@ -162,4 +162,4 @@ def test_a_traci_controller_reads_them_by_its_own_calls(in_tmp: Path) -> None:
     table = {"kind": "traci", "model": "reads:step"}
     system: System = assemble(load_study("native", ads=table))
     with pytest.raises(UserCodeError, match=r"4\.700 m and \d\.\d+ m"):
-        evaluate(system, original_of(system))
+        drive_and_score(system, original_of(system))

@@ -12,9 +12,9 @@ import pytest
 
 from safevar_sumo.ads.highway_idm import HighwayIdm
 from safevar_sumo.ads.intel_rss import AdRss
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
-from safevar_sumo.study import load_study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.ads.test_ads import COASTING, FULL, KNOWN

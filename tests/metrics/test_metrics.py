@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import (
     F_DIFF,
@@ -29,7 +30,7 @@ from safevar_sumo.records import (
     Outcome,
     SimulationRuns,
 )
-from safevar_sumo.study import MetricsTable, load_study
+from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
 STEP = 0.01
@@ -446,7 +447,7 @@ def test_an_impact_counts_above_the_speed_that_is_allowed(
     evaluations = made_up_evaluations([-speed], metrics=metrics)
     criterion = Unsafe.parse("impact_excess > 0")
     assert criterion.of(evaluations).tolist() == [excess > 0]
-    assert np.sign(criterion.left(evaluations)[0]) == -np.sign(excess)
+    assert np.sign(criterion.robustness(evaluations)[0]) == -np.sign(excess)
     assert criterion.description == "impact_excess > 0"
     if excess > 0:
         assert criterion.breach_in_words(evaluations) == f"has an {words}"

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import Along, CarToCar
-from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate, simulate_all_points
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
 from tests.made_up import original_of
@@ -54,7 +54,7 @@ def test_r152_allows_the_impact_of_the_higher_row() -> None:
 @pytest.mark.parametrize("name", ["r152", "r152_laden", "fmvss127"])
 def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
     system = assemble(load_study(name))
-    original = evaluate(system, original_of(system))
+    original = drive_and_score(system, original_of(system))
     assert not original.collided[0]
     mass = system.nominal.mass
     assert mass - assemble(load_study("wear")).nominal.mass == (450 if name == "r152_laden" else 0)
@@ -76,9 +76,9 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     assert hit.point.name == FAST
     speed = float(hit.runs.relative_speed[0])
     assert 10 * KMH < speed < 35 * KMH
-    alone = evaluate(system.at(hit.point), setting)
+    alone = drive_and_score(system.at(hit.point), setting)
     assert alone.column("impact_excess")[0] == pytest.approx(speed - 35 * KMH)
-    worst = evaluate(system, setting)
+    worst = drive_and_score(system, setting)
     assert worst.outcome.tolist() == ["stopped"]
     assert worst.column("impact_excess")[0] == -worst.f_safe[0] > speed - 35 * KMH
     told = run("simulate", "r152", "--set", "sensorRange=15", "--point", FAST).stdout
