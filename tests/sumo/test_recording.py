@@ -25,7 +25,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import at_point, evaluate
+from safevar_sumo.sumo.matrix import at_point, drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -139,7 +139,7 @@ def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_o
     ads = {"model": "idm", "parameters": {}}
     car = {"model": "car_to_car", "parameters": {}}
     system = assemble(load_study("wear", ads=ads, scenario=car, matrix={"tests": tests}))
-    outcomes = evaluate(system, original_of(system)).outcome.tolist()
+    outcomes = drive_and_score(system, original_of(system)).outcome.tolist()
     assert outcomes == ["timeout"]
     verify_in_sumo(system, original_of(system))
 
