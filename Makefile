@@ -4,7 +4,7 @@ RUN := .venv/bin/python
 PACKAGE := setup.cfg pyproject.toml constraints.txt
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-.PHONY: study test test-all lint docs pictures benchmark clean
+.PHONY: study test test-all lint docs docs-outputs pictures benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
@@ -23,6 +23,9 @@ lint: .venv/installed-test
 
 docs: .venv/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --quiet --strict
+
+docs-outputs: .venv/installed-test
+	$(RUN) -m tests.pages
 
 pictures: .venv/installed-test
 	$(RUN) docs/pictures.py

@@ -9,6 +9,7 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from html import unescape
 from pathlib import Path
 from typing import Any, get_args
 
@@ -41,6 +42,22 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         markdown,
         flags=re.MULTILINE,
     )
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Called by MkDocs for every page: formulas, which arithmatex marks, become MathML, which
+    browsers draw themselves.
+    """
+    from latex2mathml.converter import convert  # the rest of this module works without it
+
+    for mark, display in ((r"\\\((.*?)\\\)</span>", "inline"), (r"\\\[(.*?)\\\]</div>", "block")):
+        html = re.sub(
+            rf'<(?:span|div) class="arithmatex">{mark}',
+            lambda match, display=display: convert(unescape(match[1].strip()), display=display),
+            html,
+            flags=re.DOTALL,
+        )
+    return html
 
 
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -195,8 +212,11 @@ def results_files() -> str:
 
 
 def readme() -> str:
-    """The README of the repository, whose links go to this folder."""
-    return (Path(__file__).parents[1] / "README.md").read_text().replace("](docs/", "](")
+    """The README of the repository, whose links go to this folder, without its badges, which are
+    loaded from elsewhere.
+    """
+    text = (Path(__file__).parents[1] / "README.md").read_text().replace("](docs/", "](")
+    return re.sub(r"^\[!\[.*\n\n", "", text, flags=re.MULTILINE)
 
 
 def characteristics() -> str:

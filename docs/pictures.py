@@ -16,8 +16,7 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 PROGRAM = f"{shlex.quote(sys.executable)} -m safevar_sumo"
 FAILURE = (
-    f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1.008 --set tireFric=1.004 --set"
-    " maxBrakeTorque=1201"
+    f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set maxBrakeTorque=1200"
 )
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
 LIMITED = 'extends = "native"\nname = "native"\n[limits]\ndecel = { at_least = 8 }\n'
@@ -30,6 +29,13 @@ SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
+    "sawtooth.png": f"{shlex.quote(sys.executable)} {DOCS}/boundaries.py sawtooth {{}}",
+    "boundary.png": f"{shlex.quote(sys.executable)} {DOCS}/boundaries.py boundary {{}}",
+    "limits.png": f"{PROGRAM} tolerance native --characteristics decel,brakeDelay --plot {{}}",
+    "convergence.png": (
+        f"{PROGRAM} study rain --runs 5 --evaluations 2000 --out rain --quiet && "
+        f"{PROGRAM} tables rain --figures . > /dev/null && cp rain-convergence.png {{}}"
+    ),
     "stops.png": f"{shlex.quote(sys.executable)} {DOCS}/stops.py {{}}",
     "encounters.png": f"{shlex.quote(sys.executable)} {DOCS}/encounters.py {{}}",
     "sun_nsga2.png": f"{PROGRAM} validate sun {PUBLISHED}/sun_nsga2.csv --plot {{}}",

@@ -28,21 +28,31 @@ from safevar_sumo.terminal import show_no_progress
 ROOT = Path(__file__).parents[1]
 
 
+BLOCK = re.compile(
+    r'(?:^<!-- ([^\n]*) -->\n+)?^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$',
+    flags=re.DOTALL | re.MULTILINE,
+)
+
+
 class Block(NamedTuple):
-    """A fenced block of a page: its language, the file that it is the content of (or ""), and its
-    text.
+    """A fenced block of a page: the comment above it, its language, the file that it is the content
+    of, its text, and the place of the text in the page. What is not there is "".
     """
 
+    comment: str
     language: str
     title: str
     text: str
+    place: tuple[int, int]
 
 
 def blocks(page: str) -> list[Block]:
     """The fenced blocks of a page of the manual."""
-    pattern = r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$'
-    found = re.findall(pattern, (ROOT / page).read_text(), flags=re.DOTALL | re.MULTILINE)
-    return [Block(*one) for one in found]
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return [
+        Block(*(found or "" for found in match.groups()), match.span(4))
+        for match in BLOCK.finditer(text)
+    ]
 
 
 def files_of(*pages: str) -> dict[str, str]:

@@ -23,7 +23,6 @@ from PIL import Image
 from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import commands
-from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.study import (
     WITHOUT_EFFECT,
     CharacteristicTable,
@@ -34,50 +33,37 @@ from safevar_sumo.study import (
 )
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import ROOT, blocks
-
-PAGES = [
-    "README.md",
-    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
-]
-PROGRAM = "python -m safevar_sumo "
+from tests.pages import PAGES, PROGRAM, run_page, shortened
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
-def test_every_block_of_a_page_does_what_it_says(
-    page: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(scans, "SCAN_VALUES", 21)  # coarse limits, to save time
-    names = {}
-    for block in blocks(page):
-        if block.title:
-            Path(block.title).write_text(block.text)
-        elif block.language == "python":
-            exec(compile(block.text, page, "exec"), names)
-        elif block.language == "bash":
-            for line in block.text.splitlines():
-                run(line)
-        else:
-            assert block.language in ("text", "bibtex"), (
-                f"{page}: a block of {block.language!r} that nothing runs"
-            )
+def test_every_block_of_a_page_does_and_shows_what_it_says(page: str, in_tmp: Path) -> None:
+    for block, output in run_page(page, options_of_tests=True):
+        assert block.text == output, f"{page}: `make docs-outputs` fills it in"
 
 
-def run(line: str) -> None:
-    """A line of a shell; what a reader's machine is set up with is not run."""
-    if line.startswith(PROGRAM):
-        done = CliRunner().invoke(
-            commands, shlex.split(line.removeprefix(PROGRAM), comments=True), catch_exceptions=False
-        )
-        assert done.exit_code == 0, f"{line}\n{done.output}"
-    elif line.startswith("make "):
-        assert re.search(
-            rf"^{line.split()[1]}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE
-        ), line
-    else:
-        assert line.startswith(("pip install", "eval ", "#")) or not line, (
-            f"a line that nothing runs: {line}"
-        )
+def test_a_page_shows_parts_of_an_output() -> None:
+    table = ["Limits", "┏━┓", "┃a┃", "┡━┩", "│1│", "│2│", "└─┘"]
+    output = "\n".join(["All hold.", "Next: go", *table, "Remarks", "one: two", ""])
+    assert shortened(output, "output: verdict") == "All hold.\nNext: go\n"
+    assert shortened(output, "output: Limits: 1") == "Limits\n┏━┓\n┃a┃\n┡━┩\n│1│\n...\n"
+    second = output.replace("Remarks", "\n".join([*table[1:], "Remarks"]))
+    assert shortened(second, "output: Limits") == "\n".join([*table, *table[1:], ""])
+    assert shortened(output, "output: one; Lim") == "\n".join(["one: two", *table, ""])
+    assert shortened(output, "output") == output
+    line = f"{'word ' * 16}word\n"
+    assert shortened("word " * 40, "output") == f"{line}{line}{'word ' * 5}word\n"
+    with pytest.raises(LookupError, match="no part begins with 'Causes'"):
+        shortened(output, "output: Causes")
+
+
+def test_lines_of_prose_have_at_most_100_characters() -> None:
+    """Tables, headings, pictures, badges and blocks apart."""
+    for page in PAGES:
+        text = re.sub(r"(?s)^```.*?^```$|<!--.*?-->", "", (ROOT / page).read_text(), flags=re.M)
+        for line in text.splitlines():
+            assert len(line) <= 100 or line.startswith(("|", "#", "![", "[![")), f"{page}: {line}"
 
 
 def script_of_docs(name: str) -> Any:
@@ -102,7 +88,16 @@ def test_every_picture_has_its_command_and_its_page() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["failure.png", "failure.gif", "stops.png", "encounters.png", "report.png"]
+    "name",
+    [
+        "failure.png",
+        "failure.gif",
+        "sawtooth.png",
+        "boundary.png",
+        "stops.png",
+        "encounters.png",
+        "report.png",
+    ],
 )
 def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
     name: str, tmp_path: Path
@@ -229,6 +224,15 @@ def test_every_generated_table_of_a_page_is_made_from_the_code() -> None:
     assert "| `evaluations` | integer, at least 1, at most 1e+07 | required |" in text
 
 
+def test_a_formula_becomes_mathml() -> None:
+    pytest.importorskip("latex2mathml")  # of the extra `docs`
+    page = '<p>If <span class="arithmatex">\\(x^2 &lt; y\\)</span>, stop.</p>'
+    html = script_of_docs("generate").on_page_content(page)
+    assert "<msup><mi>x</mi><mn>2</mn></msup><mo>&#x0003C;</mo><mi>y</mi>" in html
+    assert html.startswith("<p>If <math")
+    assert html.endswith("</math>, stop.</p>")
+
+
 def test_the_line_that_stands_for_a_table_is_the_command_that_prints_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,7 +266,9 @@ def marked(page: str) -> list[Numbers]:
     """
     result = []
     for comment, paragraph in re.findall(
-        r"<!-- numbers:\n(.*?)-->\n+(.*?)(?=\n\n|\Z)", (ROOT / page).read_text(), flags=re.DOTALL
+        r"<!-- numbers:\n(.*?)-->\n+(?:<!--.*?-->\n+)*(.*?)(?=\n\n|\Z)",
+        (ROOT / page).read_text(),
+        flags=re.DOTALL,
     ):
         lines = [line.strip() for line in comment.splitlines() if line.strip()]
         values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
