@@ -233,9 +233,9 @@ def characteristics() -> str:
     )
 
 
-def messages(folder: Path) -> Iterator[tuple[str, str]]:
-    """The refusals of the modules in a folder, with `...` for what a file says, and the name of the
-    module.
+def messages(folder: Path) -> Iterator[tuple[str, str, str]]:
+    """The refusals of the modules in a folder: the name of the module, the message with `...` for
+    what a file says, and what is expected.
     """
 
     def text(node: ast.expr) -> str:
@@ -244,32 +244,43 @@ def messages(folder: Path) -> Iterator[tuple[str, str]]:
                 return found
             case ast.JoinedStr(values=parts):
                 return "".join(map(text, parts))
+            case ast.Call(func=ast.Name(id="one_of")):
+                return "one of ..."
         return "..."
 
     for path in sorted(folder.glob("*.py")):
         tree = ast.parse(path.read_text())
         named = [
             (node.targets[0].id, node.value)
-            for node in ast.walk(tree)
+            for node in sorted(ast.walk(tree), key=lambda node: getattr(node, "lineno", 0))
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
         ]
+
+        def texts(argument: ast.expr, named: list[tuple[str, ast.expr]] = named) -> list[str]:
+            """What an argument says, or the variable that it names: the one assigned last."""
+            known = getattr(argument, "id", getattr(argument, "attr", ""))
+            values = [value for name, value in named if name == known]
+            if isinstance(argument, ast.Name):
+                values = [one for one in values if one.lineno < argument.lineno][-1:]
+            return [one for one in map(text, values or [argument]) if one.strip(".")]
+
         for call in ast.walk(tree):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
-                place = {"unsupported": 0, "InputError": 1, "unknown_name": 1}.get(
-                    call.func.id, len(call.args)
-                )
+                named_first = {"unsupported": 0, "InputError": 1, "Unplaced": 1, "unknown_name": 1}
+                place = named_first.get(call.func.id, len(call.args))
                 for argument in call.args[place : place + 1]:
-                    known = getattr(argument, "id", getattr(argument, "attr", ""))
-                    values = [value for name, value in named if name == known]
-                    for message in map(text, values or [argument]):
-                        if message.strip("."):
-                            yield path.stem, message
+                    is_of_names = call.func.id == "unknown_name"
+                    rest = [] if is_of_names else call.args[place + 1 : place + 2]
+                    legal = "; ".join(one for each in rest for one in texts(each)) or "one of ..."
+                    for message in texts(argument):
+                        yield path.stem, message, legal
 
 
 def refusals() -> str:
-    """What the reader of OpenSCENARIO refuses."""
+    """What the reader of OpenSCENARIO refuses, and what it expects."""
     found = dict.fromkeys(messages(Path(openscenario.__file__).parent))
-    return _table(("part", "message"), [(part, f"`{message}`") for part, message in found])
+    rows = [(part, f"`{message}`", legal) for part, message, legal in found]
+    return _table(("part", "message", "what to write instead"), rows)
 
 
 def published_systems() -> str:

@@ -45,7 +45,7 @@ LIMITED = (
 GENERATE = runpy.run_path(str(ROOT / "docs" / "generate.py"))
 TEMPLATES = [
     ".+".join(map(re.escape, message.split("...")))
-    for _, message in GENERATE["messages"](Path(openscenario.__path__[0]))
+    for _, message, _ in GENERATE["messages"](Path(openscenario.__path__[0]))
 ]
 """The refusals that a page of the manual lists."""
 TRAILER = body("Car").replace("</Vehicle>", "<Trailer>{}</Trailer></Vehicle>")
