@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,32 +89,9 @@ class Piece(NamedTuple):
         base = self.start.facing * cmath.exp(-0.5j * first * offset)
         return Pose(self.start.place + base * way, self.start.facing * turn)
 
-    def curvature(self, distance: Number) -> Number:
-        """The curvature at a distance from the start [1/m]."""
-        return self.first + self.slope * distance
-
-    @property
-    def is_straight(self) -> bool:
-        """Whether it turns nowhere."""
-        return not self.first and not self.last
-
     def reversed(self) -> Piece:
         """The piece from its end to its start."""
         return Piece(self.pose(self.length).turned(-1), self.length, -self.last, -self.first)
-
-
-class Curved(Protocol):
-    """What a line asks of its pieces, which may be of any shape."""
-
-    @property
-    def start(self) -> Pose: ...
-    @property
-    def length(self) -> float: ...
-    @property
-    def is_straight(self) -> bool: ...
-    def pose(self, distance: Number) -> Pose: ...
-    def curvature(self, distance: Number) -> Number: ...
-    def reversed(self) -> Curved: ...
 
 
 def _fresnel(value: Number, sign: float) -> Number:
@@ -132,7 +109,7 @@ class Line:
     faces, `facings`, if the file states them.
     """
 
-    pieces: Sequence[Curved]
+    pieces: Sequence[Piece]
     stations: Sequence[float] = ()
     times: Sequence[float] = ()
     facings: Sequence[complex] = ()
@@ -152,7 +129,9 @@ class Line:
         """Whether it turns nowhere."""
         facing = self.pieces[0].start.facing
         return all(
-            piece.is_straight and abs(cmath.phase(piece.start.facing / facing)) < STRAIGHT
+            abs(cmath.phase(piece.start.facing / facing)) < STRAIGHT
+            and not piece.first
+            and not piece.last
             for piece in self.pieces
         )
 
@@ -177,12 +156,11 @@ class Line:
     def curvature(self, distance: Number) -> Number:
         """The curvatures at distances [1/m]."""
         inside = np.clip(distance, 0.0, self.length)
-        found = np.empty(len(inside))
-        pieces = self._piece_at(inside)
-        for k in np.unique(pieces):
-            here = pieces == k
-            found[here] = self.pieces[k].curvature(inside[here] - self.starts[k])
-        return found
+        firsts, slopes = (
+            np.array([getattr(piece, name) for piece in self.pieces]) for name in ("first", "slope")
+        )
+        k = self._piece_at(inside)
+        return firsts[k] + slopes[k] * (inside - self.starts[k])
 
     @cached_property
     def stray(self) -> float:

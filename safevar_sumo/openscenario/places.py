@@ -16,7 +16,7 @@ import numpy as np
 
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
-from safevar_sumo.openscenario.lines import Curved, Line, Piece, Pose, unit
+from safevar_sumo.openscenario.lines import Line, Piece, Pose, unit
 from safevar_sumo.openscenario.road import Network, Road
 
 MAX_DETOUR = 6
@@ -59,7 +59,7 @@ class Way(Line):
     @classmethod
     def of(cls, network: Network, chain: tuple[tuple[str, bool], ...]) -> Way:
         """The way along a chain of roads, each with its direction."""
-        pieces: list[Curved] = []
+        pieces: list[Piece] = []
         for name, is_forward in chain:
             own = network.road(name).line.pieces
             pieces += own if is_forward else [piece.reversed() for piece in reversed(own)]

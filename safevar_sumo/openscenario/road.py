@@ -17,8 +17,8 @@ from safevar_sumo.openscenario.document import (
     unsupported,
     whole,
 )
-from safevar_sumo.openscenario.lines import Curved, Line, Piece, Pose
-from safevar_sumo.openscenario.polynomials import curve_of
+from safevar_sumo.openscenario.lines import Line, Piece, Pose
+from safevar_sumo.openscenario.polynomials import pieces_of
 
 Cubics = list[tuple[float, tuple[float, ...]]]
 """Polynomials of third degree, each with the s at which it begins [m]."""
@@ -31,7 +31,7 @@ class Road:
     """
 
     id: str
-    pieces: Sequence[Curved]
+    pieces: Sequence[Piece]
     flaw: str
     sections: list[tuple[float, dict[int, Cubics]]]
     offsets: Cubics
@@ -203,12 +203,13 @@ def _road(element: Element) -> Road:
         for link in element.findall("link/*")
         if link.tag in ("predecessor", "successor")
     }
-    pieces: list[Curved] = []
+    pieces: list[Piece] = []
     sections: list[tuple[float, dict[int, Cubics]]] = []
     offsets: Cubics = []
     flaw = ""
     try:
-        pieces = [_piece(each, name) for each in element.findall("planView/geometry")]
+        for each in element.findall("planView/geometry"):
+            pieces += _pieces(each, name)
         offsets = _cubics(part(element, "lanes"), "laneOffset", "s")
         sections = [_section(each, name) for each in element.findall("lanes/laneSection")]
     except InputError as error:
@@ -246,20 +247,21 @@ SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
 """Shapes of OpenDRIVE's geometries."""
 
 
-def _piece(geometry: Element, road: str) -> Curved:
+def _pieces(geometry: Element, road: str) -> list[Piece]:
     """A geometry of OpenDRIVE."""
     start = Pose.at(number(geometry, "x"), number(geometry, "y"), number(geometry, "hdg"))
     length = number(geometry, "length")
     for shape in geometry:
         match shape.tag:
             case "line":
-                return Piece(start, length)
+                return [Piece(start, length)]
             case "arc":
-                return Piece(start, length, number(shape, "curvature"), number(shape, "curvature"))
+                return [Piece(start, length, *2 * [number(shape, "curvature")])]
             case "spiral":
-                return Piece(start, length, number(shape, "curvStart"), number(shape, "curvEnd"))
+                ends = (number(shape, key) for key in ("curvStart", "curvEnd"))
+                return [Piece(start, length, *ends)]
             case "poly3" | "paramPoly3":
-                return curve_of(start, length, shape)
+                return pieces_of(start, length, shape)
             case "userData" | "include" | "dataQuality":
                 continue
         raise unsupported(f"the road {road} has a {shape.tag}", one_of(SHAPES))
