@@ -86,7 +86,7 @@ class Following(NamedTuple):
     distance: float
 
 
-class LaneLine(NamedTuple):
+class FollowedLane(NamedTuple):
     """The lane that an actor follows since it is on a path and moved sideways as it does: at
     distances, how far the lane's middle has moved to the left; the actor's offset then [m].
     """
@@ -121,7 +121,7 @@ class Actor:
     follows: Following | None = None
     running: dict[str, Running] = field(default_factory=dict)
     deleted: float = math.inf
-    lane: LaneLine | None = None
+    lane: FollowedLane | None = None
 
     def __post_init__(self) -> None:
         self.place, self.facing = (np.zeros(self.n_samples, dtype=complex) for _ in range(2))
@@ -191,10 +191,11 @@ class Actor:
         """Move from a sample to the `last`: the speed is that of the body, along its own
         direction.
         """
-        path = self.here.path
         now = self.here
         n = last - sample
         later = slice(sample + 1, last + 1)
+
+        # How far it drives in each step, along its own direction.
         if self.follows is not None:
             speed: Array = self.follows.other.speed[later]
         elif self.along is None:
@@ -208,26 +209,54 @@ class Actor:
                 self.stations.value(times[later] - self.stations.since), prepend=now.distance
             )
         self.travelled[later] = self.travelled[sample] + np.cumsum(ahead)
-        forward = ahead
+
+        # Where that is along its path and beside it.
         lane = self._follow_lane()
-        base = np.full(n, now.left if lane is None else lane.left)
-        turn = np.ones(n)
-        if self.sideways is not None:
-            motion = self.sideways
-            passed: Array = times[later] if motion.until is None else self.travelled[later]
-            base = np.broadcast_to(motion.value(passed - motion.since), n)
-            if motion.until is not None:
-                # It ends at the first sample at which the actor has travelled so far.
-                index = int(np.searchsorted(self.travelled[sample : last + 1], motion.until - 1e-9))
-                self.running["sideways"].end = float(
-                    np.append(times[sample : last + 1], np.inf)[index]
-                )
-        left = base
+        offset = self._offsets(lane, sample, last, times)
+        distance, left, turn = self._ways(lane, ahead, offset, speed)
+        if self.follows is not None:
+            distance = self._behind(self.follows, later)
+        pose = now.path.pose(distance, left)
+        self.place[later] = pose.place
+        self.facing[later] = pose.facing * turn * now.turn
+        self.speed[later] = speed
+        self.distance[later] = distance
+        self.left[later] = left
+        moves = speed > 1e-3
+        since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
+        self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (
+            since == 0
+        )
+
+    def _offsets(self, lane: FollowedLane | None, sample: int, last: int, times: Array) -> Array:
+        """Offsets to the left by its motion sideways, from a sample to the `last` [m]; a lane that
+        moves comes on top.
+        """
+        motion = self.sideways
+        later = slice(sample + 1, last + 1)
+        if motion is None:
+            return np.full(last - sample, self.here.left if lane is None else lane.left)
+        passed: Array = times[later] if motion.until is None else self.travelled[later]
+        if motion.until is not None:
+            # It ends at the first sample at which the actor has travelled so far.
+            index = int(np.searchsorted(self.travelled[sample : last + 1], motion.until - 1e-9))
+            self.running["sideways"].end = float(np.append(times[sample : last + 1], np.inf)[index])
+        return np.broadcast_to(motion.value(passed - motion.since), last - sample)
+
+    def _ways(
+        self, lane: FollowedLane | None, ahead: Array, offset: Array, speed: Array
+    ) -> tuple[Array, Array, Array]:
+        """Distances along the path and to its left after steps that lead so far `ahead` [m], and
+        the body's turns.
+        """
+        now = self.here
+        path = now.path
+        left, turn, forward = offset, np.ones(len(ahead)), ahead
         distance = now.distance + np.cumsum(forward)
         # Where a lane is depends on the distance, and the distance on how far it leads aside.
         for _ in range(1 if lane is None else 3):
             if lane is not None:
-                left = base + lane.shift(distance)
+                left = offset + lane.shift(distance)
             if lane is not None or self.sideways is not None:
                 aside = np.diff(left, prepend=now.left)
                 sine = np.clip(aside / np.maximum(ahead, 1e-12), -1.0, 1.0)
@@ -241,21 +270,9 @@ class Actor:
                     middle = distance - forward / 2
                     inside = 1 - path.curvature(middle) * left
                     distance = now.distance + np.cumsum(forward / inside)
-        if self.follows is not None:
-            distance = self._behind(self.follows, later)
-        pose = path.pose(distance, left)
-        self.place[later] = pose.place
-        self.facing[later] = pose.facing * turn * now.turn
-        self.speed[later] = speed
-        self.distance[later] = distance
-        self.left[later] = left
-        moves = speed > 1e-3
-        since = np.maximum.accumulate(np.where(moves, np.arange(1, n + 1), 0))
-        self.standing[later] = STEP * (np.arange(1, n + 1) - since) + self.standing[sample] * (
-            since == 0
-        )
+        return distance, left, turn
 
-    def _follow_lane(self) -> LaneLine | None:
+    def _follow_lane(self) -> FollowedLane | None:
         """The lane that it follows; None if it is on no roads, or lanes keep their places."""
         path = self.here.path
         if not isinstance(path, Way) or path.has_even_lanes:
@@ -267,7 +284,7 @@ class Actor:
             left = self.here.left
             goal = left if self.sideways is None else float(self.sideways.value(1e12))
             distances, lefts = path.lane_line(self.here.distance, goal)
-            self.lane = LaneLine(path, self.sideways, distances, lefts - lefts[0], left)
+            self.lane = FollowedLane(path, self.sideways, distances, lefts - lefts[0], left)
         return self.lane
 
     def _behind(self, following: Following, later: slice) -> Array:

@@ -12,7 +12,7 @@ from safevar_sumo.openscenario.document import unsupported
 
 
 @dataclass
-class SpeedProfile:
+class OwnSpeeds:
     """The speeds of Ego by its SpeedActions: when the last of them ends, and when an
     ActivateControllerAction switches the driving system on [s].
     """

@@ -7,7 +7,7 @@ import numpy as np
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, actors_of
 from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
-from safevar_sumo.openscenario.own_speed import SpeedProfile
+from safevar_sumo.openscenario.own_speed import OwnSpeeds
 from safevar_sumo.openscenario.places import STRAY, Place, Way, located, place_of, turn_of
 from safevar_sumo.openscenario.road import read_network, straight_network
 
@@ -48,7 +48,7 @@ class Player:
         self.begun: dict[Key, float] = {}
         self.ended: dict[Key, float] = {}
         self.dependences: dict[str, float] = {}
-        self.profile = SpeedProfile()
+        self.profile = OwnSpeeds()
         self.masters: dict[str, tuple[float, str]] = {}
         self.remarks: dict[str, None] = {}
         self.ignored: set[str] = set()
