@@ -3,7 +3,7 @@ its speed.
 """
 
 from safevar_sumo.openscenario.actors import STEP as STEP
-from safevar_sumo.openscenario.document import MOST as MOST, read as read
+from safevar_sumo.openscenario.document import MOST as MOST
 from safevar_sumo.openscenario.expressions import text_of as text_of
 from safevar_sumo.openscenario.logical import (
     Source as Source,
@@ -11,6 +11,7 @@ from safevar_sumo.openscenario.logical import (
     open_file as open_file,
     originals as originals,
 )
+from safevar_sumo.openscenario.reading import read as read
 from safevar_sumo.openscenario.scene import (
     EVERY as EVERY,
     Moved as Moved,

@@ -19,7 +19,8 @@ from safevar_sumo.openscenario.document import (
     unsupported,
 )
 from safevar_sumo.openscenario.lines import Line, Pose
-from safevar_sumo.openscenario.places import Place, Way
+from safevar_sumo.openscenario.places import Place
+from safevar_sumo.openscenario.ways import Way
 
 STEP = 0.01
 """Time between two samples [s]."""

@@ -14,8 +14,8 @@ from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
-from safevar_sumo.openscenario.places import Way
 from safevar_sumo.openscenario.player import Player
+from safevar_sumo.openscenario.ways import Way
 
 REACTIONS = (
     "CollisionCondition",

@@ -15,7 +15,6 @@ import numpy as np
 from safevar_sumo.openscenario.document import (
     Element,
     attribute,
-    beside,
     check_unique,
     declared,
     is_number,
@@ -28,6 +27,7 @@ from safevar_sumo.openscenario.document import (
 )
 from safevar_sumo.openscenario.expressions import literal
 from safevar_sumo.openscenario.guard import guarded
+from safevar_sumo.openscenario.reading import beside
 
 FloatArray = Any
 """An array of numbers."""

@@ -6,10 +6,12 @@ import numpy as np
 
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, actors_of
-from safevar_sumo.openscenario.document import Document, Element, attribute, unsupported
+from safevar_sumo.openscenario.document import Element, attribute, unsupported
 from safevar_sumo.openscenario.own_speed import OwnSpeeds
-from safevar_sumo.openscenario.places import STRAY, Place, Way, located, place_of, turn_of
+from safevar_sumo.openscenario.places import Place, located, place_of, turn_of
+from safevar_sumo.openscenario.reading import Document
 from safevar_sumo.openscenario.road import read_network, straight_network
+from safevar_sumo.openscenario.ways import STRAY, Way
 
 Key = tuple[str, str]
 """An element in conditions on states: its kind, and its name after those of all around it, joined

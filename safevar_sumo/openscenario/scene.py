@@ -12,11 +12,12 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario.actors import STEP, Actor, Array, Shape
 from safevar_sumo.openscenario.conditions import bodies_apart
-from safevar_sumo.openscenario.document import is_number, read, refuse_violated, unsupported, whole
+from safevar_sumo.openscenario.document import is_number, refuse_violated, unsupported, whole
 from safevar_sumo.openscenario.guard import guarded
 from safevar_sumo.openscenario.lines import Pose
-from safevar_sumo.openscenario.places import Way
+from safevar_sumo.openscenario.reading import read
 from safevar_sumo.openscenario.storyboard import Storyboard
+from safevar_sumo.openscenario.ways import Way
 
 
 class Moved(NamedTuple):

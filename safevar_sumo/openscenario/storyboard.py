@@ -5,25 +5,18 @@ event to the next.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
 
-from safevar_sumo.openscenario.actions import INIT_ORDER, PLACING, act, is_ignored, leaf_of
-from safevar_sumo.openscenario.actors import STEP, Actor, Running, Unplaced
+from safevar_sumo.openscenario.actions import INIT_ORDER, PLACING, act, leaf_of
+from safevar_sumo.openscenario.actors import STEP, Unplaced
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
-from safevar_sumo.openscenario.document import (
-    Document,
-    Element,
-    attribute,
-    number,
-    part,
-    truth,
-    unsupported,
-)
-from safevar_sumo.openscenario.places import STRAY, Way
+from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
+from safevar_sumo.openscenario.events import Act, Event
 from safevar_sumo.openscenario.player import Key, Player
+from safevar_sumo.openscenario.reading import Document
+from safevar_sumo.openscenario.ways import STRAY, Way
 
 LONGEST = 600.0
 """Time up to which the StopTrigger of a file must hold [s]."""
@@ -35,47 +28,6 @@ TIMES = np.round(np.arange(round((LONGEST + AFTER) / STEP) + 1) * STEP, 9)
 """Times of the samples of the longest scene [s]."""
 BLOCK = 1000
 """Samples that are played at once at most."""
-
-
-@dataclass
-class Event:
-    """An Event (class Event): its kind and path, those of its maneuver, group, act and story, and
-    its actions that go on, by name.
-    """
-
-    element: Element
-    group: Element
-    key: Key
-    outer: list[Key]
-    actors: list[Actor]
-    running: dict[Key, list[Running]] = field(default_factory=dict)
-    has_begun: bool = False
-    has_ended: bool = False
-
-    @property
-    def name(self) -> str:
-        """The event in remarks."""
-        return attribute(self.element, "name")
-
-    @property
-    def moves(self) -> bool:
-        """Whether an action of it moves somebody."""
-        return not all(is_ignored(each) for each in self.element.findall("Action/*"))
-
-
-@dataclass
-class Act:
-    """An Act (class Act) and its events."""
-
-    element: Element
-    key: Key
-    events: list[Event]
-    has_begun: bool = False
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether all of it is over."""
-        return self.has_begun and all(event.has_ended for event in self.events)
 
 
 def _below(outer: Key, element: Element) -> Key:
