@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,56 +31,27 @@ from safevar_sumo.openscenario.places import (
 )
 from safevar_sumo.openscenario.player import Player
 from safevar_sumo.openscenario.synchronize import relative_speed, synchronize_action
+from safevar_sumo.openscenario.transitions import SHAPES, Transition, transition_of
 from safevar_sumo.openscenario.ways import AHEAD, Way
 
 IGNORED = (
-    "ActivateControllerAction AssignControllerAction ControllerAction AppearanceAction"
-    " LightStateAction AnimationAction VisibilityAction EnvironmentAction VariableAction"
-    " VariableSetAction ParameterAction InfrastructureAction SetMonitorAction TrafficSignalAction"
-    " UserDefinedAction"
-).split()
+    "ActivateControllerAction",
+    "AssignControllerAction",
+    "ControllerAction",
+    "AppearanceAction",
+    "LightStateAction",
+    "AnimationAction",
+    "VisibilityAction",
+    "EnvironmentAction",
+    "VariableAction",
+    "VariableSetAction",
+    "ParameterAction",
+    "InfrastructureAction",
+    "SetMonitorAction",
+    "TrafficSignalAction",
+    "UserDefinedAction",
+)
 """Actions that move nobody."""
-
-
-class Transition(NamedTuple):
-    """How long a change takes [s], or with `over_distance` how far the actor drives meanwhile [m];
-    and its share, 0 to 1, after so much of either.
-    """
-
-    duration: float
-    share: Callable[[Array], Array]
-    over_distance: bool = False
-
-
-SHAPES: dict[str, tuple[float, Callable[[Array], Array]]] = {
-    "linear": (1.0, lambda x: x),
-    "sinusoidal": (math.pi / 2, lambda x: (1 - np.cos(math.pi * x)) / 2),
-    "cubic": (1.5, lambda x: x * x * (3 - 2 * x)),
-}
-"""Shapes of a change by their names (class DynamicsShape): largest slope, and the share done at a
-share of the time.
-"""
-
-
-def transition_of(dynamics: Element, change: float, speed: float | None = None) -> Transition:
-    """Class TransitionDynamics for a change. A rate is the largest one.
-
-    A distance is driven at a speed [m/s], or without one at whatever speed the actor has.
-    """
-    shape = attribute(dynamics, "dynamicsShape")
-    dimension = attribute(dynamics, "dynamicsDimension")
-    duration = number(dynamics, "value")
-    if shape == "step" or not change or (not duration and dimension != "rate"):
-        return Transition(0.0, np.ones_like)
-    steepest, share = SHAPES[shape]
-    if dimension == "rate":
-        duration = steepest * abs(change / duration) if duration else math.inf
-    elif dimension == "distance" and speed is not None:
-        duration = duration / speed if speed else math.inf
-    over_distance = dimension == "distance" and speed is None
-    return Transition(
-        duration, lambda since: share(np.minimum(since / duration, 1.0)), over_distance
-    )
 
 
 # Longitudinal
@@ -168,10 +138,13 @@ def longitudinal_distance_action(player: Player, action: Element, actor: Actor) 
 
 # Lateral
 
+MAX_SKEW = 0.1
+"""Sine of the angle to a road up to which a body that was placed in the plane drives along it."""
+
 
 def lane_change_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """LaneChangeAction: a relative lane counts to the left of its entity, as the entity faces."""
-    way = _way_of(action, actor)
+    way = _way_of(player, action, actor)
     target = part(action, "LaneChangeTarget/*")
     lane = whole(target, "value")
     if target.tag == "RelativeTargetLane":
@@ -187,7 +160,7 @@ def lane_change_action(player: Player, action: Element, actor: Actor) -> list[Ru
 
 def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """LaneOffsetAction: as fast as maxLateralAcc allows; without one at once."""
-    way = _way_of(action, actor)
+    way = _way_of(player, action, actor)
     target = part(action, "LaneOffsetTarget/*")
     left = actor.here.left
     by = _sign(way, actor) * number(target, "value")
@@ -206,13 +179,15 @@ def lane_offset_action(player: Player, action: Element, actor: Actor) -> list[Ru
     return [_sideways(player, actor, goal, transition)]
 
 
-def _way_of(action: Element, actor: Actor) -> Way:
-    if not isinstance(actor.here.path, Way):
+def _way_of(player: Player, action: Element, actor: Actor) -> Way:
+    place = player.place_of(actor.name)
+    if not isinstance(place.path, Way) or abs(place.turn.imag) > MAX_SKEW:
         raise unsupported(
             f"{action.tag} of {actor.name}, which is not on a road",
             "an actor whose position is on a road",
         )
-    return actor.here.path
+    actor.at = place
+    return place.path
 
 
 def _sign(way: Way, actor: Actor) -> int:

@@ -228,6 +228,19 @@ def test_who_follows_a_trajectory_on_a_straight_road_is_on_the_road(
     assert origins[2][0] == pytest.approx(115 + 26j)
 
 
+def test_who_is_placed_in_the_plane_changes_lanes_of_a_straight_road(tmp_path: Path) -> None:
+    found = []
+    for place in (at(-2, 100), writing.world(110, 14), writing.world(110, 14, 0.5)):
+        change = event(lane_change(-1, "linear", "time", 3), AT_ONCE.format(1))
+        file = write(tmp_path, change, car=(teleport(place), speed(10)))
+        if "0.5" in place:
+            with pytest.raises(InputError, match="LaneChangeAction of Car, which is not on a road"):
+                play(file, {})
+        else:
+            found.append(play(file, {}).others[0].place)
+    assert np.abs(found[0] - found[1]).max() < 1e-6
+
+
 @pytest.mark.parametrize("action", ["lane change", "offset", "position"])
 def test_a_mirror_image_of_left_hand_traffic_is_the_mirror_image(
     tmp_path: Path, action: str
