@@ -143,25 +143,26 @@ MOST_LANES = 20
 
 
 def straight_network(scenario: Element) -> Network:
-    """A straight road to the east for a file that names none, with the lanes that it names."""
+    """A straight road to the east for a file that names none, with the lanes that it needs."""
     names = {one.get("roadId", "") for one in scenario.iter() if "roadId" in one.attrib}
-    lanes = [whole(one, "laneId") for one in scenario.iter() if "laneId" in one.attrib]
-    lanes += [whole(one, "value") for one in scenario.iter("AbsoluteTargetLane")]
-    beside = [whole(one, "dLane") for one in scenario.iter("RelativeLanePosition")]
-    beside += [whole(one, "value") for one in scenario.iter("RelativeTargetLane")]
-    most = max(map(abs, [1, *lanes])) + sum(map(abs, beside))
-    if len(names) > 1 or most > MOST_LANES:
-        problem = f"the file names no road file, but {len(names)} roads and {most} lanes"
-        raise unsupported(problem, f"RoadNetwork/LogicFile, or a road of up to {MOST_LANES} lanes")
-    name = names.pop() if names else ""
+    if len(names) > 1:
+        problem = f"the file names no road file, but the roads {', '.join(sorted(names))}"
+        raise unsupported(problem, "RoadNetwork/LogicFile, or places on one road")
+    lanes = [
+        abs(whole(one, key))
+        for one in scenario.iter()
+        for key in ("laneId", "dLane", "value")
+        if key in one.attrib and (key != "value" or one.tag.endswith("TargetLane"))
+    ]
+    # Steps from lane to lane lead at most so far.
+    most = min(max(sum(lanes), 1), MOST_LANES)
     widths: dict[int, Cubics] = {
-        sign * lane: [(0.0, (WIDTH, 0.0, 0.0, 0.0))]
-        for lane in range(1, most + 1)
-        for sign in (1, -1)
+        lane: [(0.0, (WIDTH, 0.0, 0.0, 0.0))] for lane in range(-most, most + 1) if lane
     }
-    line = Piece(Pose.at(0.0, 0.0, 0.0), LONG)
+    name = "".join(names)
+    line = [Piece(Pose.at(0.0, 0.0, 0.0), LONG)]
     offsets: Cubics = [(0.0, (0.0,) * 4)]
-    road = Road(name, [line], "", [(0.0, widths)], offsets, {}, is_left_hand=False, is_level=True)
+    road = Road(name, line, "", [(0.0, widths)], offsets, {}, is_left_hand=False, is_level=True)
     return Network("the road", {name: road}, {})
 
 

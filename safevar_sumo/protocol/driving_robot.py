@@ -114,13 +114,11 @@ class DrivingRobot:
         if self._sample or not self._profile_end:
             return seen
         is_led = self._profile_until > 0
-        highest = self._at_highest
-        return seen._replace(
-            gap=np.where(is_led, np.inf, seen.gap),
-            speed=np.where(is_led, highest.speed, seen.speed),
-            throttle=np.where(is_led, highest.throttle, seen.throttle),
-            brake=np.where(is_led, highest.brake, seen.brake),
-        )
+        shown = {
+            name: np.where(is_led, getattr(self._at_highest, name), getattr(seen, name))
+            for name in ("speed", "throttle", "brake")
+        }
+        return seen._replace(gap=np.where(is_led, np.inf, seen.gap), **shown)
 
     def lead(self, state: State) -> State:
         """The state after a step, in which the vehicle has the speed of its profile and its pedals

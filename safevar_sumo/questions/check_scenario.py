@@ -116,9 +116,9 @@ def _draw(played: Played, ego: str, name: str, answer: Answer) -> Figure:
 
     figure, axes = new_figure(name, 1, 1, (8.0, 4.0))
     axis = axes[0][0]
-    rest = played.duration / STEP - len(played.profile)
-    way = STEP * (played.profile.sum() + played.speed * rest)
-    paths = {ego: np.array([0.0, way]) - played.ego.length / 2}
+    led = played.profile - played.speed
+    way = played.speed * played.duration + STEP * float(led.sum())
+    paths = {ego: np.array([-played.ego.length / 2, way])}
     for one in played.others:
         paths[one.name] = (one.place - played.start.place) / played.start.facing
     for label, path in paths.items():

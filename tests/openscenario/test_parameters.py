@@ -92,13 +92,20 @@ def test_a_file_without_a_road_gets_a_straight_one(tmp_path: Path, network: str)
     assert driven(OpenScenario(str(file))).outcome[0] == "passed"
 
 
-def test_a_file_without_a_road_names_one_road_of_some_lanes(tmp_path: Path) -> None:
-    for place, problem in (("1000", "1 roads and 1000 lanes"), ("-1", "2 roads and 2 lanes")):
-        other = at(-2, 90).replace('roadId="1"', 'roadId="7"') if place == "-1" else at(1000, 90)
-        file = Path(write(tmp_path, car=(teleport(other), speed(10))))
-        file.write_text(file.read_text().replace(NO_ROAD, ""))
-        with pytest.raises(InputError, match=f"the file names no road file, but {problem}"):
-            play(str(file), {})
+@pytest.mark.parametrize(
+    ("place", "problem"),
+    [
+        (at(1000, 90), "road 1 has no lane 1000 at s = 90.0 m"),
+        (at(-2, 90).replace('roadId="1"', 'roadId="7"'), "no road file, but the roads 1, 7"),
+    ],
+)
+def test_a_file_without_a_road_names_one_road_of_some_lanes(
+    tmp_path: Path, place: str, problem: str
+) -> None:
+    file = Path(write(tmp_path, car=(teleport(place), speed(10))))
+    file.write_text(file.read_text().replace(NO_ROAD, ""))
+    with pytest.raises(InputError, match=problem):
+        play(str(file), {})
 
 
 VEHICLES = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="0"/><Catalog name="{}">{}</Catalog></OpenSCENARIO>"""
