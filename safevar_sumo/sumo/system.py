@@ -250,12 +250,11 @@ def assemble(study: Study) -> System:
 
 
 def _check_speed(scenario: Scenario, nominal: Nominal) -> None:
-    """Refuse a file's scene that is faster than the original vehicle, or than any test."""
-    name = getattr(scenario, "ego", "")
-    speed = float(np.max([scenario.test_speed or 0.0, scenario.profile_highest]))
-    highest = min(nominal.max_speed, MAX_TEST_SPEED) if name else np.inf
+    """Refuse an Ego of a file that is faster than the original vehicle, or than any test."""
+    speed = float(np.max(scenario.profile_highest))
+    highest = min(nominal.max_speed, MAX_TEST_SPEED) if speed else np.inf
     if speed > highest:
-        problem = f"{name} drives at {speed:.1f} m/s, faster than the study's vehicle can"
+        problem = f"Ego drives at {speed:.1f} m/s, faster than the study's vehicle can"
         raise InputError("", problem, f"at most {highest:.1f} m/s, or another vehicle")
 
 

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads import Ads
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import STEP, Played, play
 from safevar_sumo.scenarios import OpenScenario
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import refused, run
 from tests.openscenario.writing import (
     AT_ONCE,
@@ -149,6 +153,7 @@ def test_the_first_brake_ends_the_profile(tmp_path: Path) -> None:
     assert driven(OpenScenario(file), releases).trace.speed.max() == pytest.approx(20, abs=0.3)
 
 
+@pytest.mark.slow
 def test_the_driving_system_sees_while_the_robot_leads(tmp_path: Path) -> None:
     """A car stands 30 m ahead: the system brakes before Ego is at its test speed."""
     car = teleport(at(-1, 84)), speed(0)
@@ -165,3 +170,32 @@ def test_an_ego_that_is_faster_than_the_vehicle_is_bad_input(tmp_path: Path) -> 
     study = tmp_path / "mine.toml"
     study.write_text(f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\n')
     refused("simulate", str(study), message=("Ego drives at 60.0 m/s", "at most 55.6 m/s"))
+
+
+@pytest.mark.slow
+def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -> None:
+    """Ego accelerates to v in 5 s; a Car stands 200 m ahead. At 6 m/s Ego does not get there."""
+    parameter = '<ParameterDeclaration name="v" parameterType="double" value="15"/>'
+    faster = event(speed("$v", "linear", "time", 5), AT_ONCE.format(1))
+    file = write(
+        tmp_path,
+        groups=group(faster, actor="Ego"),
+        ego=STANDING,
+        stop=STOP,
+        parameters=parameter,
+        car=(teleport(at(-1, 250)), speed(0)),
+    )
+    search = {"v": {"lower": 5.0, "upper": 30.0, "original": 15.0}}
+    system = assemble(load_study("wear", scenario={"file": file, "search": search}))
+    members = system.characteristics
+    values = 6.0, 15.0, 22.0, 30.0
+    settings = np.tile(members.original, (len(values), 1))
+    settings[:, members.names.index("v")] = values
+    searched = drive_and_score(system, settings)
+    in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
+    assert np.array_equal(searched.f_safe, in_sumo.f_safe, equal_nan=True)
+    assert searched.outcome.tolist() == ["invalid-test", "stopped", "stopped", "collision"]
+    for value, degree in list(zip(values, searched.f_safe, strict=True))[1:]:
+        own = assemble(load_study("wear", scenario={"file": file, "values": {"v": value}}))
+        alone = drive_and_score(own, own.characteristics.original[np.newaxis])
+        assert alone.f_safe[0] == pytest.approx(degree, abs=1e-9)
