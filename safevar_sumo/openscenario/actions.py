@@ -13,8 +13,10 @@ import numpy as np
 from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
 from safevar_sumo.openscenario.document import (
+    IS_READ,
     Element,
     attribute,
+    is_number,
     number,
     part,
     truth,
@@ -337,7 +339,24 @@ def leaf_of(action: Element) -> Element:
 def is_ignored(action: Element) -> bool:
     """Whether an action moves nobody."""
     leaf = leaf_of(action) if action.tag in ("PrivateAction", "GlobalAction") else action
-    return leaf.tag in IGNORED
+    return leaf.tag in IGNORED and IS_READ not in leaf.attrib
+
+
+def _set_value(player: Player, action: Element) -> None:
+    """ParameterAction, VariableAction: other values in conditions from now on."""
+    is_variable = action.tag == "VariableAction"
+    values = player.variables if is_variable else player.document.values
+    name = attribute(action, "variableRef" if is_variable else "parameterRef").lstrip("$")
+    change = part(action, "*")
+    if change.tag == "SetAction":
+        values[name] = attribute(change, "value")
+        return
+    rule = part(change, "Rule/*")
+    if name not in values or not is_number(values[name]):
+        problem = f"{action.tag}: {name} is no number that is declared"
+        raise unsupported(problem, one_of(filter(lambda one: is_number(values[one]), values)))
+    by, old = number(rule, "value"), float(values[name])
+    values[name] = repr(old + by if rule.tag == "AddValue" else old * by)
 
 
 def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
@@ -353,6 +372,9 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
     if action.tag == "GlobalAction":
         if leaf.tag == "EntityAction" and leaf.find("DeleteEntityAction") is not None:
             player.other(leaf).deleted = player.now  # class DeleteEntityAction
+            return []
+        if leaf.tag in ("ParameterAction", "VariableAction"):
+            _set_value(player, leaf)
             return []
         raise unsupported(
             f"{part(leaf, '*').tag if len(leaf) else leaf.tag} is not supported",

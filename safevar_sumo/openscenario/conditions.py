@@ -135,7 +135,7 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
 
 
 def parameter_condition(player: Player, condition: Element, window: slice) -> Array:
-    """ParameterCondition, VariableCondition: both do not change in a run."""
+    """ParameterCondition, VariableCondition: both change by actions alone, so not in a window."""
     is_variable = condition.tag == "VariableCondition"
     values = player.variables if is_variable else player.document.values
     name = attribute(condition, "variableRef" if is_variable else "parameterRef").lstrip("$")

@@ -32,6 +32,10 @@ MOST_DEPTH = 100
 """Elements within each other at most; the schemas need fewer than 30."""
 
 
+IS_READ = "isRead"
+"""Attribute of an action that sets what a condition compares."""
+
+
 def unsupported(problem: str, legal: str) -> InputError:
     """The refusal of a file, in a sentence that names the element."""
     return InputError(FILE_KEY, problem, legal)

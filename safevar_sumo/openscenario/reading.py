@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.openscenario.document import (
+    IS_READ,
     Element,
     Parameter,
     attribute,
@@ -78,6 +79,7 @@ def read(file: str, given: Mapping[str, str]) -> Document:
         )
     check_unique([attribute(one, "name") for one in root.findall("Entities/*")], "entities")
     _name_members(root)
+    _mark_values(root)
     logic = root.find("RoadNetwork/LogicFile")
     name = "" if logic is None else logic.get("filepath", "")
     road = name and beside(folder, name)
@@ -87,6 +89,17 @@ def read(file: str, given: Mapping[str, str]) -> Document:
             "the path of an OpenDRIVE file, from the file that names it",
         )
     return Document(root, parameters, values, list(dict.fromkeys(catalogs)), road)
+
+
+def _mark_values(root: Element) -> None:
+    """Mark actions that set a parameter or a variable which a condition compares."""
+    for kind in ("parameter", "variable"):
+        reference = f"{kind}Ref"
+        conditions = root.iter(f"{kind.capitalize()}Condition")
+        names = {one.get(reference, "").lstrip("$") for one in conditions}
+        for action in root.iter(f"{kind.capitalize()}Action"):
+            if action.get(reference, "").lstrip("$") in names:
+                action.set(IS_READ, "true")
 
 
 def _name_members(root: Element) -> None:
@@ -162,7 +175,9 @@ def _referenced(child: Element, values: Values, library: Library) -> Element:
     """The entry of a catalog that a reference names, with the values that it assigns."""
     catalog, name = (literal(attribute(child, key), values) for key in ("catalogName", "entryName"))
     if (catalog, name) in library.entered:
-        raise unsupported(f"the entry {name} of the catalog {catalog} refers to itself", "another")
+        raise unsupported(
+            f"the entry {name} of the catalog {catalog} refers to itself", "an entry that does not"
+        )
     file, found = _entry(catalog, name, library.folders)
     # Another value of a parameter may choose any of them.
     is_chosen = "$" in attribute(child, "catalogName")

@@ -20,6 +20,7 @@ from tests.openscenario.writing import (
     speed,
     teleport,
     trigger,
+    watching,
     write,
 )
 from tests.scenarios.holding import driven
@@ -152,3 +153,42 @@ def test_a_missing_catalog_is_refused_where_the_file_needs_it(
         assert caught.value.legal
     else:
         assert play(file, {}).others[0].shape.length == 4
+
+
+CHANGES = {
+    "set": "<SetAction value='5'/>",
+    "add": "<ModifyAction><Rule><AddValue value='2'/></Rule></ModifyAction>",
+    "multiply": "<ModifyAction><Rule><MultiplyByValue value='${5 / 3}'/></Rule></ModifyAction>",
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("kind", ["Parameter", "Variable"])
+def test_an_action_changes_what_conditions_compare(tmp_path: Path, kind: str, change: str) -> None:
+    """v is 3 in the file, and 5 after 4 s."""
+    reference = f"{kind.lower()}Ref='v'"
+    action = f"<{kind}Action {reference}>{CHANGES[change]}</{kind}Action>"
+    sets = event("", AT_ONCE.format(4), "Sets", "parallel").replace(
+        "<PrivateAction></PrivateAction>", f"<GlobalAction>{action}</GlobalAction>"
+    )
+    is_five = f"<{kind}Condition {reference} rule='greaterThan' value='4.9'/>"
+    slows = event(speed(0, "linear", "rate", 2), is_five, "Slows")
+    file = Path(write(tmp_path, sets, slows, parameters=V.format("v", "double", "3", "")))
+    variable = "<VariableDeclarations><VariableDeclaration name='v' variableType='double' value='3'/></VariableDeclarations>"
+    file.write_text(file.read_text().replace("<CatalogLocations>", f"{variable}<CatalogLocations>"))
+    (car,) = play(str(file), {}).others
+    assert car.speed[[400, 500]].tolist() == [10, pytest.approx(8, abs=0.03)]
+
+
+def test_what_no_condition_compares_may_wait_for_a_collision(tmp_path: Path) -> None:
+    collision = watching(
+        "Ego", "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>"
+    )
+    action = f"<GlobalAction><ParameterAction parameterRef='v'>{CHANGES['set']}</ParameterAction></GlobalAction>"
+    logs = event("", collision, "Logs").replace("<PrivateAction></PrivateAction>", action)
+    parameters = V.format("v", "double", "3", "")
+    played = play(write(tmp_path, logs, parameters=parameters), {})
+    assert played.remarks == []
+    compared = event(speed(5), "<ParameterCondition parameterRef='v' rule='equalTo' value='5'/>")
+    with pytest.raises(InputError, match="the event Logs waits for a CollisionCondition of Ego"):
+        play(write(tmp_path, logs, compared, parameters=parameters), {})
