@@ -75,8 +75,9 @@ class DrivingRobot:
         self._vehicle = vehicle
         self._points = points
         self._profile_until = self._of_points([point.scenario.profile_until for point in points], n)
-        self._profile_end = float(self._profile_until.max())
-        if self._profile_end:  # it holds the test speed later
+        self.profile_end = float(self._profile_until.max())
+        """When the last profile of speeds ends [s]; 0 without one."""
+        if self.profile_end:  # it holds the test speed later
             is_led = self._profile_until > 0
             highest = self._of_points([point.scenario.profile_highest for point in points], n)
             self._at_highest = vehicle.at_start(prepared, np.where(is_led, highest, state.speed))
@@ -111,7 +112,7 @@ class DrivingRobot:
         """What the driving system sees; at first, where the robot will lead, the highest speed of
         the profile and nobody: so a cruise control is set to that speed.
         """
-        if self._sample or not self._profile_end:
+        if self._sample or not self.profile_end:
             return seen
         is_led = self._profile_until > 0
         shown = {
@@ -125,7 +126,7 @@ class DrivingRobot:
         hold that speed; sensors and commands keep their history.
         """
         time = self._sample * self._step
-        if time - self._step >= self._profile_end:
+        if time - self._step >= self.profile_end:
             return state
         is_led = self._is_driving & (time - self._step < self._profile_until)
         profiles = [

@@ -108,7 +108,9 @@ def drive(
 
             # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
-            state = robot.lead(vehicle.advance(prepared, state, command))
+            state = vehicle.advance(prepared, state, command)
+            if robot.profile_end:
+                state = robot.lead(state)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
