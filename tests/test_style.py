@@ -21,9 +21,9 @@ LONGEST = 60
 LONGER = {"questions/repair/__init__.py:repair", "openscenario/actors.py:move"}
 """Functions that may still be longer."""
 DOUBLE = {
-    *("Crossing", "FloatArray", "compare", "evaluate", "LaneLine", "SpeedProfile"),  # OpenSCENARIO
+    *("Crossing", "FloatArray", "compare", "evaluate"),  # of OpenSCENARIO
     *("Failure", "Failures", "FullBraking", "Parameter", "Search"),  # of repair and tolerance
-    *("columns_of", "find_failures", "parameters_of"),
+    *("columns_of", "parameters_of"),
 }
 """Names that may still have several meanings."""
 

@@ -27,7 +27,7 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.verification import drive_again
 
 
-class LaneLine(NamedTuple):
+class DrawnLane(NamedTuple):
     """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; or the outline of
     an area, and 0.
 
@@ -102,7 +102,7 @@ class Comparison:
         return network_for(self.point.scenario)
 
     @cached_property
-    def road(self) -> tuple[LaneLine, ...]:
+    def road(self) -> tuple[DrawnLane, ...]:
         """The lanes of the network."""
         return read_road(self.network)
 
@@ -180,7 +180,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
     )
 
 
-def read_road(network: NetworkFiles) -> tuple[LaneLine, ...]:
+def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
     """Read the lanes of one copy of a network, as netconvert built it."""
     lanes = []
     for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
@@ -194,7 +194,7 @@ def read_road(network: NetworkFiles) -> tuple[LaneLine, ...]:
             for_persons = lane.get("allow", "").split() == ["pedestrian"]
             width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
             lanes.append(
-                LaneLine(kind or ("path" if for_persons else "road"), np.array(line), width)
+                DrawnLane(kind or ("path" if for_persons else "road"), np.array(line), width)
             )
     return tuple(lanes)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.replay.comparison import Comparison, LaneLine
+from safevar_sumo.replay.comparison import Comparison, DrawnLane
 from safevar_sumo.scenarios import VUT
 
 SEAM_WIDTH = 0.12
@@ -67,7 +67,7 @@ class FlatScene:
     comparison: Comparison
     step: float
     sample_count: int
-    road: tuple[LaneLine, ...]
+    road: tuple[DrawnLane, ...]
     bodies: tuple[FlatBody, ...]
     left_ends: FloatArray
     bottom: float
@@ -204,7 +204,7 @@ def strip_corners(start: FloatArray, end: FloatArray, width: float) -> FloatArra
     return np.array([start + half_width, end + half_width, end - half_width, start - half_width])
 
 
-def lane_outlines(lane: LaneLine, width: float) -> Iterator[FloatArray]:
+def lane_outlines(lane: DrawnLane, width: float) -> Iterator[FloatArray]:
     """Polygons that show a lane, shape (P, 2) each: an area, the stripes of a crossing, or strips
     of this width [m].
     """

@@ -25,7 +25,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     Metres,
     ProtocolTest,
     Seconds,
-    SpeedProfile,
+    TargetProfile,
     lateral_offset,
 )
 from safevar_sumo.scenarios.tracks import (
@@ -176,8 +176,8 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         return self._profile.speed_at
 
     @property
-    def _profile(self) -> SpeedProfile:
-        return SpeedProfile(
+    def _profile(self) -> TargetProfile:
+        return TargetProfile(
             0.0,
             np.float64(self.parameter("target_speed")) * KMH,  # 0 of a target that stands
             self.parameter("acceleration_distance"),

@@ -25,7 +25,7 @@ from safevar_sumo.scenarios.euro_ncap import (
     Metres,
     ProtocolTest,
     Seconds,
-    SpeedProfile,
+    TargetProfile,
     lateral_offset,
 )
 from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize, Speed, Track
@@ -85,7 +85,7 @@ class _Start(NamedTuple):
     impact_left: Quantity
     distance_to_impact: Quantity
     time_to_impact: Quantity
-    profile: SpeedProfile
+    profile: TargetProfile
 
     @classmethod
     def of(cls, test: Crossing) -> _Start:
@@ -113,7 +113,7 @@ class _Start(NamedTuple):
                 )
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance = speed * time
-            profile = SpeedProfile(begin=0.0, speed=speed, run_up=0.0)
+            profile = TargetProfile(begin=0.0, speed=speed, run_up=0.0)
         else:
             distance = (lateral_start + impact_lateral) * test.start_share
             run_up = test.parameter("acceleration_distance")
@@ -121,7 +121,7 @@ class _Start(NamedTuple):
             time = test.time_to_impact or np.maximum(
                 TIME_TO_IMPACT, np.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP
             )
-            profile = SpeedProfile.with_arrival(distance, time - test.lead, speed, run_up)
+            profile = TargetProfile.with_arrival(distance, time - test.lead, speed, run_up)
 
         # Where it meets the vehicle.
         extent = direction.extent(BODIES[test.parameter("target")])

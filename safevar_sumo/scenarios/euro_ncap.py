@@ -98,7 +98,7 @@ TESTS = msgspec.convert(shipped_table("scenarios/euro_ncap.toml"), dict[str, Tes
 """The rows of the protocol's table: euro_ncap.toml beside this module."""
 
 
-class SpeedProfile(NamedTuple):
+class TargetProfile(NamedTuple):
     """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to
     `speed` [m/s] within `run_up` [m]; or of N targets, in arrays.
     """
@@ -110,7 +110,7 @@ class SpeedProfile(NamedTuple):
     @classmethod
     def with_arrival(
         cls, distance: Quantity, time: Quantity, speed: Quantity, run_up: float
-    ) -> SpeedProfile:
+    ) -> TargetProfile:
         """The profile that covers `distance` [m] by `time` [s].
 
         Past the run-up, distance = speed * (time - begin) - run_up.

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, Trace
 from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.euro_ncap import SpeedProfile
+from safevar_sumo.scenarios.euro_ncap import TargetProfile
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.tracks import VUT_WIDTH
 from safevar_sumo.shipped import NETWORKS
@@ -60,7 +60,7 @@ def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_i
 def test_a_target_arrives_in_time_with_any_speed_profile(
     speed: float, run_up: float, rest: float, time: float
 ) -> None:
-    profile = SpeedProfile.with_arrival(run_up + rest, time, speed, run_up)
+    profile = TargetProfile.with_arrival(run_up + rest, time, speed, run_up)
     assert profile.travelled(time) == pytest.approx(run_up + rest)
     assert profile.travelled(profile.begin) == 0
     if run_up:

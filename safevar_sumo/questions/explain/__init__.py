@@ -21,7 +21,7 @@ from safevar_sumo.questions.explain.failures import (
     TO_EXPLAIN,
     Population,
     choose_failures,
-    find_failures,
+    gather_failures,
 )
 from safevar_sumo.questions.explain.margins import MARGINS, margins_table
 from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS
@@ -126,7 +126,7 @@ def explain(
     study = evaluator.study
 
     # The failures, and the minimal causes of a sample of them.
-    population = find_failures(subject, evaluator, solution, unsafe)
+    population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)
     is_caused = _has_causes(population, study)

@@ -80,7 +80,7 @@ class Population(NamedTuple):
     left_out: FloatArray
 
 
-def find_failures(
+def gather_failures(
     subject: Study | Case,
     evaluator: Evaluator,
     solutions: Sequence[str],
