@@ -38,7 +38,7 @@ hypothesis.settings.load_profile("default")
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 WORKER_PROCESSES = local.ProcessWorker
 FITS = 2
-"""Number of fitted vehicle models of the study `slippery`, with which conclusions are repeated."""
+"""Number of parameter sets of the study `slippery`, with which conclusions are repeated."""
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"

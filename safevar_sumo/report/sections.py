@@ -208,7 +208,7 @@ def tested(study: ReportedStudy) -> Answer:
 
 def facts(study: ReportedStudy) -> list[tuple[str, str]]:
     """What a signature under the page is about, each with its name: the results, how they were
-    computed, and of the first answer the scope, the fits and the attack.
+    computed, and how the limits of the first answer were tested.
     """
     # Which results, and by which versions.
     numbers = {
@@ -221,14 +221,15 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
 
     # How the limits were tested.
     if numbers.get("fits_tried"):
-        rows.append(("Fits", f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"))
+        text = f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"
+        rows.append(("Parameter sets", text))
     if numbers.get("attacked") and numbers.get("at_most") is not None:
-        uncertainty = (
-            f", and at most {100 * numbers['at_most']:.2f} % of evenly drawn cars are unsafe"
+        text = (
+            f"{numbers['attacked']:,} simulations that search for a counterexample; at most"
+            f" {100 * numbers['at_most']:.2f} % of uniformly sampled vehicles within the limits are"
+            " unsafe"
         )
-        rows.append(
-            ("Attack", f"{numbers['attacked']:,} simulations aimed at the limits{uncertainty}")
-        )
+        rows.append(("Falsification", text))
 
     # What moves limits alone, and how far the parameter sets differ.
     tables = study.answers[0].tables if numbers else {}
@@ -236,7 +237,8 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         rows.append(
             (
                 "Limits alone",
-                f"one fit at scanned points, then all: {_moved_limits(tables['uncertainty'])}",
+                "one parameter set at scanned points, then all:"
+                f" {_moved_limits(tables['uncertainty'])}",
             )
         )
     if "fits" in tables and numbers.get("margin"):
@@ -244,7 +246,7 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         if len(corners):
             text = (
                 f"the worst corner of all limits keeps {corners.min():.2f} to {corners.max():.2f}"
-                " m, fit by fit"
+                " m, depending on the parameter set"
             )
             rows.append(("Spread", text))
     return rows
@@ -310,7 +312,7 @@ def name_and_sentence(models: Mapping[str, type], name: str) -> str:
 
 
 def trust(study: ReportedStudy) -> Answer:
-    """How far the results agree with published data and with other fitted vehicle models, and what
+    """How far the results agree with published data and with other parameter sets, and what
     they leave out.
     """
     # Agreement with published simulations.

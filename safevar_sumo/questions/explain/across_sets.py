@@ -24,7 +24,7 @@ from safevar_sumo.records import BoolArray, Evaluations
 MAX_SHARE_SETS = 8
 """Maximum number of sets with which shares are computed; the first sets lie farthest apart."""
 MAX_VEHICLES = 300
-"""Maximum number of vehicles, drawn at random, that are simulated with each set; those that collide
+"""Maximum number of sampled vehicles that are simulated with each set; those that collide
 show which collisions the reference drivers avoid.
 """
 MAX_FAILURES = 20

@@ -1,5 +1,5 @@
-"""Encounters that wear has cost: those that a competent driver avoids in the new car, and no longer
-in the worn one.
+"""Encounters that wear has cost: those that a competent driver avoids in the original vehicle, and
+no longer in the worn one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point
 from safevar_sumo.study import Domain, ModelTable, Study
 
 BORDERS = "borders of what a competent driver avoids"
-"""The stage of progress."""
+"""The phase of progress."""
 STEPS, REFINING = 12, (12, 12)
 """Number of values between which a border is sought; and of parts into which each round divides
 what is between two neighbours.
@@ -32,13 +32,13 @@ COLUMNS: Columns = {
     "border_before": Column(
         "",
         "value from which on, up to the study's own, a competent driver avoids the collision in the"
-        " new car",
+        " original vehicle",
         ".4g",
     ),
     "border_now": Column(
         "",
-        "the same in the car with this change, above the study's value if need be; undefined if at"
-        " no value",
+        "the same in the vehicle with this change, which may be above the study's value; undefined"
+        " if at no value",
         ".4g",
     ),
 }
@@ -75,12 +75,12 @@ def find_moved_borders(evaluator: Evaluator, causes: Iterable[Cause]) -> pd.Data
         study = _with_border(evaluator.study, point, border, domain)
         with_driver = evaluator.for_study(study, verified=0)
 
-        # The new car, and cars with one change each.
+        # The original vehicle, and vehicles with one change each.
         vehicle = original[evaluator.characteristics.of_vehicle]
-        cars = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[
+        vehicles = np.where(np.eye(len(vehicle), dtype=bool), furthest[: len(vehicle)], vehicle)[
             changed
         ]
-        before, *borders = _borders(with_driver, np.vstack([vehicle, cars]), domain).tolist()
+        before, *borders = _borders(with_driver, np.vstack([vehicle, vehicles]), domain).tolist()
         title = f"{point.name or evaluator.study.scenario.model}: {border} [{domain.unit}]"
         moved = [pair for pair in zip(changed, borders, strict=True) if pair[1] > before]
         rows += [
@@ -128,26 +128,28 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
     )
 
 
-def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArray:
-    """The values from which on each of M cars, shape (M, n), is safe, up to the study's own value
-    or, if it is unsafe there, up to the first safe value above; shape (M,). The first car is the
-    new one.
+def _borders(evaluator: Evaluator, vehicles: FloatArray, domain: Domain) -> FloatArray:
+    """The values from which on each of M vehicles, shape (M, n), is safe, up to the study's own value
+    or, if it is unsafe there, up to the first safe value above; shape (M,). The first vehicle is
+    the original one.
 
-    It is the domain's lower end if a car is safe from there on, and infinite if no value from the
+    It is the domain's lower end if a vehicle is safe from there on, and infinite if no value from the
     study's own on is.
     """
     values = np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original])
 
     def are_unsafe(settings: FloatArray) -> BoolArray:
-        """Which settings collide, or are in an encounter that is infeasible, as the new car
-        collides.
+        """Which settings collide, or are in an encounter that is infeasible, as the original
+        vehicle collides.
         """
         runs = evaluator.evaluate(settings, BORDERS, ignore_constraints=True)
         return np.asarray(runs.collided | (runs.outcome == Outcome.INFEASIBLE))
 
-    # Every car at the same values, which cover the domain.
-    grid = np.column_stack([np.repeat(cars, len(values), axis=0), np.tile(values, len(cars))])
-    fails = are_unsafe(grid).reshape(len(cars), len(values))
+    # Every vehicle at the same values, which cover the domain.
+    grid = np.column_stack(
+        [np.repeat(vehicles, len(values), axis=0), np.tile(values, len(vehicles))]
+    )
+    fails = are_unsafe(grid).reshape(len(vehicles), len(values))
     # A border is below the first safe value from the study's own on.
     own = int(np.searchsorted(values, domain.original))
     is_never_safe = fails[:, own:].all(axis=1)
@@ -157,8 +159,8 @@ def _borders(evaluator: Evaluator, cars: FloatArray, domain: Domain) -> FloatArr
     # It lies between the last unsafe value below that one and its neighbour.
     rows = np.flatnonzero(fails.any(axis=1) & ~is_never_safe)
     last = len(values) - 1 - np.argmax(fails[rows, ::-1], axis=1)
-    starts = np.column_stack([cars[rows], values[last + 1]])
-    ends = np.column_stack([cars[rows], values[last]])
+    starts = np.column_stack([vehicles[rows], values[last + 1]])
+    ends = np.column_stack([vehicles[rows], values[last]])
     if len(rows):
         borders[rows] = find_boundaries(starts, ends, are_unsafe, REFINING).safe[:, -1]
     return borders
