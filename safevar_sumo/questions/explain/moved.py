@@ -129,12 +129,12 @@ def _with_border(study: Study, point: Point, border: str, domain: Domain) -> Stu
 
 
 def _borders(evaluator: Evaluator, vehicles: FloatArray, domain: Domain) -> FloatArray:
-    """The values from which on each of M vehicles, shape (M, n), is safe, up to the study's own value
-    or, if it is unsafe there, up to the first safe value above; shape (M,). The first vehicle is
-    the original one.
+    """The values from which on each of M vehicles, shape (M, n), is safe, up to the study's own
+    value or, if it is unsafe there, up to the first safe value above; shape (M,). The first vehicle
+    is the original one.
 
-    It is the domain's lower end if a vehicle is safe from there on, and infinite if no value from the
-    study's own on is.
+    It is the domain's lower end if a vehicle is safe from there on, and infinite if no value from
+    the study's own on is.
     """
     values = np.sort([*np.linspace(domain.lower, domain.upper, STEPS), domain.original])
 

@@ -215,8 +215,8 @@ def statistics_tables(
 def moved_table(evaluator: Evaluator, causes_of: Sequence[Sequence[Cause]]) -> pd.DataFrame:
     causes = [] if is_rated(evaluator.study) else [cause for group in causes_of for cause in group]
     title = (
-        "Avoidable in the original vehicle, no longer in this one: a competent driver, who reacts to"
-        " any braking of a leader"
+        "Avoidable in the original vehicle, no longer in this one: a competent driver who reacts"
+        " to any braking of a leader"
     )
     return tabulate(title, MOVED_COLUMNS, find_moved_borders(evaluator, causes))
 
