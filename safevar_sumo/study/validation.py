@@ -139,7 +139,8 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     places = dict[str, str]()
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
-            inner_keys = getattr(_intended_type(field.type, {}), "__struct_fields__", ())
+            kind_of_field = getattr(field.type, "__origin__", field.type)  # without its marks
+            inner_keys = getattr(kind_of_field, "__struct_fields__", ())
             places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
     places |= {name: name for name in own}
     nearest = [key] if key in places else get_close_matches(key, places, n=1)

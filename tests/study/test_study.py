@@ -55,6 +55,7 @@ MISTAKES = [
     ('[spread]\n"ads.parameters.brake_gap" = ["a"]', "spread.'ads.parameters.brake_gap'[0] = 'a'"),
     ("[repair.brake_gap]\nlow = 1", "repair.parameters.brake_gap.low: there is no such key"),
     ("seed = 3", "seed: there is no such key; did you mean 'search.seed'?"),
+    ("margin = 3", "margin: there is no such key; did you mean 'scenario.margin'?"),
     (
         "[search]\nevaluatons = 5",
         "search.evaluatons: there is no such key; did you mean 'evaluations'?",
