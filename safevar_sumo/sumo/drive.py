@@ -114,9 +114,9 @@ def drive(
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
-    return _runs(
-        points, outcomes, robot, contacts, trace=trace, encounter=observer.encounter(trace)
-    )
+    encounter = observer.encounter(trace)
+    outcomes.ended = outcomes.classify()
+    return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
 
 
 def _runs(
@@ -130,7 +130,7 @@ def _runs(
 ) -> SimulationRuns:
     """The runs of N vehicles that have ended."""
     # In an encounter in which nothing happens, all but a collision says nothing.
-    ended = outcomes.classify()
+    ended = outcomes.ended
     size = len(ended) // len(points)
     is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (
         ended != Outcome.COLLISION
@@ -289,6 +289,8 @@ class _Outcomes:
         self.is_checked = np.ones(n, dtype=bool)
         self.collision_speed = np.full(n, np.nan)
         self.warning_ttc = np.full(n, np.nan)
+        self.ended: npt.NDArray[np.str_] = np.array([])
+        """The outcomes of all runs, once no run is open."""
         self._has_moved = np.zeros(n, dtype=bool)
         self._has_stopped = np.zeros(n, dtype=bool)
         self._is_over = np.zeros(n, dtype=bool)
