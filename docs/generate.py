@@ -226,10 +226,15 @@ def characteristics() -> str:
         for key, row in study.vehicle.characteristics.items():
             model = study.vehicle.model
             seen.setdefault(
-                (model, key), (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart)
+                (model, key),
+                (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart, row.measurement),
             )
     return _table(
-        ("vehicle", "characteristic", "unit", "what it is", "real-world counterpart"), seen.values()
+        (
+            *("vehicle", "characteristic", "unit", "name (what it is)", "real-world counterpart"),
+            "how a workshop measures it",
+        ),
+        seen.values(),
     )
 
 

@@ -137,6 +137,8 @@ def test_every_shipped_characteristic_is_explained(name: str) -> None:
     for key, row in load_study(name).vehicle.characteristics.items():
         assert row.meaning, key
         assert row.counterpart, key
+        assert row.measurement, key
+        assert row.remedy, key
 
 
 def test_the_map_of_the_code_names_every_package_and_no_drawing_a_folder_that_is_not_there() -> (

@@ -12,7 +12,7 @@ import msgspec
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import check_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -32,7 +32,7 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import DESCRIPTIONS
 from safevar_sumo.study import free_parameters, study_names, unit_text
 from safevar_sumo.terminal import open_progress
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
     from safevar_sumo.plugins.check.trials import Extent
@@ -43,16 +43,27 @@ SCENARIO: Columns = DESCRIBED | {"search": "what [scenario.search] may vary, and
 STUDIES: Columns = NAME | {
     key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")
 }
-VEHICLES: Columns = {
-    "vehicle": "vehicle",
-    "name": "characteristic",
+DOMAINS: Columns = {
     "unit": "its unit",
     "original": Column("as unit", "value of the original vehicle", "g"),
     "lower": Column("as unit", "lower end of its domain", "g"),
     "upper": Column("as unit", "upper end of its domain", "g"),
+}
+VEHICLES: Columns = {
+    "vehicle": "vehicle",
+    "name": "characteristic",
+    **DOMAINS,
     "threshold": Column("as unit", "smallest change that the filter keeps", "g"),
     "meaning": Column("", "what it is", is_shown=False),
     "counterpart": Column("", "what it is in other models", is_shown=False),
+}
+CHARACTERISTICS: Columns = {
+    **NAME,
+    "short_name": "its name in sentences",
+    **DOMAINS,
+    "measurement": Column("", "how a workshop measures it", is_shown=False),
+    "remedy": Column("", "what to do with a vehicle beyond its limit", is_shown=False),
+    "workshop": "how a workshop measures it, and what to do with a vehicle beyond its limit",
 }
 METRICS_TITLE = "Metrics; TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
 WEATHER: Columns = NAME | {
@@ -91,11 +102,20 @@ FINDINGS: Columns = {
     algorithms=DESCRIBED,
     metrics=DESCRIBED,
     objectives=DESCRIBED,
+    characteristics=CHARACTERISTICS,
 )
-def list_models(kind: str | None = None) -> Answer:
+def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with
     KIND only these, or your own scenario, package.module:Name.
+
+    KIND may also be characteristics, followed by a study: what it varies, how a workshop measures
+    it, and what to do with a vehicle beyond its limit.
     """
+    if kind == "characteristics":
+        return _list_characteristics(study)
+    if study is not None:
+        raise InputError("study", f"{kind} of {study!r}", "a study after characteristics alone")
+
     # The user's own scenario, or everything.
     own = {}
     if kind is not None and ":" in kind:
@@ -121,7 +141,7 @@ def list_models(kind: str | None = None) -> Answer:
         ),
     }
     if kind is not None:
-        check_name("kind", f"there is no {kind!r} to list", kind, tables)
+        check_name("kind", f"there is no {kind!r} to list", kind, [*tables, "characteristics"])
         tables = {kind: tables[kind]}
     counts = ", ".join(f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items())
     verdict = f"A study can name {', '.join(own) or counts}."
@@ -129,6 +149,34 @@ def list_models(kind: str | None = None) -> Answer:
     return Answer(
         question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables
     )
+
+
+def _list_characteristics(name: str | None) -> Answer:
+    """The characteristics of a study, with how a workshop measures them."""
+    if name is None:
+        raise InputError("study", "no study", "its name or file, as in list characteristics wear")
+    study = read_study(name)
+    items = CharacteristicSet.of(study).vehicle
+    rows = [
+        (*(getattr(item, key) for key in [*CHARACTERISTICS][:-1]), _in_a_workshop(item))
+        for item in items
+    ]
+    title = f"Characteristics of {study.name}"
+    return Answer(
+        question="list",
+        study=study,
+        verdict=f"{study.name} varies {number_of(len(rows), 'characteristic')}.",
+        numbers={"passed": True},
+        tables={"characteristics": tabulate(title, CHARACTERISTICS, rows)},
+    )
+
+
+def _in_a_workshop(item: Characteristic) -> str | None:
+    """How a workshop measures a characteristic, and what it does beyond the limit; None if the
+    study says neither.
+    """
+    remedy = f"beyond its limit: {item.remedy}" if item.remedy else ""
+    return "; ".join(filter(None, (item.measurement, remedy))) or None
 
 
 def _studies() -> Iterator[tuple[str, ...]]:

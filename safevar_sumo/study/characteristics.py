@@ -30,7 +30,8 @@ class Domain(Table, frozen=True, kw_only=True):
     """What a search varies: its `original` value, and the ends `lower` and `upper` of its domain,
     in `unit`.
 
-    `meaning` describes it and begins with a short name (up to the first comma or bracket).
+    `meaning` describes it; `short_name` is its name in sentences, by default the beginning of
+    `meaning` up to the first comma or bracket.
     """
 
     unit: str
@@ -38,6 +39,7 @@ class Domain(Table, frozen=True, kw_only=True):
     lower: float
     upper: float
     meaning: ShortText = ""
+    short_name: ShortText = ""
 
     def __post_init__(self) -> None:
         if max(abs(self.original), abs(self.lower), abs(self.upper)) > MAX_MAGNITUDE:
@@ -52,12 +54,16 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
-    """One row of the characteristics table; f_diff multiplies its change by `weight`, and
-    `counterpart` is the part of a real vehicle that sets it.
+    """One row of the characteristics table; f_diff multiplies its change by `weight`.
+
+    `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
+    measures it, and `remedy` what to do with a vehicle beyond its limit.
     """
 
     weight: PositiveNumber = 1.0
     counterpart: ShortText = ""
+    measurement: ShortText = ""
+    remedy: ShortText = ""
 
 
 def unit_text(unit: str, layout: str = " {}") -> str:

@@ -35,7 +35,10 @@ class Characteristic:
     (`is_scenario`); all quantities are in `unit`.
 
     A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names
-    the part of a real vehicle that determines it; both may be empty.
+    the part of a real vehicle that determines it, `measurement` says how a workshop measures it,
+    and `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in
+    sentences: by default the meaning up to the first comma or bracket, such as `engine drag`, or
+    the name if the study gives no meaning.
     """
 
     name: str
@@ -45,15 +48,16 @@ class Characteristic:
     upper: float
     weight: float = 1.0
     meaning: str = ""
+    short_name: str = ""
     counterpart: str = ""
+    measurement: str = ""
+    remedy: str = ""
     is_scenario: bool = False
 
-    @property
-    def short_name(self) -> str:
-        """The meaning up to the first comma or bracket, such as `engine drag`; the name if the
-        study gives no meaning.
-        """
-        return re.split(r"[,;(]", self.meaning)[0].strip() or self.name
+    def __post_init__(self) -> None:
+        if not self.short_name:
+            beginning = re.split(r"[,;(]", self.meaning)[0].strip()
+            object.__setattr__(self, "short_name", beginning or self.name)
 
     @property
     def words(self) -> str:

@@ -166,7 +166,7 @@ def test_a_claim_is_shown_as_a_claim() -> None:
 
 def test_the_verdict_names_what_is_lost_and_where() -> None:
     answer = answer_about(np.nan, hits(numbers("CPNCO", "standard", "night"), 40.0))
-    assert answer.verdict.startswith("With tread depth of the tyres 3 mm the vehicle loses 1.")
+    assert answer.verdict.startswith("With tread depth 3 mm the vehicle loses 1.")
     assert (
         " of them in CPNCO night. Euro NCAP tests on a dry road; this rating has the weather"
         in answer.verdict
