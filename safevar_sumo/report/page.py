@@ -1,5 +1,5 @@
-"""The page about results: for each study first what decides, then replays, then each answer,
-folded.
+"""The page about results: for each study first the sheet of a workshop and what decides, then
+replays, then each answer, folded.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from safevar_sumo.questions.tolerance.by_parameter import usual_values
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, replays, tested, trust
+from safevar_sumo.report.sheet import sheet_of
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -288,8 +289,8 @@ def make_page(
 
 
 def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonObject:
-    """One study for the template. On its front stand all verdicts, the first of them with its first
-    table; answers to the same question follow it with theirs.
+    """One study for the template: first the sheet of a workshop. On the front stand all verdicts,
+    the first of them with its first table; answers to the same question follow it with theirs.
     """
     # All answers to the first question lead.
     anchor = f"study-{number}"
@@ -306,6 +307,7 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "is_bad": any(answer.failures for answer in answers),
         "shortfall": study.case.shortfall,
         "later_changes": study.later_changes,
+        "sheet": sheet_of(study),
         "facts": facts(study),
         "front": [_on_front(answer) for answer in leading],
         "verdicts": [*sections[len(leading) : len(answers)], sections[-1]],

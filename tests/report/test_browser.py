@@ -224,8 +224,10 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
     try:
         assert browser.execute_script(TOO_WIDE) == []
         assert browser.execute_script(BROKEN_NAMES) == []
-        front = "return document.querySelector('.front').getBoundingClientRect().bottom + scrollY"
-        assert browser.execute_script(front) <= A4["height"], "verdicts and limits are one page"
+        bottom = "return document.querySelector('.sheet').getBoundingClientRect().bottom + scrollY"
+        assert browser.execute_script(bottom) <= A4["height"], "the sheet of a workshop is one page"
+        height = "return document.querySelector('.front').getBoundingClientRect().height"
+        assert browser.execute_script(height) <= A4["height"], "verdicts and limits are one page"
         every = "return document.querySelectorAll(arguments[0]).length"
         seen = (
             "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
