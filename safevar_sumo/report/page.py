@@ -308,6 +308,8 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "shortfall": study.case.shortfall,
         "later_changes": study.later_changes,
         "sheet": sheet_of(study),
+        "tables": study.case.study,
+        "versions": study.versions,
         "facts": facts(study),
         "front": [_on_front(answer) for answer in leading],
         "verdicts": [*sections[len(leading) : len(answers)], sections[-1]],

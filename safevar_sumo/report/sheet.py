@@ -1,10 +1,10 @@
 """The first sheet of a page: limits for a workshop and an operator, without statistics, which can
-be printed alone.
+be printed alone. Its sentences stand in `web/sheet.html.j2`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from typing import Any
 
@@ -26,16 +26,7 @@ PARTS: Columns = {
 }
 UNSAID = "the study does not say"
 DIGITS = 16
-"""Number of hexadecimal digits of the digest."""
-NEXT_STEP = (
-    "If a part is beyond its limit, do what the last column says before the driving system drives"
-    " again."
-)
-NOT_TESTED = (
-    "Speeds, roads, weather and traffic other than those above.",
-    "Parts that the table does not name, such as steering, suspension and single wheels.",
-    "A real vehicle: all of these tests are simulations of a model.",
-)
+"""Number of hexadecimal digits of the digest that are printed."""
 
 
 def sheet_of(study: ReportedStudy) -> JsonObject | None:
@@ -52,62 +43,40 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         return None
 
     # What decides, the table, and what it is about.
+    numbers = limits.numbers
     missing = _why_no_limits(limits)
-    doubt = "" if missing else _why_unsigned(study, limits)
-    rows = [] if missing else list(_parts(study, limits))
-    original = [] if missing else list(_original_in_words(study, limits))
-    if by_value is not None:
-        original.append(_own_limit_in_words(study, by_value))
+    rows = () if missing else _parts(study, limits)
+    *tests, road = numbers.get("scope", "").split("; ")
+    wider = limits.tables.get("wider")
     return {
-        "sentences": [missing or doubt] if missing or doubt else list(_conclusion(limits)),
+        "missing": missing,
+        "is_signed": not (missing or numbers["rough"] or study.later_changes),
+        "unsafe": Unsafe.parse(numbers.get("unsafe", "collision")),
         "parts": Markup(html_table(tabulate("Parts and their limits", PARTS, rows))),
-        "facts": list(_facts(study, limits, original)),
-        "not_tested": [] if missing else list(_not_tested(study, limits)),
-        "is_signed": not (missing or doubt),
+        "numbers": numbers,
+        "tests": "; ".join(tests),
+        "road": road,
+        "wider": [] if wider is None else wider.to_dict("records"),
+        "own_limit": None if by_value is None else _own_limit(by_value),
+        "command": limits.command,
+        "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
+        "ranges": [
+            f"{item.short_name} {_domain_in_words(item)}"
+            for item in study.case.characteristics.vehicle
+        ],
     }
 
 
 def _why_no_limits(limits: Answer) -> str:
     """Why nobody may work by this sheet, in sentences; empty if there are joint limits."""
-    why = ""
+    numbers = limits.numbers
     if "limits" not in limits.tables:
-        why = limits.verdict
-    elif not limits.numbers["driven"]:
-        why = SENTENCE_END.split(limits.verdict)[0]
-    elif limits.numbers["kept"] is False:
-        why = f"{'; '.join(limits.failures)}."
-    elif not limits.numbers["box"]:
-        why = (
-            "No limits were found that hold at the same time. The next sheet has limits of single"
-            " parts, which hold only if all other parts are as in the original vehicle."
-        )
-    return f"Do not use this sheet. {why[:1].upper()}{why[1:]}" if why else ""
-
-
-def _why_unsigned(study: ReportedStudy, limits: Answer) -> str:
-    """Why limits are not to be signed, in sentences; empty if they may be."""
-    if limits.numbers["rough"]:
-        return (
-            "Do not use this sheet: its limits are rough. Ask tolerance again without --attack for"
-            " limits that can be signed."
-        )
-    if study.later_changes:
-        return (
-            "Do not use this sheet: files or versions have changed since the results. Run the study"
-            " again for limits that can be signed."
-        )
-    return ""
-
-
-def _conclusion(limits: Answer) -> Iterator[str]:
-    unsafe = Unsafe.parse(limits.numbers["unsafe"])
-    is_safe = f"is safe (unsafe: {unsafe.description})"
-    avoids = "avoids a collision" if unsafe.is_collision else is_safe
-    yield (
-        "All of these limits hold at the same time: every simulated vehicle within them"
-        f" {avoids} in the tests named below."
-    )
-    yield NEXT_STEP
+        return limits.verdict
+    if not numbers["driven"]:
+        return SENTENCE_END.split(limits.verdict)[0]
+    if numbers["kept"] is False:
+        return f"Not kept: {'; '.join(limits.failures)}."
+    return "" if numbers["box"] else "No limits were found that hold at the same time."
 
 
 def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
@@ -126,14 +95,12 @@ def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
 
 def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     """A limit: `at least 3 mm`. An end of the domain is none, unless both are."""
-    low, high = (
-        (item.original, item.original)
-        if row is None
-        else (row["together_low"], row["together_high"])
+    if row is None or row["together_low"] == row["together_high"]:
+        return f"{item.original:.10g}{item.suffix}, as in the original vehicle"
+    sides = (
+        ("at least", row["together_low"], item.lower),
+        ("at most", row["together_high"], item.upper),
     )
-    if low == high:
-        return f"{low:.10g}{item.suffix}, as in the original vehicle"
-    sides = (("at least", low, item.lower), ("at most", high, item.upper))
     ends = [f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last]
     return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
 
@@ -142,69 +109,17 @@ def _domain_in_words(item: Characteristic) -> str:
     return f"{item.lower:.10g} to {item.upper:.10g}{item.suffix}"
 
 
-def _facts(
-    study: ReportedStudy, limits: Answer, original: Sequence[str]
-) -> Iterator[tuple[str, str]]:
-    """What the limits are about, and how the sheet is told from others, each with its name."""
-    own = study.case.study
-    yield (
-        "Vehicle and study",
-        (f"vehicle {own.vehicle.model}, driving system {own.ads.model}, study {own.name}"),
-    )
-    if scope := limits.numbers.get("scope"):
-        *tests, road = scope.split("; ")
-        yield "Tests and speeds", "; ".join(tests)
-        yield "Road and light", road
-    if "wider" in limits.tables and not _why_no_limits(limits):
-        for row in limits.tables["wider"].to_dict("records"):
-            found = "no failure of these limits was found." if row["kept"] else row["verdict"]
-            yield "Wider tests", f"In the study {row['study']} ({row['scope']}), {found}"
-    if original:
-        yield "Original vehicle", " ".join(original)
-    yield "Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())
-    if limits.command:
-        digest = sha256(limits.render("json").encode()).hexdigest()[:DIGITS]
-        yield "Digest", f"{digest} (first digits of: {limits.command} --json | sha256sum)"
-
-
-def _original_in_words(study: ReportedStudy, limits: Answer) -> Iterator[str]:
-    """How far the original vehicle itself is safe, and which encounters count."""
-    scenario = study.case.study.scenario
-    if scenario.search:
-        yield (
-            "Only encounters count in which the original vehicle itself keeps at least"
-            f" {scenario.margin:g} m. In all others the limits promise nothing."
-        )
-    elif limits.numbers["margin"]:
-        yield f"It keeps at least {limits.numbers['margin']:g} m in all of these tests."
-    else:
-        yield "It is safe in all of these tests."
-
-
-def _own_limit_in_words(study: ReportedStudy, by_value: Answer) -> str:
-    """Up to which value of a parameter the original vehicle keeps its margin."""
-    scenario = study.case.study.scenario
-    margin = scenario.margin if scenario.search else by_value.numbers["margin"]
+def _own_limit(by_value: Answer) -> JsonObject:
+    """Up to which value of a parameter the original vehicle keeps its margin, and touches
+    nobody.
+    """
     frame = by_value.table("limits")
     column = next(name for name in map(str, frame) if name.startswith("by_"))
-    parameter = column.removeprefix("by_").replace("_", " ")
-    unit = unit_text(columns_of(frame)[column].unit)
-    keeps = by_value.numbers["original_keeps_up_to"]
-    safe = by_value.numbers["original_safe_up_to"]
-    if keeps is None:
-        return f"It keeps {margin:g} m at no {parameter} that was tested."
-    if keeps == frame[column].max():
-        return f"It keeps {margin:g} m up to {parameter} {keeps:.10g}{unit}, the highest tested."
-    touches = "" if safe in (None, keeps) else f", and touches nobody up to {safe:.10g}{unit}"
-    return f"It keeps {margin:g} m only up to {parameter} {keeps:.10g}{unit}{touches}."
-
-
-def _not_tested(study: ReportedStudy, limits: Answer) -> Iterator[str]:
-    """What the limits say nothing about, in sentences."""
-    if limits.numbers["contacts_left_out"]:
-        yield "Encounters in which the original vehicle keeps too little: contacts occur there."
-    yield from NOT_TESTED
-    ranges = "; ".join(
-        f"{item.short_name} {_domain_in_words(item)}" for item in study.case.characteristics.vehicle
-    )
-    yield f"Values outside the tested ranges: {ranges}."
+    return {
+        "parameter": column.removeprefix("by_").replace("_", " "),
+        "unit": unit_text(columns_of(frame)[column].unit),
+        "margin": by_value.numbers["margin"],
+        "keeps": by_value.numbers["original_keeps_up_to"],
+        "safe": by_value.numbers["original_safe_up_to"],
+        "greatest": frame[column].max(),
+    }
