@@ -50,17 +50,11 @@ def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) ->
     assert rows["tau"]["short_name"] == "tau", "without any text, its key is its name"
     printed = run("list", "characteristics", str(file)).stdout
     assert "mass: weighbridge; beyond its limit: leave the trailer" in printed
-    native, ours = (evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file)))
-    assert native == ours
+    keys = [evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file))]
+    assert keys[0] == keys[1]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("characteristics", "study: no study\nexpected: its name or file"),
-        ("studies wear", "study: studies of 'wear'\nexpected: a study after characteristics alone"),
-        ("characteristcs", "did you mean 'characteristics'?"),
-    ],
-)
-def test_a_list_that_there_is_not_is_refused(arguments: str, message: str) -> None:
-    refused("list", *arguments.split(), message=(message,))
+def test_a_list_that_there_is_not_is_refused() -> None:
+    refused("list", "characteristics", message=("study: no study\nexpected: its name or file",))
+    refused("list", "studies", "wear", message=("a study after characteristics alone",))
+    refused("list", "characteristcs", message=("did you mean 'characteristics'?",))

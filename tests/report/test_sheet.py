@@ -22,7 +22,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 from tests.report.test_report import words_of
 
 STUDY = read_study("wear")
-CHARACTERISTICS = CharacteristicSet.of(STUDY).vehicle
+CHARACTERISTICS = CharacteristicSet.of(STUDY)
 LIMITS = [
     ("treadDepth", 3.0, 8.0, "at least 3 mm"),
     ("brakeTorque", 0.85, 1.0, "at least 0.85"),
@@ -63,9 +63,9 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
 
 def sheet_with(*answers: Answer, changes: tuple[str, ...] = ()) -> str:
     """The words of the sheet; empty without a sheet."""
-    case = SimpleNamespace(characteristics=CharacteristicSet.of(STUDY))
+    case = SimpleNamespace(characteristics=CHARACTERISTICS)
     study: Any = SimpleNamespace(case=case, answers=answers, later_changes=changes)
-    parts = {"name": "wear", "title": "A worn car", "anchor": "a", "versions": {"libsumo": "1.28"}}
+    parts = {"name": "wear", "title": "A car", "anchor": "a", "versions": {"libsumo": "1.28"}}
     template = template_environment(TEMPLATE_FOLDER).get_template("sheet.html.j2")
     sheet = sheet_of(study)
     if sheet is None:
@@ -112,9 +112,9 @@ def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
     assert ("at least 3 mm" in sheet) is has_table
 
 
-def test_without_an_answer_the_sheet_has_the_reason_and_nobody_who_asked_has_none() -> None:
-    refused = replace(answer_of(), numbers={}, tables={})
-    assert f"Do not use this sheet. {VERDICT}" in sheet_with(refused)
+def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked() -> None:
+    sheet = sheet_with(replace(answer_of(), numbers={}, tables={}))
+    assert f"Do not use this sheet. {VERDICT}" in sheet
     assert sheet_with() == ""
 
 
