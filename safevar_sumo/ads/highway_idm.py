@@ -36,7 +36,8 @@ class HighwayIdm(ScalarAds):
         self._me, self._front = (vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
 
     def drive(self, seen: Observation) -> tuple[float, float]:
-        me, front = self._me, self._front
+        me = self._me
+        front = self._front
         me.speed = float(seen.speed)
         if self.target_speed is None:
             self.target_speed = me.speed
