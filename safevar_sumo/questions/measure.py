@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.errors import check_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.study import Study
@@ -45,6 +45,10 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     )
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
+    allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)
+    if allows and not unsafe.is_of_impacts:
+        problem = f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact"
+        raise InputError("unsafe", problem, "a bound on impact_excess, or collision")
 
     # And counts the point that is worst by it.
     if matrix is not None and not unsafe.is_of_points:

@@ -103,6 +103,12 @@ def test_a_study_that_contradicts_itself_is_refused(text: str, message: str, in_
     assert len(told.strip().splitlines()) <= 2
 
 
+def test_another_metric_is_no_criterion_where_impacts_are_allowed(in_tmp: Path) -> None:
+    told = run("explain", "r152", "--unsafe", "drac > 6", expect=2).stderr
+    assert "tests of study 'r152' allow an impact" in told
+    assert len(told.strip().splitlines()) == 2
+
+
 @pytest.mark.slow
 def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> None:
     answer = sv.rules("r152", samples=40, pool=InlinePool())
