@@ -24,7 +24,7 @@ import textwrap
 import traceback
 from collections.abc import Iterator
 from contextlib import chdir, redirect_stdout
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +98,7 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
     names = dict[str, Any]()
     printed, is_shortened = "", False
     found = blocks(page)
-    for block, below in zip(found, [*found[1:], None], strict=True):
+    for block, below in zip_longest(found, found[1:]):
         if block.comment.startswith("output"):
             if not is_shortened or not options_of_tests:
                 yield block, shortened(printed, block.comment)

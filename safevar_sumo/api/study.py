@@ -335,9 +335,10 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         for item in case.characteristics
         if by_name[item.name] != item.original
     ]
-    listed = ", ".join(texts) if len(texts) <= MAX_LISTED else "the table lists them"
-    number = number_of(len(texts), "change")
-    return f"{counts} With the fewest changes the vehicle {ending}: {number} ({listed}).", rows
+    listed = f"{number_of(len(texts), 'change')}, which the table lists"
+    if len(texts) <= MAX_LISTED:
+        listed = ", ".join(texts) or "no change at all"
+    return f"{counts} With the fewest changes the vehicle {ending}: {listed}.", rows
 
 
 def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:
