@@ -22,6 +22,7 @@ import sys
 import tempfile
 import textwrap
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import chdir, redirect_stdout
 from itertools import pairwise, zip_longest
@@ -144,6 +145,7 @@ def _run(line: str, added: str, code: int) -> str:
 
 def main() -> None:
     """Fill in the outputs of pages."""
+    warnings.simplefilter("ignore")  # as the filters of pytest do
     for page in sys.argv[1:] or PAGES:
         text = (ROOT / page).read_text(encoding="utf-8")
         with tempfile.TemporaryDirectory() as folder, chdir(folder):

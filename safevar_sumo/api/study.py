@@ -301,8 +301,8 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         return "The search found no solution.", []
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
-        f"The search found {len(solutions)} different solutions; {len(failures)} of them are unsafe"
-        f" ({case.unsafe.description})."
+        f"The search found {len(solutions)} different solutions; {len(failures)} of them are"
+        f" unsafe: {case.unsafe.description}."
     )
     counts = " ".join([counts, *demanded_in_words(results.study)])
     if failures.empty:
