@@ -222,7 +222,9 @@ def tests_between(
     every axis that a study may search, at all values of other axes; none without such an axis.
     `cells` are tests in place of the study's.
     """
-    if study.matrix is None or study.matrix.protocol or study.scenario.search or cells == []:
+    if study.matrix is None or study.matrix.protocol or study.matrix.point:
+        return []
+    if study.scenario.search or cells == []:
         return []
     if cells:
         study = _with_tests(study, cells)

@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 
+from msgspec.structs import replace as replace_in
+
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
@@ -15,8 +17,15 @@ from safevar_sumo.sumo.system import assemble
 
 
 def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
-    """The tests of a study's matrix, each with its points."""
+    """The tests of a study's matrix, each with its points; of a study at one point that test
+    alone.
+    """
     assert study.matrix is not None
+    if study.matrix.point:
+        values = dict(points[0].parameters)
+        test = next(test for test in study.matrix.tests if test.name == values["test"])
+        over = {name: [values[name]] for name in test.over}
+        return [(replace_in(test, over=over), [*points])]
     rest = iter(points)
     tests = []
     for test in study.matrix.tests:

@@ -18,14 +18,15 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify, falsify_all
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.models import Model, tests_between as tests_in_cells
+from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
+from safevar_sumo.sumo.matrix import at_point, drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import ROOT, InlinePool, files_of, refused, run
@@ -363,3 +364,16 @@ def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> Non
     assert "Up to 10 km/h no limit holds: the original vehicle itself is unsafe" in answer.verdict
     assert answer.numbers["kept"] is False
     assert answer.failures == ("the limits hold up to none of these values, not 10 km/h",)
+
+
+@pytest.mark.parametrize(
+    ("point", "scope"),
+    [
+        ("CPNA, speed 40, impact_location 25, wet", "crossing (CPNA) at 40 km/h, impact location"),
+        ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; road wet"),
+    ],
+)
+def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
+    study = at_point(load_study("wear"), point)
+    assert scope_of(study).startswith(scope)
+    assert tests_in_cells(study, np.random.default_rng(0), None) == []
