@@ -22,9 +22,9 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
     """
     assert study.matrix is not None
     if study.matrix.point:
-        values = dict(points[0].parameters)
-        test = next(test for test in study.matrix.tests if test.name == values["test"])
-        over = {name: [values[name]] for name in test.over}
+        of_point = dict(points[0].parameters)
+        test = next(test for test in study.matrix.tests if test.name == of_point["test"])
+        over = {name: [of_point[name]] for name in test.over}
         return [(replace_in(test, over=over), [*points])]
     rest = iter(points)
     tests = []
