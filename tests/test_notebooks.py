@@ -158,8 +158,8 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     ) == (5, 3)
     printed = "".join(_texts(notebook))
     for result in (
-        "may go to their joint limits at the same time",
-        "An unsafe vehicle has a probability of",
+        "joint limits hold at the same time",
+        "a vehicle is unsafe with a probability of",
         "of them have ",
     ):
         assert result in printed

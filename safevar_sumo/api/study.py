@@ -155,8 +155,8 @@ def study(
     if unsafe is not None and (status or dry_run):
         raise InputError(
             "unsafe",
-            f"beside {'status' if status else 'dry_run'}, which judge no vehicle",
-            "a search",
+            f"beside --{'status' if status else 'dry-run'}, which judges no vehicle",
+            "the option with a search, or without it",
         )
     if status:
         return summarise(load(directory))
@@ -335,7 +335,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         for item in case.characteristics
         if by_name[item.name] != item.original
     ]
-    listed = f"{number_of(len(texts), 'change')}, which the table lists"
+    listed = f"{number_of(len(texts), 'change')}, which the second table lists"
     if len(texts) <= MAX_LISTED:
         listed = ", ".join(texts) or "no change at all"
     return f"{counts} With the fewest changes the vehicle {ending}: {listed}.", rows

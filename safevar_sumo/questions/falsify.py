@@ -39,9 +39,9 @@ class Falsification(NamedTuple):
 
     Attributes
     ----------
-    settings, judges, left
-        Settings, shape (K, n), the numbers of the judges that they met, and what they leave, shape
-        (K,).
+    settings, judges, robustness
+        Settings, shape (K, n), the numbers of the judges that they met, and their robustness, shape
+        (K,): below 0 where they are unsafe.
     simulated
         Number of settings that were simulated, each in one encounter and one model.
     """
@@ -231,12 +231,14 @@ def _worst(
     ones.
     """
     is_counted = np.isfinite(robustness)
-    all_left = np.concatenate([found.robustness, robustness[is_counted]])
-    worst = np.argsort(all_left, kind="stable")[: max(PARENTS, np.count_nonzero(all_left < 0))]
+    all_robustness = np.concatenate([found.robustness, robustness[is_counted]])
+    worst = np.argsort(all_robustness, kind="stable")[
+        : max(PARENTS, np.count_nonzero(all_robustness < 0))
+    ]
     return Falsification(
         np.concatenate([found.settings, settings[is_counted]])[worst],
         np.concatenate([found.judges, numbers[is_counted]])[worst],
-        all_left[worst],
+        all_robustness[worst],
         found.simulated + len(robustness),
     )
 

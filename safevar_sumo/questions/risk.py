@@ -211,9 +211,10 @@ def _probability_in_words(study: Study, failures: int, total: int) -> str:
     ]
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
+    vehicles = f"{failures:,} of {total:,} vehicles"
     return (
-        f"An unsafe vehicle has a probability of {share} if vehicles vary as specified, {manner}:"
-        f" {failures:,} of {total:,} are unsafe"
+        f"With the variation that the study states ({manner}), a vehicle is unsafe with a"
+        f" probability of {share}: {vehicles}"
     )
 
 

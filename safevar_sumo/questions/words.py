@@ -18,7 +18,7 @@ OUTCOME_VERBS = {
     Outcome.TIMEOUT: "is still under way at the end",
     Outcome.NEVER_MOVED: "never moves",
     Outcome.SIMULATOR_ERROR: "could not be simulated",
-    Outcome.INVALID_TEST: "violates the test's speed tolerance",
+    Outcome.INVALID_TEST: "ends as an invalid test",
     Outcome.INFEASIBLE: "violates a constraint",
 }
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""

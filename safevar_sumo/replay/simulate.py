@@ -401,10 +401,10 @@ def _sweep(
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     where = " in the original encounter" if study.scenario.search else ""
     original = (
-        f"The original vehicle{where}: {evaluations.outcome[0]}, safety degree"
+        f"The original vehicle{where} ends as {evaluations.outcome[0]}, with a safety degree of"
         f" {evaluations.f_safe[0]:.2f}."
     )
-    counts = f"{collisions} of {number_of(len(frame), 'setting')} collide."
+    counts = f"Of {number_of(len(frame), 'setting')}, {collisions or 'none'} collide."
     return Answer(
         question="simulate",
         study=study,
@@ -431,7 +431,9 @@ def _verdict(simulation: Simulation) -> list[str]:
     """How the original vehicle and, if it differs, the simulated one end."""
     least = simulation.scoring.safe_original
     name = simulation.pair.point.name
-    where = f"At {name} the" if name else "The" if least is None else "In this encounter the"
+    where = "The" if least is None else "In this encounter the"
+    if name:
+        where = f"In the test case {name}, the"
     verdict = [f"{where} original vehicle {simulation.original.verdict}."]
     if simulation.setting != simulation.original.setting:
         verdict.append(

@@ -54,8 +54,8 @@ vehicle; and, in a study that searches its scenario, the column of their encount
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
     Outcome.INVALID_TEST: (
-        "left the tolerance of a test's speed before the driving system acted: they are neither "
-        "failures nor successes"
+        "are invalid tests: they left the tolerance of the test's speed, the driving system acted"
+        " before the test allows it, or nothing happened; they are neither failures nor successes"
     ),
 }
 """Outcomes of settings about which nothing is known."""

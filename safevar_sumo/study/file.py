@@ -192,9 +192,10 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
         tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
-        raise InputError(
-            path, f"cannot be read as TOML: {reason}", "the path of a study file"
-        ) from None
+        legal = "the path of a study file"
+        if isinstance(error, tomllib.TOMLDecodeError):
+            legal = "TOML, in which each key stands once"
+        raise InputError(path, f"cannot be read as TOML: {reason}", legal) from None
 
     # Where it comes from.
     folders = () if path.parent == STUDIES else (str(path.resolve().parent),)

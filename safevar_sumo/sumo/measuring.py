@@ -87,7 +87,13 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)  # sentences have both
     names = [objective.name for objective in objectives]
     if len(set(names)) < len(names):
-        problem = f"search.objectives: one of {', '.join(names)} is named twice"
+        twice = next(name for name in names if names.count(name) > 1)
+        written = [
+            repr(text)
+            for text, name in zip(study.search.objectives, names, strict=True)
+            if name == twice
+        ]
+        problem = f"search.objectives: {' and '.join(written)} are the same objective"
         raise InputError("", problem, one_of([*shipped]))
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))

@@ -191,7 +191,7 @@ def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
         "--status",
         "--unsafe",
         "drac > 5",
-        message=("--unsafe: beside status",),
+        message=("--unsafe: beside --status",),
     )
 
 

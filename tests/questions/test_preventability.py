@@ -122,7 +122,7 @@ def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None
     assert (
         _avoided_in_words(many)
         == "Of 1000 collisions in the same vehicle, a competent driver would have avoided nearly"
-        " all and full braking at the first possible moment would have avoided all."
+        " all and full braking at the first possible moment all."
     )
     assert _avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
 

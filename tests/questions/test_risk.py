@@ -90,7 +90,7 @@ def test_first_order_indices_of_correlated_characteristics() -> None:
         {"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04
     )
     assert frame["degree_total"].isna().all()
-    assert "if vehicles vary as specified, a normal, b normal and c normal" in answer.verdict
+    assert "(a normal, b normal and c normal), a vehicle is unsafe" in answer.verdict
 
 
 def drawn(**variation: dict[str, Any]) -> FloatArray:

@@ -242,7 +242,8 @@ def test_limits_that_other_fits_move_are_uncertain() -> None:
         (
             "a <= 6",
             (
-                "All limits hold in one vehicle model: no vehicle that was tested within them is"
+                "All limits hold with one parameter set of the vehicle model: no vehicle that was"
+                " tested within them is"
                 " unsafe (collision)."
             ),
         ),

@@ -85,7 +85,8 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         "Road and lightroad wet, by day",
         "Original vehicleThe original vehicle keeps at least 0.3 m in all of these tests.",
         "Versionslibsumo 1.28",
-        "Values outside the tested ranges: tread depth 1.6 to 8 mm; brake torque 0.5 to 1;",
+        "Values outside the tested ranges: tread depth 1.6 to 8 mm; brake torque as a share of a"
+        " new vehicle's 0.5 to 1;",
         "Name and signature:",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
     ):

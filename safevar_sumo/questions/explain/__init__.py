@@ -290,7 +290,7 @@ def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     shares = avoided_shares(verdicts)
     titles = {
         LETTER: "a competent driver would have avoided {}",
-        FULL: "full braking at the first possible moment would have avoided {}",
+        FULL: "full braking at the first possible moment {}",
     }
     phrases = [
         title.format(share_in_words(shares[name]))

@@ -92,12 +92,13 @@ def find_smallest_robust_failure(
 
 
 def robustness_in_words(share: float) -> str:
-    """How robust a failure is, by the share of its unsafe neighbours: `The cause is robust: 84 %
-    of neighbouring vehicles are unsafe, too.`; empty if unknown.
+    """How robust a failure is, by the share of its unsafe neighbours: `The cause does not depend
+    on exact values: 84 % of vehicles with slightly different values are unsafe, too.`; empty if
+    unknown.
     """
     if np.isnan(share):
         return ""
-    phrase = f"{100 * share:.0f} % of neighbouring vehicles are unsafe, too"
+    phrase = f"{100 * share:.0f} % of vehicles with slightly different values are unsafe, too"
     if share >= MIN_ROBUST_SHARE:
-        return f"The cause is robust: {phrase}."
-    return f"The cause is borderline: only {phrase}."
+        return f"The cause does not depend on exact values: {phrase}."
+    return f"The cause depends on exact values: only {phrase}."

@@ -308,8 +308,8 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
         else ""
     )
     return (
-        f" It holds in {survivors.fits} of {count} fits of the vehicle, attacked with"
-        f" each{broken}{left_out}."
+        f" It holds in {survivors.fits} of {count} parameter sets of the vehicle model, each with a"
+        f" search for counterexamples{broken}{left_out}."
     )
 
 

@@ -313,7 +313,7 @@ def _sentences(
     tried = len(members) + len(left_out)
     fits = f"in {len(members)} of {tried} parameter sets"
     if tried == 1:
-        fits = "in one vehicle model"
+        fits = "with one parameter set of the vehicle model"
     counted = _of_counted(search, by.values[-1])
     of_counted = f"{counted}," if counted else ""
     hold = "hold" if search.budget else "were only scanned"

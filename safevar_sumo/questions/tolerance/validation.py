@@ -72,10 +72,9 @@ class Validator:
         self.evaluator = evaluator
         self.seed = models[0].evaluator.study.search.seed
         self._proofs = 0
+        """Number of upper bounds so far."""
         self._failing = {0}
-        """Number of upper bounds so far; numbers of the models in which corners of earlier boxes
-        failed, which come first.
-        """
+        """Numbers of the models in which corners of earlier boxes failed: these come first."""
 
     def validate(self, box: Box, attempt: int) -> Validation:
         """Validate a box in all models: the first part that finds failures is the last."""

@@ -161,10 +161,10 @@ def _box_in_words(
                 " none."
             )
         return
-    where = "in one vehicle model"
+    where = "with one parameter set of the vehicle model"
     if len(models.members) > 1:
         where = f"in {count} of {len(models.members)} parameter sets"
-    decision = "All characteristics may go to their joint limits at the same time"
+    decision = "All joint limits hold at the same time"
     if has_limits:
         decision = "The joint limits below hold" if together.broken else "All limits hold"
     if not budget:
