@@ -23,7 +23,7 @@ from safevar_sumo.questions.ask import PointName, Range
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
-from safevar_sumo.questions.words import number_of, points_in_words
+from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
@@ -401,10 +401,11 @@ def _sweep(
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     where = " in the original encounter" if study.scenario.search else ""
     original = (
-        f"The original vehicle{where} ends as {evaluations.outcome[0]}, with a safety degree of"
-        f" {evaluations.f_safe[0]:.2f}."
+        f"The original vehicle{where}"
+        f" {ending_in_words(evaluations.outcome[0], evaluations.f_safe[0], system.contact)}."
     )
-    counts = f"Of {number_of(len(frame), 'setting')}, {collisions or 'none'} collide."
+    verb = "collide" if collisions > 1 else "collides"
+    counts = f"Of {number_of(len(frame), 'setting')}, {collisions or 'none'} {verb}."
     return Answer(
         question="simulate",
         study=study,
