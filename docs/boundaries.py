@@ -13,10 +13,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.figures import BLUE, DEGREE_LABEL, VERMILION, new_figure
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.study import load_study
-from safevar_sumo.sumo.matrix import evaluate
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 
 SIZE = (6.4, 3.4)
@@ -37,7 +37,7 @@ def _evaluate(columns: Mapping[str, FloatArray]) -> Evaluations:
     settings = np.tile(characteristics.original, (count, 1))
     for name, values in columns.items():
         settings[:, characteristics.names.index(name)] = values
-    return evaluate(system, settings)
+    return drive_and_score(system, settings)
 
 
 def draw_sawtooth(path: str) -> None:

@@ -168,10 +168,10 @@ def _steps(
     least = np.full(n_judges, np.inf)
     generation = 0
     while found.simulated < budget:
-        # The first generation holds all known settings, each later one at most `size`.
-        number = min(
-            max(size, len(settings)) if generation == 0 else size, budget - found.simulated
-        )
+        # The first generation holds all known settings, and random ones; more known settings than
+        # a generation get as many random ones beside them.
+        is_large = generation == 0 and len(settings) > size
+        number = min(len(settings) + size if is_large else size, budget - found.simulated)
         choice = np.arange(n_judges) if generation == 0 else _pair(least, generation)
         settings, numbers = _new_ones(box, settings, numbers, choice, number, seen, rng)
         if not len(settings):

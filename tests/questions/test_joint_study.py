@@ -177,7 +177,7 @@ def test_limits_together_are_not_wider_than_those_alone() -> None:
     answer = json_of(
         "tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius"
     )
-    assert re.search(LEFT_OUT.format("those"), answer["verdict"])
+    assert re.search(LEFT_OUT.format("those"), answer["tested"])
     rows: list[dict[str, Any]] = answer["tables"]["limits"]["rows"]
     assert any(one["alone_low"] > 30 for one in rows)
     for one in rows:
@@ -207,7 +207,7 @@ def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody
     counts = system.measuring.scoring.violation(evaluations) == 0
     assert counts.sum() > 4000
     assert (evaluations.collided & counts).sum() <= 1
-    assert "all corners in 32,768 encounters" in answer["verdict"]
+    assert "All corner cases in 32,768 encounters" in answer["tested"]
 
 
 WORN = {
