@@ -104,7 +104,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
     kept = evaluations.column("rating_points")[
         case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]
     ]
-    assert f"With the fewest changes it keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
+    assert f"the vehicle keeps {kept:.2f} points: brakeTorque 1 -> " in verdict
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
