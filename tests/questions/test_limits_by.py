@@ -18,7 +18,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify, falsify_all
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model, tests_between as tests_in_cells
+from safevar_sumo.questions.models import Model, tests_between as drawn_between
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.by_parameter import Parameter, cells_between, study_between
 from safevar_sumo.questions.tolerance.extension import Extension
@@ -376,4 +376,4 @@ def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> Non
 def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
     study = at_point(load_study("wear"), point)
     assert scope_of(study).startswith(scope)
-    assert tests_in_cells(study, np.random.default_rng(0), None) == []
+    assert drawn_between(study, np.random.default_rng(0), None) == []

@@ -100,7 +100,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
         None
     ] * 3
     results = SimpleNamespace(case=case, study=case.study, original=record(original, row=0))
-    verdict = _verdict(results, case, assemble(case.study))
+    verdict, _ = _verdict(results, case, assemble(case.study))
     kept = evaluations.column("rating_points")[
         case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]
     ]
