@@ -295,7 +295,7 @@ def _answer_of(
 
 
 def _fits_in_words(models: Models, survivors: Survivors) -> str:
-    """In how many fits of the vehicle the answer holds, in a sentence; empty with one model."""
+    """In how many parameter sets the answer holds, in a sentence; empty with one model."""
     count = len(models.members)
     if count == 1 or not survivors.changes:
         return ""

@@ -1,4 +1,4 @@
-"""Attacks on a change of the parameters in all fits of the vehicle, and its proof on fresh wear."""
+"""The falsification of a change in all parameter sets of the vehicle, and its bound on new wear."""
 
 from __future__ import annotations
 

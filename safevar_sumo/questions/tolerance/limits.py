@@ -254,7 +254,9 @@ def _tables(
     tried = len(found.models.members) + len(found.models.left_out)
     if found.together is not None and tried > 1:
         fits = _fit_rows(found.models, found.together)
-        tables["fits"] = tabulate("The limits in each fit of the vehicle", FITS, fits)
+        tables["fits"] = tabulate(
+            "The limits in each parameter set of the vehicle model", FITS, fits
+        )
     if RATING_POINTS.name in scans[0].profile:
         tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
     if nearest:
