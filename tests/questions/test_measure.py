@@ -252,7 +252,7 @@ def test_limits_of_the_matrix_by_drac_are_obeyed_in_every_fit() -> None:
     ]
     fits = studies_of_sets(study_by(load_study("wear"), Unsafe.parse("drac > 8")))
     assert answer["numbers"]["fits"] == answer["numbers"]["fits_tried"] == len(fits)
-    assert f"in any of {len(fits)} fits" in answer["verdict"]
+    assert f"in {len(fits)} of {len(fits)} parameter sets" in answer["verdict"]
     for fit in fits:
         found = sv.evaluate(fit, cars, filtered=False, jobs=1)
         assert (found["outcome"] != "collision").all()
