@@ -61,7 +61,7 @@ def _own_cache_and_pools_of_this_process(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[None]:
     """Each session of tests builds its own networks, once for all of its processes; commands start
-    no worker processes.
+    no worker processes and keep no simulations, by which a test would check itself.
     """
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
@@ -69,6 +69,7 @@ def _own_cache_and_pools_of_this_process(
             "XDG_CACHE_HOME",
             str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"),
         )
+        patch.setenv("SAFEVAR_CACHE", "off")
         patch.setattr(local, "ProcessWorker", inline_worker)
         yield
 

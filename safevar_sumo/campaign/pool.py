@@ -61,9 +61,11 @@ class Pool:
     ----------
     workers
         Number of jobs that are carried out at the same time.
+    study_keys
+        What the simulations of a study depend on, as a digest, by packed study; a study that it
+        lacks is new to the pool.
     verified
-        Number of settings whose results were verified, by packed study; a study that it lacks is
-        new to the pool.
+        Number of settings whose results were verified, by this digest.
     compiled
         Names of the vehicle models that workers find compiled.
     """
@@ -74,6 +76,7 @@ class Pool:
         self._places: Sequence[int] = range(workers)
         self._is_abandoned = Event()
         self._started = dict[int, Worker]()
+        self.study_keys = dict[bytes, bytes]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
 

@@ -16,6 +16,13 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
+from safevar_sumo.campaign.cache import (
+    cache_in_use,
+    content_of,
+    evaluations_in,
+    key_of_settings,
+    key_of_study,
+)
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -41,6 +48,10 @@ BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
 time left is known.
 """
+PORTION = 4096
+"""Number of settings whose results are kept together."""
+SMALL_PORTION = 256
+"""That number where vehicles take turns or SUMO itself simulates, so that each costs time."""
 COMPILING = "compiling the vehicle model, for the first time"
 """The phase of progress in which one worker compiles, and no simulation has begun."""
 ECONOMICAL_FRACTION = 1 / 4
@@ -57,42 +68,76 @@ def evaluate_all(
     done: Callable[[int], None] = lambda size: None,
     verified: int = VERIFIED_SETTINGS,
     selection: Selection = EVERYTHING,
+    begin: Callable[[], None] = lambda: None,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated
-    once.
+    once, and those that the cache of simulations has are not.
 
-    User code is checked first (`check_code`). A sample of the settings in a recorded scene is also
-    simulated in SUMO, until `verified` ones of the study have been. `done` is called with the
-    number of settings of every finished batch. Of a `selection`, nothing is verified in SUMO.
+    User code is checked first (`check_code`), and `begin` is called before anything is simulated. A
+    sample of the settings in a recorded scene is also simulated in SUMO, until `verified` ones of
+    the study have been. `done` is called with the number of settings of every finished batch. Of a
+    `selection`, nothing is verified in SUMO.
     """
-    # User code is checked once for each study.
-    packed_study = msgspec.msgpack.encode(study)
-    if packed_study not in pool.verified:
-        check_code(study, pool)
-        pool.verified[packed_study] = 0
+    study_key = _study_key(study, pool)
 
-    # Equal settings are simulated once, in batches for the workers.
+    # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
-    task = Task(study=study, batch_size=batches.best, selection=selection)
-    jobs = [
-        (task, rows)
-        for rows in np.array_split(distinct_settings, batches.number(len(distinct_settings), pool))
-    ]
+    cache = cache_in_use()
+    found = list[Evaluations]()
+    portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
+    for portion in np.array_split(distinct_settings, portions):
+        key = key_of_settings(study_key, selection, portion)
+        content = cache.get(key) if cache else None
+        evaluations = evaluations_in(content) if content else None
+        if evaluations is not None:
+            done(len(portion))
+        else:
+            begin()
+            sample_size = verified - pool.verified[study_key]
+            task = Task(study=study, batch_size=batches.best, selection=selection)
+            evaluations = _simulate(task, portion, pool, batches, done, sample_size)
+            pool.verified[study_key] += max(min(sample_size, len(portion)), 0)
+            if cache and not evaluations.failed.any():
+                cache.put(key, content_of(evaluations))
+        found.append(evaluations)
+    return Evaluations.concatenate(found).take(row_of.ravel())
+
+
+def _study_key(study: Study, pool: Pool) -> bytes:
+    """What the simulations of a study depend on, as a digest; its user code is checked first, once
+    in a pool.
+    """
+    packed_study = msgspec.msgpack.encode(study)
+    if packed_study not in pool.study_keys:
+        pool.study_keys[packed_study] = key_of_study(study, check_code(study, pool))
+    return pool.study_keys[packed_study]
+
+
+def _simulate(
+    task: Task,
+    settings: FloatArray,
+    pool: Pool,
+    batches: Batches,
+    done: Callable[[int], None],
+    sample_size: int,
+) -> Evaluations:
+    """Simulate distinct settings, shape (k, n), in batches for the workers; where recorded scenes
+    replace SUMO, some of the results are repeated in SUMO.
+    """
+    jobs = [(task, rows) for rows in np.array_split(settings, batches.number(len(settings), pool))]
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
             done(len(jobs[number][1]))
 
-    # Some results from recorded scenes are repeated in SUMO.
     evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
-    sample_size = min(verified - pool.verified[packed_study], len(distinct_settings))
-    if batches.are_recorded and sample_size > 0 and selection == EVERYTHING:
-        sample = np.linspace(0, len(distinct_settings) - 1, sample_size).astype(int)
+    sample_size = min(sample_size, len(settings))
+    if batches.are_recorded and sample_size > 0 and task.selection == EVERYTHING:
+        sample = np.linspace(0, len(settings) - 1, sample_size).astype(int)
         sample = sample[~evaluations.failed[sample]]
-        carry_out(verify_settings, [(task, distinct_settings[sample])], pool)
-        pool.verified[packed_study] += sample_size
-    return evaluations.take(row_of.ravel())
+        carry_out(verify_settings, [(task, settings[sample])], pool)
+    return evaluations
 
 
 class Batches(NamedTuple):
@@ -112,6 +157,11 @@ class Batches(NamedTuple):
     best: int
     share_steps: bool
     are_recorded: bool
+
+    @property
+    def portion(self) -> int:
+        """Number of settings that are simulated before their results are kept."""
+        return PORTION if self.share_steps else SMALL_PORTION
 
     def number(self, settings: int, pool: Pool) -> int:
         """The number of batches for so many settings."""
@@ -154,11 +204,20 @@ def _compile_vehicle(task: Task, only_load: bool) -> bool:
     return bool(system_of(task.study).vehicle.compile(only_load=only_load))
 
 
-def ask_why_no_verdict(study: Study, pool: Pool) -> str:
+def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lambda: None) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
-    "" if they do.
+    "" if they do. `begin` is called before anything is simulated.
     """
-    return str(carry_out(_why_no_verdict, [(Task(study=study),)], pool)[0])
+    cache = cache_in_use()
+    key = hashlib.sha256(b"no verdict" + _study_key(study, pool)).digest()
+    content = cache.get(key) if cache else None
+    if content is not None:
+        return content.decode()
+    begin()
+    reason = str(carry_out(_why_no_verdict, [(Task(study=study),)], pool)[0])
+    if cache:
+        cache.put(key, reason.encode())
+    return reason
 
 
 def _why_no_verdict(task: Task) -> str:
@@ -175,7 +234,7 @@ def check_code(study: Study, pool: Pool) -> Use:
         With file, line and advice of the first finding that makes results wrong.
     """
     if not user_code_names(study):
-        return Use({}, [])
+        return Use({}, [], {})
     identity = json.dumps(manifest_of(study, identity_of(study, system_of(study))), sort_keys=True)
     digest = hashlib.sha256(identity.encode()).hexdigest()
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"

@@ -94,6 +94,10 @@ COMMON_OPTIONS = (
             " and say so."
         ),
     ),
+    (
+        *("fresh", bool, False),
+        "Simulate everything anew, instead of reading what earlier commands have simulated.",
+    ),
 )
 """Options that every question has: name, type, default, and meaning."""
 
@@ -200,6 +204,7 @@ class Question:
         pool: Pool | None = None,
         progress: bool | Progress = False,
         as_it_is_now: bool = False,
+        fresh: bool = False,
         **values: Any,
     ) -> Answer:
         # Options that it has, with legal values.
@@ -219,14 +224,16 @@ class Question:
                 warn(shortfall)
             return reduce_to_point(subject, point)
 
+        from safevar_sumo.campaign.cache import keep_simulations  # SUMO takes long to load
+
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
-        return replace(
-            self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress), command=command
-        )
+        with keep_simulations(fresh=fresh):
+            answer = self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress)
+        return replace(answer, command=command)
 
     def answer(
         self,

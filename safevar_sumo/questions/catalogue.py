@@ -92,6 +92,14 @@ FINDINGS: Columns = {
 }
 
 
+CACHE: Columns = {
+    "folder": "where simulations are kept",
+    "entries": "number of entries, each with up to some thousand simulations",
+    "size": Column("MB", "size on disk", ".1f"),
+    "limit": Column("MB", "size from which on the oldest simulations make room", ".0f"),
+}
+
+
 @contents(
     "passed",
     studies=STUDIES,
@@ -103,16 +111,20 @@ FINDINGS: Columns = {
     metrics=DESCRIBED,
     objectives=DESCRIBED,
     characteristics=CHARACTERISTICS,
+    cache=CACHE,
 )
 def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with
     KIND only these, or your own scenario, package.module:Name.
 
     KIND may also be characteristics, followed by a study: what it varies, how a workshop measures
-    it, and what to do with a vehicle beyond its limit.
+    it, and what to do with a vehicle beyond its limit. Or it may be cache: where simulations are
+    kept, how many, and how large they are.
     """
     if kind == "characteristics":
         return _list_characteristics(study)
+    if kind == "cache" and study is None:
+        return _list_cache()
     if study is not None:
         raise InputError("study", f"{kind} of {study!r}", "a study after characteristics alone")
 
@@ -141,7 +153,9 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
         ),
     }
     if kind is not None:
-        check_name("kind", f"there is no {kind!r} to list", kind, [*tables, "characteristics"])
+        check_name(
+            "kind", f"there is no {kind!r} to list", kind, [*tables, "characteristics", "cache"]
+        )
         tables = {kind: tables[kind]}
     counts = ", ".join(f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items())
     verdict = f"A study can name {', '.join(own) or counts}."
@@ -168,6 +182,32 @@ def _list_characteristics(name: str | None) -> Answer:
         verdict=f"{study.name} varies {number_of(len(rows), 'characteristic')}.",
         numbers={"passed": True},
         tables={"characteristics": tabulate(title, CHARACTERISTICS, rows)},
+    )
+
+
+def _list_cache() -> Answer:
+    """Where simulations are kept, and how large they are."""
+    from safevar_sumo.campaign import cache as simulations  # SUMO takes long to load
+
+    folder = simulations.cache_folder()
+    variable = simulations.FOLDER_VARIABLE
+    limit = simulations.SIZE_LIMIT / 1e6
+    verdict = f"Simulations are not kept: {variable} is {simulations.OFF}."
+    rows = []
+    if folder is not None:
+        entries, size = simulations.Cache(folder).extent() if folder.is_dir() else (0, 0)
+        rows = [(str(folder), entries, size / 1e6, limit)]
+        verdict = (
+            f"What questions have simulated is kept in {folder}: {size / 1e6:.1f} MB of at most"
+            f" {limit:,.0f} MB. {variable} names another folder; this one may be deleted."
+        )
+    no_study: Any = None
+    return Answer(
+        question="list",
+        study=no_study,
+        verdict=verdict,
+        numbers={"passed": True},
+        tables={"cache": tabulate("Cache of simulations", CACHE, rows)},
     )
 
 

@@ -193,7 +193,6 @@ class Evaluator:
         """Evaluate settings while progress is shown."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        compile_vehicle(self.study, self._pool, self.progress)
         done = 0
         total = len(np.unique(settings, axis=0))
         self.progress(stage, done, total)
@@ -204,7 +203,13 @@ class Evaluator:
             self.progress(stage, done, total)
 
         evaluations = evaluate_all(
-            self.study, settings, self._pool, show_more_done, verified, selection
+            self.study,
+            settings,
+            self._pool,
+            show_more_done,
+            verified,
+            selection,
+            begin=self._compile,
         )
         self.simulated += total
         if self.measure:
@@ -217,6 +222,9 @@ class Evaluator:
         if selection != EVERYTHING:
             return evaluations
         return self._without_unsafe_originals(evaluations)
+
+    def _compile(self) -> None:
+        compile_vehicle(self.study, self._pool, self.progress)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """Evaluations whose results are undefined where the original vehicle is not safe in the
@@ -353,8 +361,7 @@ class Evaluator:
         """Why simulations tell nothing about the ADS, in a sentence with which every answer begins;
         "" if they do.
         """
-        compile_vehicle(self.study, self._pool, self.progress)
-        return ask_why_no_verdict(self.study, self._pool)
+        return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
     def choose_criterion(
         self, text: Unsafe | str | None, source: Study | Case, original: Evaluations | None = None

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
@@ -65,6 +66,7 @@ def evidence(
     unsafe: Criterion = None,
     jobs: Jobs = None,
     progress: bool | Progress = False,
+    fresh: bool = False,
 ) -> str:
     """Pack results with their study, page and answers, so that anybody can compute every number
     again.
@@ -86,6 +88,8 @@ def evidence(
     progress
         True for a bar on the terminal, or a function of a phase, the number done in it, and its
         total.
+    fresh
+        Simulate everything anew, instead of reading what earlier commands have simulated.
 
     Returns
     -------
@@ -104,7 +108,7 @@ def evidence(
     # Each study once, with its files.
     studies = []
     files = dict[str, bytes]()
-    with open_progress(progress) as show:
+    with open_progress(progress) as show, keep_simulations(fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
             described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
             studies.append(described)
@@ -220,7 +224,7 @@ def verify(
     # The studies of the pack, and files that belong to none.
     path = Path(pack).absolute()
     description, files = read_pack(path)
-    with temporary_folder() as folder, open_progress(progress) as show:
+    with temporary_folder() as folder, open_progress(progress) as show, simulate_anew():
         studies = {
             Path(folder, str(number)): _unpack(
                 path, described, files, Path(folder, str(number)), jobs, show

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
+from safevar_sumo.campaign.cache import keep_simulations
 from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
@@ -72,6 +73,7 @@ def report(
     jobs: Jobs = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
+    fresh: bool = False,
 ) -> Path:
     """Write one page about results that opens offline: what decides, replays, answers, trust, and
     commands.
@@ -102,6 +104,8 @@ def report(
     as_it_is_now
         If results were computed with other files or versions, simulate with the present ones and
         say so.
+    fresh
+        Simulate everything anew, instead of reading what earlier commands have simulated.
 
     Returns
     -------
@@ -138,7 +142,8 @@ def report(
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     answer_question = answer_to if ask else answer_or_reason
     at_point = cases if point is None else [case_at(case, point) for case in cases]
-    by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
+    with keep_simulations(fresh=fresh):
+        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
@@ -153,7 +158,7 @@ def report(
         return answer_question(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
     # The answers, in the order of the page.
-    with open_progress(progress) as show:
+    with open_progress(progress) as show, keep_simulations(fresh=fresh):
         studies = [
             ReportedStudy(
                 directory=path,

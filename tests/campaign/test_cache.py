@@ -1,0 +1,292 @@
+"""The cache of simulations: what was simulated is not simulated again, whatever happens to the
+folder; and evidence never reads it.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import diskcache
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.campaign import cache, questions
+from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulations, simulate_anew
+from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
+from safevar_sumo.campaign.pool import open_pool
+from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
+from safevar_sumo.questions.catalogue import list_models
+from safevar_sumo.questions.sampling import sobol_settings
+from safevar_sumo.records import CellResults, Evaluations, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool
+
+OWN_ADS = """
+from threshold import TTC
+from safevar_sumo.ads import ScalarAds
+
+class Own(ScalarAds):
+    def drive(self, seen):
+        brakes = seen.closing_speed > 0 and seen.gap / seen.closing_speed < TTC
+        return (0.0, 1.0) if brakes else (0.3, 0.0)
+"""
+"""A driving system whose threshold [s] is in another module of the user's."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of an empty cache."""
+    monkeypatch.setenv("SAFEVAR_CACHE", str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+@pytest.fixture
+def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Numbers of settings that were simulated, of each batch."""
+    numbers = list[int]()
+
+    def count(task: Task, rows: FloatArray) -> Evaluations:
+        numbers.append(len(rows))
+        return evaluate_settings(task, rows)
+
+    monkeypatch.setattr(questions, "evaluate_settings", count)
+    return numbers
+
+
+def evaluated(study: Study, settings: FloatArray, *, fresh: bool = False) -> Evaluations:
+    """Settings as a question evaluates them, in a process of its own."""
+    with keep_simulations(fresh=fresh):
+        return evaluate_all(study, settings, InlinePool(), verified=0)
+
+
+def some_settings(study: Study, number: int) -> FloatArray:
+    return sobol_settings(CharacteristicSet.of(study), number)
+
+
+def assert_equal(one: Evaluations, other: Evaluations) -> None:
+    """To the bit, in every array."""
+    np.testing.assert_array_equal(one.settings, other.settings)
+    assert [*one.results] == [*other.results]
+    for name, values in one.results.items():
+        np.testing.assert_array_equal(values, other.results[name])
+        assert values.dtype == other.results[name].dtype
+    np.testing.assert_array_equal(one.points, other.points)
+    for mine, theirs in zip(one.cells or (), other.cells or (), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("name", ["smoke", "alks", "sun"])
+def test_what_was_simulated_is_read_and_is_the_same_to_the_bit(
+    name: str, folder: Path, simulated: list[int]
+) -> None:
+    """Also the points of a matrix at which vehicles are worst, and metrics that are undefined."""
+    study = load_study(name)
+    settings = some_settings(study, 64)
+    first = evaluated(study, settings)
+    assert sum(simulated) == 64
+    assert_equal(evaluated(study, settings), first)
+    assert sum(simulated) == 64
+    assert_equal(evaluated(study, settings, fresh=True), first)
+    assert sum(simulated) == 128
+
+
+def test_results_in_the_cells_of_a_rating_are_kept_to_the_bit() -> None:
+    """NaN where a test had no impact or no warning."""
+    study = load_study("smoke")
+    rng = np.random.default_rng(3)
+    impact, warning = (np.where(rng.random((4, 9)) < 0.5, np.nan, rng.random((4, 9))) for _ in "ab")
+    evaluations = replace(
+        evaluate_all(study, some_settings(study, 4), InlinePool(), verified=0),
+        cells=CellResults(impact, warning, rng.random((4, 9)) < 0.5),
+    )
+    kept = evaluations_in(content_of(evaluations))
+    assert kept is not None
+    assert_equal(kept, evaluations)
+
+
+def test_what_differs_is_simulated(folder: Path, simulated: list[int]) -> None:
+    """Other settings, other points, another study, and what the title does not change."""
+    study = load_study("alks")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+    evaluated(load_study(study, title="Another title"), settings)
+    assert sum(simulated) == 8
+    evaluated(study, some_settings(study, 9))
+    assert sum(simulated) == 17
+    evaluated(load_study(study, step_length=0.05), settings)
+    assert sum(simulated) == 25
+    with keep_simulations():
+        evaluate_all(study, settings, InlinePool(), selection=Selection(points=(1,)))
+    assert sum(simulated) == 33
+
+
+def test_an_interrupted_question_goes_on_where_it_was(
+    folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Portions that had ended when it was interrupted are not simulated again."""
+    monkeypatch.setattr(questions, "PORTION", 16)
+    study = load_study("smoke")
+    settings = some_settings(study, 64)
+    kept = list[int]()
+
+    def interrupt(number: int) -> None:
+        kept.append(number)
+        if sum(kept) > 40:
+            raise KeyboardInterrupt
+
+    with keep_simulations(), pytest.raises(KeyboardInterrupt):
+        evaluate_all(study, settings, InlinePool(), interrupt, verified=0)
+    simulated.clear()
+    again = evaluated(study, settings)
+    assert sum(simulated) == 32
+    assert_equal(again, evaluated(study, settings, fresh=True))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_a_change_of_a_module_that_user_code_imports_is_noticed(
+    folder: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The module lies in a folder of its own, far from the study."""
+    library = in_tmp / "library"
+    library.mkdir()
+    monkeypatch.syspath_prepend(str(library))
+    (in_tmp / "own.py").write_text(OWN_ADS)
+    study = load_study("smoke", ads={"model": "own:Own"})
+    settings = some_settings(study, 4)
+    outcomes = []
+    for threshold in ("3.0", "3.0", "0.2"):
+        (library / "threshold.py").write_text(f"TTC = {threshold}\n")
+        with keep_simulations(), open_pool(1) as pool:
+            outcomes.append(evaluate_all(study, settings, pool, verified=0).f_safe.tolist())
+    assert outcomes[0] == outcomes[1] != outcomes[2]
+
+
+def test_an_altered_entry_is_simulated_again(folder: Path, simulated: list[int]) -> None:
+    """One byte of each entry is changed, and one entry takes another one's place."""
+    study = load_study("smoke")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+    with diskcache.Cache(str(folder)) as entries:
+        for key in [*entries]:
+            content = bytearray(entries[key])
+            content[-20] ^= 1
+            entries[key] = bytes(content)
+    evaluated(study, settings)
+    assert sum(simulated) == 16
+
+
+def test_nothing_is_unpickled(folder: Path, simulated: list[int], tmp_path: Path) -> None:
+    """An entry that somebody has planted would make a file."""
+    study = load_study("smoke")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+
+    class Planted:
+        def __reduce__(self) -> tuple[object, ...]:
+            return os.mkdir, (str(tmp_path / "planted"),)
+
+    with sqlite3.connect(folder / "cache.db") as database:
+        database.execute(
+            "UPDATE Cache SET mode = 4, filename = NULL, value = ?", [pickle.dumps(Planted())]
+        )
+    evaluated(study, settings)
+    assert sum(simulated) == 16
+    assert not (tmp_path / "planted").exists()
+
+
+@pytest.mark.parametrize("fault", ["no folder", "no database", "full"])
+def test_without_a_usable_folder_all_is_simulated_and_one_line_says_so(
+    fault: str, folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if fault == "no folder":
+        folder.write_text("a file")
+    elif fault == "no database":
+        folder.mkdir()
+        (folder / "cache.db").write_bytes(b"no database at all" * 1000)
+    else:
+
+        def fail(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(diskcache.Cache, "set", fail)
+    study = load_study("smoke")
+    settings = [some_settings(study, number) for number in (4, 5)]
+    with (
+        pytest.warns(UserWarning, match="simulations are not kept: .*kept") as warnings,
+        keep_simulations(),
+    ):
+        _ = [evaluate_all(study, some, InlinePool(), verified=0) for some in settings]
+    assert len(warnings) == 1
+    assert sum(simulated) == 9
+
+
+def test_the_oldest_simulations_make_room(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "SIZE_LIMIT", 300_000)
+    with keep_simulations():
+        for number in range(100):
+            kept = cache.cache_in_use()
+            assert kept is not None
+            kept.put(str(number).encode(), os.urandom(20_000))
+        assert kept.get(b"99") is not None
+        assert kept.get(b"0") is None
+        assert kept.extent()[1] < 450_000
+
+
+@pytest.mark.slow
+def test_two_processes_share_a_cache(folder: Path) -> None:
+    """Both ask the same question at once, then one of them asks again: the same bytes."""
+    question = ["risk", "smoke", "--samples", "500", "--json"]
+    command = [sys.executable, "-m", "safevar_sumo", *question]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
+    answers = {process.communicate()[0] for process in both}
+    answers.add(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+    assert len(answers) == 1
+    assert b"probability" in answers.pop()
+
+
+def test_an_answer_is_the_same_from_the_cache(
+    folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A question that is asked again needs no worker at all."""
+    first = sv.risk("smoke", samples=100, jobs=1)
+    assert sum(simulated) > 100
+    simulated.clear()
+    monkeypatch.setattr(questions, "carry_out", None)
+    assert sv.risk("smoke", samples=100, jobs=1).render("json") == first.render("json")
+    assert not simulated
+
+
+def test_evidence_does_not_check_itself(folder: Path, simulated: list[int]) -> None:
+    study = load_study("smoke")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+    with simulate_anew():
+        evaluated(study, settings)
+    assert sum(simulated) == 16
+
+
+def test_the_list_says_where_simulations_are_and_how_large(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert list_models("cache").table()["entries"].tolist() == [0]
+    study = load_study("smoke")
+    with keep_simulations():
+        evaluate_all(study, some_settings(study, 8), InlinePool(), verified=0)
+        ask_why_no_verdict(study, InlinePool())
+    row = list_models("cache").table().iloc[0]
+    assert row["folder"] == str(folder)
+    assert row["entries"] == 2
+    assert 0 < row["size"] < 1
+    monkeypatch.setenv("SAFEVAR_CACHE", "off")
+    assert "not kept" in list_models("cache").verdict
