@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
@@ -18,6 +19,8 @@ from pathlib import Path
 from shlex import quote, split
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
+from rich.console import Console
+
 from safevar_sumo.errors import MAX_JOBS, InputError, check_name, check_text, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
@@ -26,7 +29,7 @@ from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, s
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
-from safevar_sumo.terminal import Progress, open_progress
+from safevar_sumo.terminal import Progress, open_progress, print_text
 
 if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
@@ -77,6 +80,13 @@ PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
+QUICK = "quick"
+"""The option of questions that have a rough answer, too."""
+ROUGH = (
+    "Rough answer (--quick): the study's own parameter set alone, and a short search. It proves"
+    " nothing."
+)
+"""The beginning of such an answer."""
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
@@ -232,8 +242,16 @@ class Question:
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
         with keep_simulations(fresh=fresh):
+            if self._is_long(values) and progress is True and sys.stderr.isatty():
+                first = self.answer(subjects, {**values, "quick": True}, pool=pool, jobs=jobs)
+                print_text(Console(stderr=True), f"{first.verdict}\n")
             answer = self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress)
         return replace(answer, command=command)
+
+    def _is_long(self, values: JsonObject) -> bool:
+        """Whether a rough answer, which comes much earlier, may be shown before the answer."""
+        has_rough_answer = any(option.name == QUICK for option in self.options)
+        return has_rough_answer and not any(values.get(name) for name in (QUICK, "by", "out"))
 
     def answer(
         self,
@@ -279,10 +297,15 @@ class Question:
             # An answer about a driving system that fails by itself begins with that.
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
+        numbers = {"driven": not reason, **answer.numbers}
+        rough = ""
+        if any(option.name == QUICK for option in self.options):
+            rough = ROUGH if values.get(QUICK) else ""
+            numbers["rough"] = bool(rough or numbers.get("rough"))
         verdict = " ".join(
-            filter(None, (reason, answer.verdict, cites, _undefined_in_words(evaluator)))
+            filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )
-        return replace(answer, verdict=verdict, numbers={"driven": not reason, **answer.numbers})
+        return replace(answer, verdict=verdict, numbers=numbers)
 
     def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
         """The command that asks this question; it has a flag for each option that is not at its
@@ -404,6 +427,17 @@ def with_criterion(text: str, unsafe: str | None) -> str:
     asked, values = parse_question(text)
     takes_it = unsafe is not None and any(option.metavar == CRITERION for option in asked.options)
     return f"{text} --unsafe {quote(str(unsafe))}" if takes_it and "unsafe" not in values else text
+
+
+def quick_questions(texts: Sequence[str]) -> list[str]:
+    """The questions, rough where they can be; those by a parameter, which cannot, are left out."""
+    found = []
+    for text in texts:
+        asked, values = parse_question(text)
+        if "by" not in values:
+            is_quick = any(option.name == QUICK for option in asked.options)
+            found.append(f"{text} --{QUICK}" if is_quick and QUICK not in values else text)
+    return found
 
 
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:

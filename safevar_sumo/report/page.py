@@ -27,6 +27,7 @@ from safevar_sumo.questions.ask import (
     Jobs,
     has_criterion,
     parse_question,
+    quick_questions,
     with_criterion,
 )
 from safevar_sumo.questions.case import Case, load_cases
@@ -74,6 +75,7 @@ def report(
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
     fresh: bool = False,
+    quick: bool = False,
 ) -> Path:
     """Write one page about results that opens offline: what decides, replays, answers, trust, and
     commands.
@@ -106,6 +108,8 @@ def report(
         say so.
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
+    quick
+        Rough answers within seconds, without limits by speed and without a line to sign.
 
     Returns
     -------
@@ -145,6 +149,8 @@ def report(
     with keep_simulations(fresh=fresh):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
+    if quick:
+        asked = [quick_questions(texts) for texts in asked]
     numbers = count(1)
     total = sum(map(len, asked)) + len(joint)
 

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
+QUICK_LIMIT = 4_000
+"""Approximate number of simulations for minimal causes in a rough answer."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the whole domain"
 """What the settings are of which some are unsafe."""
 
@@ -81,7 +83,7 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the
         "original_outcome",
         "original_degree",
     ),
-    *("analysed", "explained", *COLLISION_NUMBERS, "fits", "unsafe_in_fits"),
+    *("rough", "analysed", "explained", *COLLISION_NUMBERS, "fits", "unsafe_in_fits"),
     causes=CAUSE_COLUMNS,
     solutions=SOLUTION_COLUMNS,
     characteristics=[*CHARACTERISTIC_COLUMNS, "needed_in_fits"],
@@ -99,6 +101,7 @@ def explain(
     top: Annotated[int, Range(1, 1000)] = 8,
     limit: Count = 40_000,
     fits: Annotated[int, Range(0, 1000)] = 20,
+    quick: bool = False,
 ) -> Answer:
     """Explain failures: which changes cause them, how small a change is enough, and who would have
     avoided them.
@@ -121,7 +124,12 @@ def explain(
     fits
         Number of parameter sets of the vehicle model (those of [spread]) with which each conclusion
         is drawn again; 0 leaves this out.
+    quick
+        A rough answer within seconds: the study's own parameter set alone, and causes of few
+        failures.
     """
+    if quick:
+        fits, limit = 0, min(limit, QUICK_LIMIT)
     evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, SETS_AT_ONCE, BOUNDARIES, BORDERS)
     study = evaluator.study
 

@@ -30,9 +30,15 @@ from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.causes import find_cause_limits, find_minimal_causes
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.price import price_of
-from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
+from safevar_sumo.questions.repair.problem import (
+    USUAL_BUDGET,
+    Promise,
+    RepairProblem,
+    parameters_of,
+)
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.repair.validation import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
@@ -96,7 +102,7 @@ REPAIRS = {
         "not_repairable",
         "simulations",
     ),
-    *("fits", "fits_tried"),
+    *("rough", "fits", "fits_tried"),
     repairs=REPAIRS,
 )
 def repair(
@@ -109,6 +115,7 @@ def repair(
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
     fits: Annotated[int | None, Range(0, 1000)] = None,
     out: Annotated[str | None, "FILE.toml"] = None,
+    quick: bool = False,
 ) -> Answer:
     """Find the smallest change of the driving system that survives promised wear, and its price.
 
@@ -135,6 +142,9 @@ def repair(
         default all, 0 for the study's own alone.
     out
         Study file to write with the first repair; it extends the study.
+    quick
+        A rough answer: the study's own parameter set alone, and a short search for counterexamples.
+        Not with `out`.
     """
     study = evaluator.study
     if is_rated(study):
@@ -146,6 +156,9 @@ def repair(
             study.source, text, "the study without the rating, such as wear for euro_ncap_rating"
         )
     if out is not None:
+        if quick:
+            legal = "--quick without --out, or --out without --quick"
+            raise InputError("quick", f"a rough repair is not written to {out}", legal)
         _check_file(Path(out), study)
     criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
     check_margin(criterion, margin)
@@ -154,7 +167,7 @@ def repair(
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
     evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)
-    models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
+    models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
             evaluator=model.evaluator,
@@ -162,6 +175,7 @@ def repair(
             parameters=parameters,
             unsafe=model.unsafe,
             fit=model.fit,
+            budget=LEAST_SIMULATIONS if quick else USUAL_BUDGET,
         )
         for model in models.members
     ]

@@ -33,6 +33,8 @@ DIGITS = 4
 """Significant digits of a parameter's changed value, more where its range is small beside it: the
 value that is printed is the one that has been tried.
 """
+USUAL_BUDGET = 5000
+"""Number of simulations of an attack over all parameter sets, unless a rough answer is enough."""
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 DRAWS = 20
@@ -210,7 +212,7 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
     """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with
-    one `fit` of the vehicle.
+    one `fit` of the vehicle. `budget` is the number of simulations of an attack over all fits.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """
@@ -220,6 +222,7 @@ class RepairProblem:
     parameters: list[Parameter]
     unsafe: Unsafe
     fit: int = 0
+    budget: int = USUAL_BUDGET
 
     @property
     def study(self) -> Study:

@@ -13,8 +13,6 @@ from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
-BUDGET = 5000
-"""Number of simulations of an attack, over all fits."""
 KNOWN = 256
 """Number of the worst known settings with which an attack begins; with each other fit an eighth."""
 MAX_UNSAFE_SHARE = 0.001
@@ -39,8 +37,8 @@ def find_failures(
     rng = np.random.default_rng((own.study.search.seed, number))
     judges = [partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
-    with own.evaluator.stage(ATTACK_STAGE, BUDGET):
-        found = falsify(own.promise, judges, starts, BUDGET, rng)
+    with own.evaluator.stage(ATTACK_STAGE, own.budget):
+        found = falsify(own.promise, judges, starts, own.budget, rng)
     return {row: np.unique(settings, axis=0) for row, settings in found.failures.items()}
 
 

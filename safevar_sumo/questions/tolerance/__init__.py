@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
@@ -59,6 +60,7 @@ def tolerance(
     attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     by: Annotated[str | None, "NAME=V1,V2,..."] = None,
     together: bool = False,
+    quick: bool = False,
 ) -> Answer:
     """Find how far each characteristic may go: alone, and all together.
 
@@ -94,10 +96,14 @@ def tolerance(
     together
         Joint limits, which hold all at the same time; they are always sought without `by`, and
         never beside it.
+    quick
+        A rough answer within seconds: corners and a short search for counterexamples, with the
+        study's own parameter set. No limit is called kept, and with limits the exit code is 3. Not
+        with `by`.
     """
     study = evaluator.study
     parameter = None if by is None else Parameter.parse(by, study)
-    check_by(by, unsafe, together)
+    check_by(by, unsafe, together, is_quick=quick)
     stages = [SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, VALIDATION_STAGE]
     evaluator.plan(*stages, *([WIDER_STAGE] if study.wider else []))
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
@@ -112,7 +118,8 @@ def tolerance(
         original=original,
         criterion=unsafe,
         margin=margin,
-        fits=fits,
-        budget=attack,
+        fits=0 if quick else fits,
+        budget=min(attack, LEAST_SIMULATIONS) if quick else attack,
+        is_quick=quick,
     )
     return answer_limits(asked) if parameter is None else answer_by(asked, parameter)

@@ -34,6 +34,9 @@ class Asked(NamedTuple):
         Number of parameter sets in which the limits hold; None for all.
     budget
         Number of simulations that search for a counterexample.
+    is_quick
+        Whether a rough answer is enough: corners and a short search for counterexamples at the
+        study's own points, with its own parameter set.
     """
 
     subject: Study | Case
@@ -46,6 +49,12 @@ class Asked(NamedTuple):
     margin: float | None
     fits: int | None
     budget: int
+    is_quick: bool = False
+
+    @property
+    def may_keep(self) -> bool:
+        """Whether limits may be called kept: a search for counterexamples met all that counts."""
+        return self.budget > 0 and not self.is_quick
 
     @property
     def unsafe_solutions(self) -> FloatArray:

@@ -79,6 +79,7 @@ class LevelSearch:
 
     def __init__(self, asked: Asked, by: Parameter) -> None:
         evaluator = asked.evaluator
+        self.asked = asked
         self.evaluator = evaluator
         self.by = by
         self.unsafe = asked.unsafe

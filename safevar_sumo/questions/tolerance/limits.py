@@ -41,10 +41,10 @@ from safevar_sumo.questions.tolerance.scans import (
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
 from safevar_sumo.questions.tolerance.words import (
-    NOT_FALSIFIED,
     USUAL_BUDGET,
     tested_sentences,
     verdict_sentences,
+    why_not_kept,
 )
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject
@@ -141,12 +141,12 @@ def find_limits(asked: Asked) -> FoundLimits:
         models = models_of(evaluator, asked.unsafe, asked.fits)
     # Limits alone also hold at points between those of the study's matrix.
     judges = [*models.members]
-    if is_sought and asked.budget:
+    if is_sought and asked.may_keep:
         judges = [with_points_between(model, asked.unsafe, 0)[0] for model in models.members]
     search_alone = AloneSearch(scans, asked.columns, judges)
     encounters = 1 + len(evaluator.critical_encounters)
     with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(asked.columns) * encounters):
-        search_alone.run(asked.budget)
+        search_alone.run(asked.budget if asked.may_keep else 0)
     together = None
     if is_sought and is_safe:
         together = _find_together(asked, scans, models, search_alone)
@@ -169,7 +169,8 @@ def _find_together(
     for _ in range(MAX_REFUTED):
         unsafe_settings = np.concatenate([*known, search_alone.failures])
         together = find_limits_together(
-            models, columns, limits, scans, unsafe_settings, asked.budget
+            *(models, columns, limits, scans, unsafe_settings, asked.budget),
+            is_quick=asked.is_quick,
         )
         search_alone.meet(together.searched, together.failures_alone)
         if together.box is None or not together.box.holds(search_alone.failures).any():
@@ -185,14 +186,14 @@ def answer_limits(asked: Asked) -> Answer:
     models = found.models
     together = found.together
     contacts = None
-    if together is not None and asked.budget and len(evaluator.characteristics.scenario):
+    if together is not None and asked.may_keep and len(evaluator.characteristics.scenario):
         contacts = contacts_left_out(models.members, [together.box or together.specified])
-    scope = scope_of(study, between=asked.budget > 0)
+    scope = scope_of(study, between=asked.may_keep)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
-    if not asked.budget:
+    if not asked.may_keep:
         rows = rows.without_kept()
     nearest = []
-    if rows.broken and together is not None:
+    if rows.broken and together is not None and not asked.is_quick:
         nearest = nearest_limits(models, asked.limits)
     wider = wider_rows(asked, together) if found.is_safe else []
     refusal = ""
@@ -200,10 +201,9 @@ def answer_limits(asked: Asked) -> Answer:
         breach = asked.unsafe.breach_in_words(asked.original)
         refusal = f"the original itself {breach}: no limit can be kept"
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
-    is_kept = None if not failures and not asked.budget else not failures
+    is_kept = None if not failures and not asked.may_keep else not failures
     sentences = verdict_sentences(
-        *(models, found.alone, together, asked.limits, rows.broken, asked.budget),
-        *(nearest, wider, refusal, contacts),
+        *(models, found.alone, together, asked, rows.broken), *(nearest, wider, refusal, contacts)
     )
     tested = tested_sentences(models, together, asked.budget, contacts)
     return Answer(
@@ -221,7 +221,7 @@ def answer_limits(asked: Asked) -> Answer:
             **_numbers(found),
         },
         tables=_tables(found, rows.rows, nearest, wider),
-        failures=(NOT_FALSIFIED,) if is_kept is None and asked.limits else failures,
+        failures=(why_not_kept(asked),) if is_kept is None and asked.limits else failures,
         draw=partial(draw_limits, scans=found.scans),
     )
 

@@ -25,11 +25,11 @@ from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
 from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE
 from safevar_sumo.questions.tolerance.words import (
-    NOT_FALSIFIED,
     USUAL_BUDGET,
     contacts_in_words,
     rough_in_words,
     tested_in_words,
+    why_not_kept,
 )
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
@@ -114,7 +114,7 @@ def _failed(search: LevelSearch, reach: Reach, is_kept: bool | None) -> tuple[st
     if is_kept:
         return ()
     if is_kept is None:
-        return (NOT_FALSIFIED,) if search.limits else ()
+        return (why_not_kept(search.asked),) if search.limits else ()
     return (
         (
             f"the limits hold up to {_text(search.by, reach.value)}, not"
@@ -298,7 +298,8 @@ def _sentences(
         yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."
     elif search.limits:
         yield (
-            f"{where}, up to which value the specified limits hold was not tested: {NOT_FALSIFIED}."
+            f"{where}, up to which value the specified limits hold was not tested:"
+            f" {why_not_kept(search.asked)}."
         )
     else:
         yield (
@@ -427,14 +428,20 @@ def _draw_limits(axis: Axes, rows: pd.DataFrame, by: Parameter) -> None:
     axis.set_ylim(values[0], values[-1])
 
 
-def check_by(by: str | None, unsafe: str | None, is_together: bool) -> None:
+def check_by(
+    by: str | None, unsafe: str | None, is_together: bool, *, is_quick: bool = False
+) -> None:
     """Refuse options that do not go together with limits up to values of a parameter.
 
     Raises
     ------
     InputError
-        If another criterion than the margin, or joint limits, are asked for beside `by`.
+        If another criterion than the margin, joint limits or a rough answer are asked for beside
+        `by`.
     """
+    if by is not None and is_quick:
+        problem = f"a rough answer has no value of --by {by} up to which limits hold"
+        raise InputError("quick", problem, "--quick without --by, or --by without --quick")
     if by is not None and is_together:
         legal = (
             "--by for limits alone, or joint limits of a study with a narrower domain, without --by"

@@ -145,6 +145,8 @@ def find_limits_together(
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
     budget: int,
+    *,
+    is_quick: bool = False,
 ) -> LimitsTogether:
     """The largest box by relative volume in which `columns` vary, in which those of `limits` reach
     their limits, and that holds none of `unsafe_settings`, shape (K, n).
@@ -158,14 +160,15 @@ def find_limits_together(
     What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
     boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can
     go, at most `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box
-    is confirmed by further searches for counterexamples. After `MAX_BOXES` boxes or
+    is confirmed by further searches for counterexamples; with `is_quick` no limit moves out and
+    nothing is confirmed. After `MAX_BOXES` boxes or
     `MAX_SIMULATIONS` simulations the largest that passed is confirmed, or none is found.
     """
     search, nothing = _open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
         return nothing
     boxes = _Boxes(search, _start_of(search, columns, scans), models.own.evaluator)
-    validator = Validator(nothing.members, enough(budget), models.own.evaluator)
+    validator = Validator(nothing.members, enough(budget), models.own.evaluator, is_quick=is_quick)
     for number in range(1, MAX_BOXES + 1):
         box = boxes.next(number)
         if box is None:
@@ -184,7 +187,7 @@ def find_limits_together(
             boxes.refuse(validation)
             if is_over and boxes.passed is None:
                 break
-        elif is_last:
+        elif is_last or is_quick:
             return _result(nothing, boxes.extension, validation, number)
         else:
             boxes.accept(validation, may_grow=not is_over)

@@ -4,25 +4,32 @@ scope.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.box import MET_BY_CORNERS
+from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
+from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases, number_of, share_in_words
-from safevar_sumo.study import Limit, unit_text
+from safevar_sumo.study import unit_text
 
 USUAL_BUDGET = 5000
 """Number of simulations that search for a counterexample unless an option says otherwise."""
-NOT_FALSIFIED = "with --attack 0, no simulation searched for a counterexample"
+
+
+def why_not_kept(asked: Asked) -> str:
+    """Why specified limits that nothing broke are not called kept."""
+    if asked.is_quick:
+        return "with --quick, no limit is called kept: ask without it"
+    return "with --attack 0, no simulation searched for a counterexample"
 
 
 def rough_in_words(budget: int) -> str:
@@ -58,9 +65,8 @@ def verdict_sentences(
     models: Models,
     alone: Sequence[AloneLimit],
     together: LimitsTogether | None,
-    limits: Mapping[str, Limit],
+    asked: Asked,
     broken: Sequence[str],
-    budget: int,
     nearest: Sequence[tuple[Any, ...]],
     wider: Sequence[tuple[Any, ...]],
     refusal: str,
@@ -77,12 +83,13 @@ def verdict_sentences(
 
     # The decision, and how sure it is.
     decision = f"Do not release: {'; '.join(broken)}." if broken else ""
-    if rough := f"{rough_in_words(budget)}{decision}".strip():
+    begin = "" if asked.is_quick else rough_in_words(asked.budget)
+    if rough := f"{begin}{decision}".strip():
         yield rough
     if together is not None:
         yield from _fits_in_words(models, together)
         yield from _nearest_in_words(nearest)
-        yield from _box_in_words(models, together, bool(limits), budget)
+        yield from _box_in_words(models, together, asked)
 
     # What is unsafe within the limits but does not count, or elsewhere.
     if contacts is not None:
@@ -96,7 +103,7 @@ def verdict_sentences(
         yield f"{names[0]} can make the vehicle unsafe on its own."
     else:
         yield "No single characteristic makes the vehicle unsafe on its own."
-    yield f"Scope: {scope_of(study, between=budget > 0)}."
+    yield f"Scope: {scope_of(study, between=asked.may_keep)}."
 
 
 def tested_sentences(
@@ -117,7 +124,8 @@ def tested_sentences(
         )
     if together is not None and together.box is not None:
         yield validation_in_words(together, budget)
-        yield _bound_in_words(together)
+        if together.proof is not None:
+            yield _bound_in_words(together.proof)
 
 
 def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
@@ -141,9 +149,7 @@ def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
         yield "No value of any one of the specified limits would do."
 
 
-def _box_in_words(
-    models: Models, together: LimitsTogether, has_limits: bool, budget: int
-) -> Iterator[str]:
+def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Iterator[str]:
     """The joint limits, and what was found within them."""
     unsafe = models.own.unsafe
     count = len(together.members)
@@ -151,7 +157,7 @@ def _box_in_words(
         if together.boxes:
             kept = (
                 "The specified limits hold with all other characteristics as in the original. "
-                if has_limits
+                if asked.limits
                 else ""
             )
             tested = number_of(together.boxes, "operating range")
@@ -165,9 +171,11 @@ def _box_in_words(
     if len(models.members) > 1:
         where = f"in {count} of {len(models.members)} parameter sets"
     decision = "All joint limits hold at the same time"
-    if has_limits:
+    if asked.limits:
         decision = "The joint limits below hold" if together.broken else "All limits hold"
-    if not budget:
+    if asked.is_quick and asked.budget:
+        decision = "The joint limits below hold at their corners and in the short search"
+    elif not asked.budget:
         decision = (
             "No search for counterexamples tested the joint limits below: they hold at their"
             " corners"
@@ -236,15 +244,14 @@ def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
 
 def _sampled_in_words(together: LimitsTogether) -> str:
     proof = together.proof
-    assert proof is not None
+    if proof is None:
+        return "no random vehicles"
     failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
     unsafe = "none" if not proof.failures else f"{proof.failures}"
     return f"{proof.samples:,} random vehicles, {unsafe} unsafe{failed}"
 
 
-def _bound_in_words(together: LimitsTogether) -> str:
-    proof = together.proof
-    assert proof is not None
+def _bound_in_words(proof: Proof) -> str:
     return (
         f"With {100 * CONFIDENCE:.0f} % confidence at most {100 * proof.at_most:.2f} % of uniformly"
         " sampled vehicles within the limits are unsafe."

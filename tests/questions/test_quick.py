@@ -1,0 +1,96 @@
+"""Rough answers: at once, and never more than they are."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.questions.ask import quick_questions
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.report.page import report
+from tests.in_process import json_of, refused, run
+
+
+@pytest.mark.slow
+def test_a_rough_tolerance_calls_no_limit_kept() -> None:
+    """It says what was tested, and ends with code 3: a gate must not pass by it."""
+    asked = ("tolerance", "smoke", "--quick", "--limits", "mass <= 2500", "--unsafe", "collision")
+    run(*asked, expect=3)
+    answer = sv.tolerance("smoke", limits=("mass <= 2500",), unsafe="collision", quick=True)
+    assert answer.verdict.startswith("Rough answer (--quick)")
+    assert answer.numbers["rough"] is True
+    assert answer.numbers["kept"] is None
+    assert answer.table("limits")["kept"].isna().all()
+    assert answer.numbers["attacked"] == LEAST_SIMULATIONS
+    assert answer.numbers["samples"] is None
+    assert answer.numbers["fits_tried"] == 1
+    assert "no limit is called kept" in answer.failures[0]
+
+
+def test_a_rough_tolerance_says_which_limit_fails() -> None:
+    answer = sv.tolerance("smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True)
+    assert answer.numbers["kept"] is False
+    assert "Do not release" in answer.verdict
+
+
+@pytest.mark.slow
+def test_a_rough_tolerance_of_the_worn_car_searches_at_its_own_points() -> None:
+    """None of the points between, no wider scope, and no bound."""
+    numbers = json_of("tolerance", "wear", "--quick")["numbers"]
+    assert numbers["rough"]
+    assert numbers["box"]
+    assert numbers["attacked"] == LEAST_SIMULATIONS
+    assert "between" not in numbers["scope"]
+    assert numbers["at_most"] is None
+
+
+def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
+    answer = sv.explain("smoke", quick=True)
+    assert answer.verdict.startswith("Rough answer (--quick)")
+    assert (answer.numbers["rough"], answer.numbers["fits"]) == (True, 0)
+
+
+@pytest.mark.slow
+def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
+    answer = sv.repair("wear", promise=("treadDepth >= 4",), quick=True)
+    assert answer.verdict.startswith("Rough answer (--quick)")
+    assert (answer.numbers["rough"], answer.numbers["fits_tried"]) == (True, 1)
+
+
+def test_a_rough_answer_gives_no_speed_and_writes_no_study(tmp_path: Path) -> None:
+    refused(
+        *("tolerance", "wear", "--by", "speed=20,30", "--quick"),
+        message=("--quick", "no value of --by speed=20,30", "--by without --quick"),
+    )
+    refused(
+        *("repair", "wear", "--promise", "all", "--quick", "--out", str(tmp_path / "own.toml")),
+        message=("--quick", "a rough repair is not written", "--out without --quick"),
+    )
+    assert not [*tmp_path.iterdir()]
+
+
+def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:
+    asked = ["tolerance", "tolerance --by speed=20,30", "explain --limit 30000", "risk"]
+    assert quick_questions(asked) == ["tolerance --quick", "explain --limit 30000 --quick", "risk"]
+
+
+@pytest.mark.slow
+def test_a_rough_page_has_no_line_to_sign(slippery: Path, tmp_path: Path) -> None:
+    page = report(slippery, out=tmp_path / "page.html", quick=True, jobs=1).read_text()
+    assert "Do not use this sheet: its limits are rough" in page
+    assert "Rough answer (--quick)" in page
+    assert 'class="signature"' not in page
+
+
+def test_on_a_terminal_the_rough_answer_comes_first(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Elsewhere nothing is computed twice."""
+    for is_terminal in (False, True):
+        monkeypatch.setattr(sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False)
+        answer = sv.explain("smoke", limit=2000, fits=0, progress=True)
+        assert answer.numbers["rough"] is False
+        assert ("Rough answer (--quick)" in capsys.readouterr().err) == is_terminal
