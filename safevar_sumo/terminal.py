@@ -5,6 +5,8 @@ time left.
 
 from __future__ import annotations
 
+import math
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +29,8 @@ SETTLING_TIME = 2.0
 """Work before the time left is shown [s]: batches that end together make earlier estimates
 meaningless.
 """
+NUMBERED = re.compile(r"\b\d+ of \d+, ")
+"""The number of a phase among several, as in `2 of 5, boundaries`."""
 UNLIMITED_WIDTH = 1_000_000
 """Width in which no line is broken [characters]."""
 
@@ -119,17 +123,21 @@ class _Count(ProgressColumn):
 
 
 class _Pace(ProgressColumn):
-    """The mean speed of the phase under way, and the time left at that speed."""
+    """The mean speed of the phase under way, and the time left at that speed: of a phase of several
+    it is that of the phase, and a phase that has ended has none.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._done = 0
         self._total = 0
         self._last = 0.0
+        self._of = ""
         self._begun: tuple[int, float] | None = None
         """What was done when the phase began, such as by an earlier command, and the time [s]."""
 
-    def update(self, done: int, total: int) -> None:
+    def update(self, phase: str, done: int, total: int) -> None:
+        self._of = " of this phase" if NUMBERED.search(phase) else ""
         is_new = self._begun is None or done == 0 or done < self._done or not self._total
         self._done = done
         self._total = total
@@ -138,15 +146,16 @@ class _Pace(ProgressColumn):
             self._begun = done, self._last
 
     def render(self, task: Task | None = None) -> Text:
-        if not self._total:
+        if not self._total or self._done >= self._total:
             return Text("")
         done_before, start = self._begun or (0, 0.0)
         done = self._done - done_before
         worked = self._last - start
         if done <= 0 or worked < SETTLING_TIME:
-            return Text("-:--:-- left")
+            return Text(f"-:--:-- left{self._of}")
         seconds = (self._total - self._done) * worked / done - (time.monotonic() - self._last)
-        return Text(f"{done / worked:.3g}/s, {timedelta(seconds=max(round(seconds), 0))} left")
+        left = timedelta(seconds=max(math.ceil(seconds), 1))
+        return Text(f"{done / worked:.3g}/s, {left} left{self._of}")
 
 
 @contextmanager
@@ -167,7 +176,7 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
     def show(phase: str, done: int, total: int) -> None:
         nonlocal line
         line = f"{phase}: {done} of {total}, " if total else f"{phase}: {done}"
-        pace.update(done, total)
+        pace.update(phase, done, total)
         bar.update(task, description=phase, completed=done, total=total or None)
 
     def print_lines() -> None:

@@ -74,7 +74,17 @@ class Cache:
         self._folder = folder
         self._is_read = is_read
         self._entries: diskcache.Cache | None = None
+        self._keys = dict[bytes, bytes]()
         self._guarded(self._open, None)
+
+    def key_of(self, study: Study, use: Use) -> bytes:
+        """What the simulations of a study depend on besides their settings, as a digest; `use` is
+        what its user code uses.
+        """
+        packed_study = msgspec.msgpack.encode(study)
+        if packed_study not in self._keys:
+            self._keys[packed_study] = _key_of_study(study, use)
+        return self._keys[packed_study]
 
     def get(self, key: bytes) -> bytes | None:
         """The content of an entry; None if there is none, or it has been altered."""
@@ -168,24 +178,6 @@ def cache_in_use() -> Cache | None:
     return _cache.get()
 
 
-def key_of_study(study: Study, use: Use) -> bytes:
-    """What the simulations of a study depend on besides their settings, as a digest.
-
-    The study and its files count as in the identity of results, and besides that the files that
-    user code `use`s, this package's own files, and the versions of Python and of all that is
-    installed.
-    """
-    places = study.origin.places
-    identity = identity_of(study, system_of(study), use.modules)
-    parts = [
-        identity_digest(manifest_of(study, identity)),
-        digests_by_name(use.opened, places),
-        digests_by_name(use.elsewhere, places),
-        _environment(),
-    ]
-    return sha256(msgspec.json.encode(parts)).digest()
-
-
 def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray) -> bytes:
     """The key of settings of a study, as a selection restricts and varies them."""
     digest = sha256(study_key)
@@ -207,8 +199,10 @@ def content_of(evaluations: Evaluations) -> bytes:
     return zlib.compress(buffer.getvalue(), FAST)
 
 
-def evaluations_in(content: bytes) -> Evaluations | None:
-    """The evaluations in an entry's content; None if it holds none."""
+def evaluations_in(content: bytes | None) -> Evaluations | None:
+    """The evaluations in an entry's content; None if it holds none, or there is no entry."""
+    if content is None:
+        return None
     try:
         with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
             arrays = dict(file)
@@ -227,6 +221,24 @@ def evaluations_in(content: bytes) -> Evaluations | None:
         )
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
         return None
+
+
+def _key_of_study(study: Study, use: Use) -> bytes:
+    """What the simulations of a study depend on besides their settings, as a digest.
+
+    The study and its files count as in the identity of results, and besides that the files that
+    user code `use`s, this package's own files, and the versions of Python and of all that is
+    installed.
+    """
+    places = study.origin.places
+    identity = identity_of(study, system_of(study), use.modules)
+    parts = [
+        identity_digest(manifest_of(study, identity)),
+        digests_by_name(use.opened, places),
+        digests_by_name(use.elsewhere, places),
+        _environment(),
+    ]
+    return sha256(msgspec.json.encode(parts)).digest()
 
 
 def _digest(key: bytes, content: bytes) -> bytes:

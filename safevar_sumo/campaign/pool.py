@@ -21,6 +21,7 @@ from typing import Any, Protocol, TypeVar
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
 from safevar_sumo.output import temporary_folder
+from safevar_sumo.plugins import Use
 
 Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
@@ -61,11 +62,11 @@ class Pool:
     ----------
     workers
         Number of jobs that are carried out at the same time.
-    study_keys
-        What the simulations of a study depend on, as a digest, by packed study; a study that it
-        lacks is new to the pool.
+    uses
+        What the user code of a study uses, by packed study; a study that it lacks is new to the
+        pool.
     verified
-        Number of settings whose results were verified, by this digest.
+        Number of settings whose results were verified, by packed study.
     compiled
         Names of the vehicle models that workers find compiled.
     """
@@ -76,7 +77,7 @@ class Pool:
         self._places: Sequence[int] = range(workers)
         self._is_abandoned = Event()
         self._started = dict[int, Worker]()
-        self.study_keys = dict[bytes, bytes]()
+        self.uses = dict[bytes, Use]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
 

@@ -16,13 +16,7 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.cache import (
-    cache_in_use,
-    content_of,
-    evaluations_in,
-    key_of_settings,
-    key_of_study,
-)
+from safevar_sumo.campaign.cache import cache_in_use, content_of, evaluations_in, key_of_settings
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -78,7 +72,8 @@ def evaluate_all(
     the study have been. `done` is called with the number of settings of every finished batch. Of a
     `selection`, nothing is verified in SUMO.
     """
-    study_key = _study_key(study, pool)
+    packed_study = msgspec.msgpack.encode(study)
+    use = _use_of(study, packed_study, pool)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -87,31 +82,29 @@ def evaluate_all(
     found = list[Evaluations]()
     portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
     for portion in np.array_split(distinct_settings, portions):
-        key = key_of_settings(study_key, selection, portion)
-        content = cache.get(key) if cache else None
-        evaluations = evaluations_in(content) if content else None
-        if evaluations is not None:
-            done(len(portion))
-        else:
-            begin()
-            sample_size = verified - pool.verified[study_key]
-            task = Task(study=study, batch_size=batches.best, selection=selection)
-            evaluations = _simulate(task, portion, pool, batches, done, sample_size)
-            pool.verified[study_key] += max(min(sample_size, len(portion)), 0)
-            if cache and not evaluations.failed.any():
-                cache.put(key, content_of(evaluations))
+        key = b""
+        if cache:
+            key = key_of_settings(cache.key_of(study, use), selection, portion)
+            if kept := evaluations_in(cache.get(key)):
+                found.append(kept)
+                done(len(portion))
+                continue
+        begin()
+        sample_size = verified - pool.verified[packed_study]
+        task = Task(study=study, batch_size=batches.best, selection=selection)
+        evaluations = _simulate(task, portion, pool, batches, done, sample_size)
+        pool.verified[packed_study] += max(min(sample_size, len(portion)), 0)
+        if cache and not evaluations.failed.any():
+            cache.put(key, content_of(evaluations))
         found.append(evaluations)
     return Evaluations.concatenate(found).take(row_of.ravel())
 
 
-def _study_key(study: Study, pool: Pool) -> bytes:
-    """What the simulations of a study depend on, as a digest; its user code is checked first, once
-    in a pool.
-    """
-    packed_study = msgspec.msgpack.encode(study)
-    if packed_study not in pool.study_keys:
-        pool.study_keys[packed_study] = key_of_study(study, check_code(study, pool))
-    return pool.study_keys[packed_study]
+def _use_of(study: Study, packed_study: bytes, pool: Pool) -> Use:
+    """What the user code of a study uses, which is checked once in a pool."""
+    if packed_study not in pool.uses:
+        pool.uses[packed_study] = check_code(study, pool)
+    return pool.uses[packed_study]
 
 
 def _simulate(
@@ -209,10 +202,13 @@ def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lam
     "" if they do. `begin` is called before anything is simulated.
     """
     cache = cache_in_use()
-    key = hashlib.sha256(b"no verdict" + _study_key(study, pool)).digest()
-    content = cache.get(key) if cache else None
-    if content is not None:
-        return content.decode()
+    key = b""
+    if cache:
+        use = _use_of(study, msgspec.msgpack.encode(study), pool)
+        key = hashlib.sha256(b"no verdict" + cache.key_of(study, use)).digest()
+        content = cache.get(key)
+        if content is not None:
+            return content.decode()
     begin()
     reason = str(carry_out(_why_no_verdict, [(Task(study=study),)], pool)[0])
     if cache:

@@ -45,6 +45,42 @@ CANDIDATES = 512
 """Number of encounters over its domain from which they are chosen."""
 
 
+class _Plan:
+    """Progress of a question whose stages come one after another, without a way back: what is not
+    planned, or belongs to an earlier stage, counts in the one under way, and no count falls.
+    """
+
+    def __init__(self, show: Progress, stages: Sequence[str]) -> None:
+        self._show = show
+        self._stages = stages
+        self._number = 0
+        """The number of the stage under way, from 1; 0 before the first."""
+        self._name = ""
+        self._part, self._done_in_part = "", 0
+        """The stage that is shown as a part of the one under way, and what is done in it."""
+        self._before = self._done = 0
+        """What was done before this part, and what is done in all."""
+
+    def show_part(self, part: str, done: int, total: int) -> None:
+        """Show the progress of a stage, as a part of the stage under way."""
+        if part == COMPILING:
+            self._show(part, done, total)
+            return
+        # The next planned stage, or one before the first, begins its own count.
+        number = self._stages.index(part) + 1 if part in self._stages else 0
+        if number > self._number or (not self._number and part != self._name):
+            self._number = number
+            self._name = part
+            self._before = self._done = 0
+        # A part that follows another one, or begins again, goes on where that one ended.
+        elif part != self._part or done < self._done_in_part:
+            self._before = self._done - done
+        self._part, self._done_in_part = part, done
+        self._done = self._before + done
+        words = f"{self._number} of {len(self._stages)}, " if self._number else ""
+        self._show(f"{words}{self._name}", self._done, self._before + total if total else 0)
+
+
 class _Stage:
     """Progress of a stage over several calls: `earlier` settings are done, and about `total` are
     expected.
@@ -113,7 +149,7 @@ class Evaluator:
             self.region = region_of(study)
         self.characteristics = self.region.characteristics
         self._pool = pool
-        self.progress = progress
+        self.progress = self._told = progress
         self._verified = verified
         self._counts = dict[str, int]()
         """Settings of each stage that has ended; where it begins again, its count goes on."""
@@ -155,13 +191,7 @@ class Evaluator:
 
     def plan(self, *stages: str) -> None:
         """Let progress number these stages of a question: `2 of 5, boundaries`."""
-        show = self.progress
-
-        def show_numbered(stage: str, done: int, total: int) -> None:
-            number = f"{stages.index(stage) + 1} of {len(stages)}, " if stage in stages else ""
-            show(f"{number}{stage}", done, total)
-
-        self.progress = show_numbered
+        self.progress = _Plan(self._told, stages).show_part
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
@@ -471,8 +501,10 @@ def open_evaluator(
         If the study's models cannot be assembled.
     """
     if pool is not None:
-        yield Evaluator(study, pool, progress)
+        evaluator = Evaluator(study, pool, progress)
+        evaluator.plan()
+        yield evaluator
         return
     assemble(study)  # before workers start
-    with open_pool(jobs) as new_pool:
-        yield Evaluator(study, new_pool, progress)
+    with open_pool(jobs) as new_pool, open_evaluator(study, new_pool, None, progress) as evaluator:
+        yield evaluator
