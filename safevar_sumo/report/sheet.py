@@ -4,27 +4,36 @@ be printed alone. Its sentences stand in `web/sheet.html.j2`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from hashlib import sha256
 from typing import Any
 
 from markupsafe import Markup
 
+from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import SENTENCE_END, Answer, Columns, tabulate
 from safevar_sumo.questions.tables import columns_of, html_table
+from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import JsonObject
-from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
+from safevar_sumo.scenarios.euro_ncap import TESTS
 from safevar_sumo.study import unit_text
-from safevar_sumo.vehicles import Characteristic
+from safevar_sumo.vehicles import VEHICLES, Characteristic
 
 PARTS: Columns = {
     "part": "characteristic of the vehicle",
     "how to measure": "how a workshop measures it",
     "limit": "values that are allowed, all limits at the same time",
+    "measured": "to be filled in: the value of the vehicle that is checked",
     "beyond the limit": "what to do with a vehicle beyond the limit",
 }
 UNSAID = "the study does not say"
+BLANK = "_" * 8
+"""Place for a value that is filled in by hand."""
+NAMED_TESTS = re.compile(r".*? \((.*?)\)(.*)")
+"""A phrase of a scope: a scenario, the names of its tests, and their speeds."""
 DIGITS = 16
 """Number of hexadecimal digits of the digest that are printed."""
 
@@ -54,7 +63,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "unsafe": Unsafe.parse(numbers.get("unsafe", "collision")),
         "parts": Markup(html_table(tabulate("Parts and their limits", PARTS, rows))),
         "numbers": numbers,
-        "tests": "; ".join(tests),
+        "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
+        "ads": name_and_sentence(ADS, limits.study.ads.model),
+        "tests": [_tests_in_words(phrase) for phrase in tests],
         "road": road,
         "wider": [] if wider is None else wider.to_dict("records"),
         "own_limit": None if by_value is None else _own_limit(by_value),
@@ -85,28 +96,45 @@ def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
     """
     rows = {row["characteristic"]: row for row in limits.tables["limits"].to_dict("records")}
     for item in study.case.characteristics.vehicle:
+        name = item.meaning or item.short_name
         yield (
-            f"{item.short_name[:1].upper()}{item.short_name[1:]}",
+            f"{name[:1].upper()}{name[1:]}",
             item.measurement or UNSAID,
             _limit_in_words(item, rows.get(item.name)),
+            f"{BLANK}{item.suffix}",
             item.remedy or UNSAID,
         )
 
 
 def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     """A limit: `at least 3 mm`. An end of the domain is none, unless both are."""
-    if row is None or row["together_low"] == row["together_high"]:
+    # A part without a limit or without room, on either side, stays as it was.
+    domain = (item.lower, item.upper)
+    low, high = (None, None) if row is None else (row["together_low"], row["together_high"])
+    if low == high and low not in domain:
         return f"{item.original:.10g}{item.suffix}, as in the original vehicle"
-    sides = (
-        ("at least", row["together_low"], item.lower),
-        ("at most", row["together_high"], item.upper),
-    )
-    ends = [f"{word} {end:.10g}{item.suffix}" for word, end, last in sides if end != last]
+
+    # A pure number that is 1 in the original vehicle is a share of its value.
+    is_share = not item.suffix and item.original == 1
+    unit = " of the original vehicle's" if is_share else item.suffix
+    sides = zip(("at least", "at most"), (low, high), domain, strict=True)
+    ends = [f"{word} {end:.10g}{unit}" for word, end, last in sides if end != last]
     return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
 
 
 def _domain_in_words(item: Characteristic) -> str:
     return f"{item.lower:.10g} to {item.upper:.10g}{item.suffix}"
+
+
+def _tests_in_words(phrase: str) -> str:
+    """A phrase of a scope, with what happens in Euro NCAP's tests: `an adult crosses from the far
+    side (CPFA) at 10 to 40 km/h`.
+    """
+    found = NAMED_TESTS.fullmatch(phrase)
+    names = re.split(", | and ", found[1]) if found else []
+    if not found or not TESTS.keys() >= set(names):
+        return phrase
+    return f"{join_phrases(f'{TESTS[name].words} ({name})' for name in names)}{found[2]}"
 
 
 def _own_limit(by_value: Answer) -> JsonObject:

@@ -68,6 +68,8 @@ class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes
     ----------
+    words
+        What happens in the test, for readers who do not know its name.
     target, pre_crash
         The target, and the pre-crash type of the encounter.
     slowest, fastest, locations
@@ -81,6 +83,7 @@ class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
         Of a car or motorcyclist ahead: time headway at the start [s].
     """
 
+    words: str
     target: str
     pre_crash: PreCrash
     slowest: float

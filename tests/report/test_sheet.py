@@ -25,11 +25,11 @@ STUDY = read_study("wear")
 CHARACTERISTICS = CharacteristicSet.of(STUDY)
 LIMITS = [
     ("treadDepth", 3.0, 8.0, "at least 3 mm"),
-    ("brakeTorque", 0.85, 1.0, "at least 0.85"),
+    ("brakeTorque", 0.85, 1.0, "at least 0.85 of the original vehicle's"),
     ("brakeResponse", 0.05, 0.132, "at most 0.132 s"),
     ("payload", 75.0, 525.0, "any tested value: 75 to 525 kg"),
     ("payloadCentre", 1.3, 2.0, "at least 1.3 m and at most 2 m"),
-    ("sensorRange", 80.0, 80.0, "80 m, as in the original vehicle"),
+    ("sensorRange", 80.0, 80.0, "at least 80 m"),
     ("sensorLatency", 0.05, 0.05, "0.05 s, as in the original vehicle"),
 ]
 """Joint limits and their words; nobody asked for those of the last."""
@@ -46,7 +46,10 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
         "margin": 0.3,
         "kept": True,
         "rough": False,
-        "scope": "crossing (CPFA) at 10 to 40 km/h; road wet, by day",
+        "scope": (
+            "crossing (CPFA and CPNCO) at 10 to 40 km/h; lead vehicle stopped at 50 km/h; stop"
+            " (full) at 80 km/h; road wet, by day"
+        ),
         "box": True,
         "contacts_left_out": None,
     }
@@ -78,16 +81,21 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
     answer = answer_of()
     sheet = sheet_with(answer)
     for item, (*_, limit) in zip(CHARACTERISTICS, LIMITS, strict=True):
-        assert "".join((item.short_name[1:], item.measurement, limit, item.remedy)) in sheet
+        blank = f"________{item.suffix}"
+        assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "Vehicle and studyvehicle worn, driving system aeb, study wear",
-        "Tests and speedscrossing (CPFA) at 10 to 40 km/h",
+        "Simulated vehicleworn (A car with two axles",
+        "; study wear",
+        "Driving systemaeb (Holds its speed; brakes in part, then fully,",
+        "Tests and speedsan adult crosses from the far side (CPFA) and a child crosses from the"
+        " near side, hidden by parked cars (CPNCO) at 10 to 40 km/h;"
+        "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
         "Road and lightroad wet, by day",
-        "Original vehicleThe original vehicle keeps at least 0.3 m in all of these tests.",
+        "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these tests.",
         "Versionslibsumo 1.28",
-        "Values outside the tested ranges: tread depth 1.6 to 8 mm; brake torque as a share of a"
-        " new vehicle's 0.5 to 1;",
-        "Name and signature:",
+        "Values outside the tested ranges: tread depth 1.6 to 8 mm; relative brake torque 0.5 to 1",
+        "Vehicle checked: licence plate VIN odometer km",
+        "The signature does not cover a part without a value. Date: Name and signature:",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
     ):
         assert words in sheet
