@@ -19,13 +19,7 @@ FAILURE = (
     f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set maxBrakeTorque=1200"
 )
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
-LIMITED = 'extends = "native"\nname = "native"\n[limits]\ndecel = { at_least = 8 }\n'
-"""The study of the page."""
-ASKED = (
-    "--ask 'tolerance --characteristics decel,tau,reactionTime' --ask 'explain --limit 10000' "
-    "--ask 'risk --samples 1000' --ask 'rules --samples 1000'"
-)
-SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1000"
+SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1520"
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
@@ -42,19 +36,18 @@ COMMANDS = {
     "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
     "report.png": (
-        f"{PROGRAM} study native.toml --runs 2 --evaluations 200 --out native --quiet && "
-        f"{PROGRAM} report native {ASKED} --out page.html && "
+        f"{PROGRAM} study autoware_july --runs 1 --evaluations 100 --out july --quiet && "
+        f"{PROGRAM} report july --ask 'tolerance --fits 0' --out page.html && "
         f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null"
     ),
 }
-"""The command of each picture, in a folder that has the study of the page."""
+"""The command of each picture, in a folder of its own."""
 
 
 def draw(name: str, folder: Path) -> Path:
     """Draw a picture into a folder."""
     picture = folder.resolve() / name
     with tempfile.TemporaryDirectory() as place:
-        Path(place, "native.toml").write_text(LIMITED, encoding="utf-8")
         command = COMMANDS[name].format(shlex.quote(str(picture)))
         subprocess.run(command, shell=True, check=True, cwd=place, stdout=subprocess.DEVNULL)
     return picture

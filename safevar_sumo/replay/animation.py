@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
+    from matplotlib.text import Annotation
 
 WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
 """Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels
@@ -27,7 +29,7 @@ per inch].
 """
 GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
 TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
-PERSON_COLOUR, BRAKE_COLOUR = "#1d2329", "#e60000"
+PERSON_COLOUR, BRAKE_COLOUR, IMPACT_COLOUR = "#1d2329", "#e60000", "#ffd400"
 ENDINGS = (".gif", ".html")
 """Endings of the files that `animate` writes."""
 SECONDS_PER_FRAME = 0.1
@@ -108,13 +110,15 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     # What is drawn once.
     _draw_road(axis, scene)
     bodies = [(body, *_draw_body(axis, body, scene)) for body in scene.bodies]
-    clock = figure.text(0.014, 0.98, "", fontsize=18, color=TEXT_COLOUR, va="top")
+    names = [(body, *_draw_name(axis, body, scene)) for body in scene.bodies if body.is_vut]
+    clock = figure.text(0.014, 0.98, "", fontsize=20, color=TEXT_COLOUR, va="top")
     texts = [
         figure.text(
             0.15,
-            1 - (8 + 26 * row) / (PANEL_HEIGHT + height),
+            1 - (6 + 27 * row) / (PANEL_HEIGHT + height),
             "",
-            fontsize=11,
+            fontsize=13,
+            weight="bold",
             color=COLOURS[row],
             va="top",
             family="monospace",
@@ -134,10 +138,17 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
                 )
                 patch.set_visible(bool(is_shown))
 
+        # The name beside each vehicle under test and, from the impact on, the place of it.
+        for body, name, impact in names:
+            place = (body.x[sample], body.y[sample])
+            name.xy = place
+            impact.set_data([place[0]], [place[1]])
+            impact.set_visible(scene.has_collided(body, sample))
+
         # The time and both readings.
         clock.set_text(f"{sample * scene.step:.2f} s")
         for row, text in enumerate(texts):
-            text.set_text(f"{scene.comparison.name(row)}  {scene.reading(row, sample)}")
+            text.set_text(f"{scene.comparison.name(row):8}  {scene.reading(row, sample)}")
         return []  # Matplotlib draws the whole figure again
 
     return figure, show
@@ -167,13 +178,43 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
         axis.vlines(mark, scene.bottom, scene.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
 
 
+def _draw_name(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[Annotation, Line2D]:
+    """The name of a vehicle under test, the original's above it and the changed one's below; and a
+    mark for an impact at its front bumper.
+    """
+    side = 1 if body.row == ORIGINAL else -1
+    scale = WIDTH / scene.width * 72 / DPI  # [points per m]
+    name = axis.annotate(
+        scene.comparison.name(body.row),
+        (body.x[0], body.y[0]),
+        (-body.length / 2 * scale, side * (body.width / 2 * scale + 3)),
+        textcoords="offset points",
+        color=TEXT_COLOUR,
+        fontsize=13,
+        ha="center",
+        va="bottom" if side > 0 else "top",
+        annotation_clip=False,
+    )
+    (impact,) = axis.plot(
+        [],
+        [],
+        marker=(11, 1, 0),
+        markersize=2.2 * scale,
+        color=IMPACT_COLOUR,
+        markeredgecolor=TEXT_COLOUR,
+        zorder=2.5,
+    )
+    return name, impact
+
+
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
     """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle,
     is at the origin.
     """
     from matplotlib.patches import Circle, Rectangle
 
-    # A person is a circle.
+    # A person is a circle, beside the original vehicle an empty one.
+    is_empty = body.row == ORIGINAL and len(scene.comparison.rows) > 1
     length = body.length
     width = body.width
     if body.is_person:
@@ -182,8 +223,8 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
                 Circle(
                     (0, 0),
                     max(length, width) / 2,
-                    facecolor=PERSON_COLOUR,
-                    edgecolor="white",
+                    facecolor="white" if is_empty else PERSON_COLOUR,
+                    edgecolor=PERSON_COLOUR if is_empty else "white",
                     zorder=3,
                 )
             )
@@ -191,7 +232,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
 
     # A vehicle is a rectangle; the original one is an outline beneath the other.
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
-    is_beneath = body.is_vut and body.row == ORIGINAL and len(scene.comparison.rows) > 1
+    is_beneath = body.is_vut and is_empty
 
     def draw(
         x: float,

@@ -57,6 +57,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     rows = () if missing else _parts(study, limits)
     *tests, road = numbers.get("scope", "").split("; ")
     wider = limits.tables.get("wider")
+    varied = set(limits.table().get("characteristic", ()))
     return {
         "missing": missing,
         "is_signed": not (missing or numbers["rough"] or study.later_changes),
@@ -72,7 +73,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
-            f"{item.short_name} {_domain_in_words(item)}"
+            f"{item.short_name} {_range_in_words(item, is_varied=item.name in varied)}"
             for item in study.case.characteristics.vehicle
         ],
     }
@@ -119,10 +120,13 @@ def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     unit = " of the original vehicle's" if is_share else item.suffix
     sides = zip(("at least", "at most"), (low, high), domain, strict=True)
     ends = [f"{word} {end:.10g}{unit}" for word, end, last in sides if end != last]
-    return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
+    return " and ".join(ends) or f"any tested value: {_range_in_words(item)}"
 
 
-def _domain_in_words(item: Characteristic) -> str:
+def _range_in_words(item: Characteristic, *, is_varied: bool = True) -> str:
+    """The values that were tested: the domain, or that of the original vehicle alone."""
+    if not is_varied:
+        return f"only {item.original:.10g}{item.suffix}"
     return f"{item.lower:.10g} to {item.upper:.10g}{item.suffix}"
 
 

@@ -24,7 +24,14 @@ from PIL import Image
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay import animation, gui
-from safevar_sumo.replay.animation import PANEL_HEIGHT, WIDTH, animate, animation_page, draw_scene
+from safevar_sumo.replay.animation import (
+    IMPACT_COLOUR,
+    PANEL_HEIGHT,
+    WIDTH,
+    animate,
+    animation_page,
+    draw_scene,
+)
 from safevar_sumo.replay.comparison import COLOURS, Comparison, comparison_of, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
@@ -185,6 +192,20 @@ def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Compari
     for row, body in enumerate(one for one in scene.bodies if one.is_vut):
         _, columns = of_colour(end, COLOURS[row])
         assert columns.max() == pytest.approx((body.x[-1] - scene.left_ends[-1]) * scale, abs=4)
+
+
+def test_an_impact_is_marked_from_its_moment_on_at_the_bumper_of_the_vehicle_that_collides(
+    comparison: Comparison,
+) -> None:
+    scene = lay_out_scene(comparison)
+    changed = [body for body in scene.bodies if body.is_vut][1]
+    impact = comparison.moments[1].decided
+    assert of_colour(frame(scene, impact - 1), IMPACT_COLOUR).size == 0
+    for sample in (impact, scene.sample_count - 1):
+        marked = of_colour(frame(scene, sample), IMPACT_COLOUR)
+        front = (changed.x[sample] - scene.left_ends[sample]) * WIDTH / scene.width
+        assert marked[1].min() <= front + 4
+        assert marked[1].max() == pytest.approx(front, abs=1.2 * WIDTH / scene.width)
 
 
 @pytest.mark.slow
