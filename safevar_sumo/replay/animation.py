@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
-    from matplotlib.text import Annotation
 
 WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
 """Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels
@@ -30,6 +28,13 @@ per inch].
 GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
 TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
 PERSON_COLOUR, BRAKE_COLOUR, IMPACT_COLOUR = "#1d2329", "#e60000", "#ffd400"
+NAME_STYLE: Any = {"color": TEXT_COLOUR, "fontsize": 13, "ha": "center", "va": "center"}
+IMPACT_STYLE: Any = {
+    "marker": (11, 1, 0),  # a star with 11 points
+    "markersize": 50,
+    "color": IMPACT_COLOUR,
+    "markeredgecolor": TEXT_COLOUR,
+}
 ENDINGS = (".gif", ".html")
 """Endings of the files that `animate` writes."""
 SECONDS_PER_FRAME = 0.1
@@ -110,7 +115,9 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     # What is drawn once.
     _draw_road(axis, scene)
     bodies = [(body, *_draw_body(axis, body, scene)) for body in scene.bodies]
-    names = [(body, *_draw_name(axis, body, scene)) for body in scene.bodies if body.is_vut]
+    vuts = [body for body in scene.bodies if body.is_vut]
+    names = [axis.text(0, 0, scene.comparison.name(body.row), **NAME_STYLE) for body in vuts]
+    impacts = [axis.plot([], [], **IMPACT_STYLE)[0] for _ in vuts]
     clock = figure.text(0.014, 0.98, "", fontsize=20, color=TEXT_COLOUR, va="top")
     texts = [
         figure.text(
@@ -138,12 +145,14 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
                 )
                 patch.set_visible(bool(is_shown))
 
-        # The name beside each vehicle under test and, from the impact on, the place of it.
-        for body, name, impact in names:
-            place = (body.x[sample], body.y[sample])
-            name.xy = place
-            impact.set_data([place[0]], [place[1]])
-            impact.set_visible(scene.has_collided(body, sample))
+        # The name of each vehicle under test, the original's above it and the changed one's below,
+        # and at its front bumper the impact that its reading tells.
+        for body, name, impact in zip(vuts, names, impacts, strict=True):
+            x, y = body.x[sample], body.y[sample]
+            side = 1 if body.row == ORIGINAL else -1
+            name.set_position((x - body.length / 2, y + side * 0.75 * body.width))
+            impact.set_data([x], [y])
+            impact.set_visible("collides" in scene.reading(body.row, sample))
 
         # The time and both readings.
         clock.set_text(f"{sample * scene.step:.2f} s")
@@ -178,35 +187,6 @@ def _draw_road(axis: Axes, scene: FlatScene) -> None:
         axis.vlines(mark, scene.bottom, scene.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
 
 
-def _draw_name(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[Annotation, Line2D]:
-    """The name of a vehicle under test, the original's above it and the changed one's below; and a
-    mark for an impact at its front bumper.
-    """
-    side = 1 if body.row == ORIGINAL else -1
-    scale = WIDTH / scene.width * 72 / DPI  # [points per m]
-    name = axis.annotate(
-        scene.comparison.name(body.row),
-        (body.x[0], body.y[0]),
-        (-body.length / 2 * scale, side * (body.width / 2 * scale + 3)),
-        textcoords="offset points",
-        color=TEXT_COLOUR,
-        fontsize=13,
-        ha="center",
-        va="bottom" if side > 0 else "top",
-        annotation_clip=False,
-    )
-    (impact,) = axis.plot(
-        [],
-        [],
-        marker=(11, 1, 0),
-        markersize=2.2 * scale,
-        color=IMPACT_COLOUR,
-        markeredgecolor=TEXT_COLOUR,
-        zorder=2.5,
-    )
-    return name, impact
-
-
 def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
     """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle,
     is at the origin.
@@ -224,7 +204,7 @@ def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch
                     (0, 0),
                     max(length, width) / 2,
                     facecolor="white" if is_empty else PERSON_COLOUR,
-                    edgecolor=PERSON_COLOUR if is_empty else "white",
+                    edgecolor=PERSON_COLOUR,
                     zorder=3,
                 )
             )

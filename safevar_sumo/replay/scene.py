@@ -90,12 +90,6 @@ class FlatScene:
             self.comparison.runs.trace.brake[min(sample, last_sample), body.row] > 0
         )
 
-    def has_collided(self, body: FlatBody, sample: int) -> bool:
-        """Whether the run of this vehicle under test ends with a collision that has happened."""
-        return sample >= self.comparison.moments[body.row].decided and not math.isnan(
-            self.comparison.runs.collision_speed[body.row]
-        )
-
     def reading(self, row: int, sample: int) -> str:
         """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its
         run ends.

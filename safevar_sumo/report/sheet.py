@@ -32,8 +32,6 @@ PARTS: Columns = {
 UNSAID = "the study does not say"
 BLANK = "_" * 8
 """Place for a value that is filled in by hand."""
-NAMED_TESTS = re.compile(r".*? \((.*?)\)(.*)")
-"""A phrase of a scope: a scenario, the names of its tests, and their speeds."""
 DIGITS = 16
 """Number of hexadecimal digits of the digest that are printed."""
 
@@ -73,8 +71,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
-            f"{item.short_name} {_range_in_words(item, is_varied=item.name in varied)}"
+            f"{item.short_name} {_domain_in_words(item)}"
             for item in study.case.characteristics.vehicle
+            if item.name in varied
         ],
     }
 
@@ -120,13 +119,10 @@ def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     unit = " of the original vehicle's" if is_share else item.suffix
     sides = zip(("at least", "at most"), (low, high), domain, strict=True)
     ends = [f"{word} {end:.10g}{unit}" for word, end, last in sides if end != last]
-    return " and ".join(ends) or f"any tested value: {_range_in_words(item)}"
+    return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
 
 
-def _range_in_words(item: Characteristic, *, is_varied: bool = True) -> str:
-    """The values that were tested: the domain, or that of the original vehicle alone."""
-    if not is_varied:
-        return f"only {item.original:.10g}{item.suffix}"
+def _domain_in_words(item: Characteristic) -> str:
     return f"{item.lower:.10g} to {item.upper:.10g}{item.suffix}"
 
 
@@ -134,11 +130,12 @@ def _tests_in_words(phrase: str) -> str:
     """A phrase of a scope, with what happens in Euro NCAP's tests: `an adult crosses from the far
     side (CPFA) at 10 to 40 km/h`.
     """
-    found = NAMED_TESTS.fullmatch(phrase)
-    names = re.split(", | and ", found[1]) if found else []
-    if not found or not TESTS.keys() >= set(names):
+    # The phrase has the scenario, the names of its tests in brackets, and their speeds.
+    tests, _, speeds = phrase.partition(" (")[2].partition(")")
+    names = re.split(", | and ", tests)
+    if not TESTS.keys() >= set(names):
         return phrase
-    return f"{join_phrases(f'{TESTS[name].words} ({name})' for name in names)}{found[2]}"
+    return f"{join_phrases(f'{TESTS[name].words} ({name})' for name in names)}{speeds}"
 
 
 def _own_limit(by_value: Answer) -> JsonObject:

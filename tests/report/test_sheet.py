@@ -94,7 +94,7 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these",
         "Versionslibsumo 1.28",
         "Values outside the tested ranges: tread depth 1.6 to 8 mm; relative brake torque 0.5 to 1",
-        "detection range of the sensors 15 to 80 m; perception latency only 0.05 s.",
+        "sensors 15 to 80 m. Every other part was as in the original vehicle.",
         "Vehicle checked: licence plate VIN odometer km",
         "The signature does not cover a part without a value. Date: Name and signature:",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
