@@ -38,6 +38,7 @@ MEANINGS = {
     "cluster": "a Dask cluster of two workers is so many times as fast as two processes",
     "answer": "an answer takes so many times what its simulations cost in large batches",
     "answer_simulating": "its simulations take so many times that",
+    "answer_again": "the same command, asked again, takes so many times that with the cache",
     "growth_time": "the last evaluations take so many times what the first took",
     "growth_memory": (
         "a worker holds so many times the memory that it held after the first 5,000 evaluations"
