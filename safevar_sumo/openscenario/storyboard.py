@@ -133,8 +133,10 @@ class Storyboard(Player):
         is known while a robot drives it.
         """
         end = self.profile.end_time
+        # What holds at the last sample of the profile may begin one sample later.
+        known = end + 2 * STEP
         for key, waits in self.reactions:
-            if not end or self.begun.get(key, math.inf) > end:
+            if not end or min(self.begun.get(key, math.inf), self.now) >= known:
                 raise unsupported(
                     f"{waits} of {self.ego.name}, which only a run can tell",
                     "a condition on time, places or others",

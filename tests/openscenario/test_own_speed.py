@@ -54,6 +54,22 @@ def when(condition: str) -> str:
     return event(lane_change(-1, "linear", "time", 2), watching("Ego", condition), "Aside")
 
 
+def test_a_speed_that_is_met_at_the_end_of_the_profile_is_known(tmp_path: Path) -> None:
+    """10 m/s at 3 m/s^2 take 3.333 s, between two samples; a step takes none; and a scene that ends
+    before, as Ego stands for 1 s, has no end of the profile.
+    """
+    car = when('<SpeedCondition value="9.99" rule="greaterThan"/>')
+    at_start = private("Ego", teleport(at(-1, 50)), speed(10, "linear", "rate", 3))
+    assert begins(played(tmp_path, ego=at_start, car=car)) == pytest.approx(3.34)
+    step = event(speed(10), AT_ONCE.format(1), "Step")
+    assert begins(played(tmp_path, step, car=car)) == pytest.approx(1.01)
+    stop = trigger(watching("Ego", '<StandStillCondition duration="1"/>'), "")
+    slow = event(speed(10, "linear", "time", 20), AT_ONCE.format(3), "Slow")
+    groups = group(slow, actor="Ego") + group(car)
+    file = write(tmp_path, groups=groups, ego=STANDING, stop=stop)
+    assert play(file, {}).duration == pytest.approx(5)
+
+
 def test_ego_accelerates_and_then_keeps_its_speed(tmp_path: Path) -> None:
     """From 1 s on by 4 m/s^2 to 20 m/s; nothing switches a driving system on before 6 s."""
     scene = played(tmp_path, FASTER)
