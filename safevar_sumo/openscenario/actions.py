@@ -256,18 +256,23 @@ def _go_on(actor: Actor, way: Way) -> list[Running]:
 
 def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> list[Running]:
     """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in
-    between.
+    between. It ends at the end of the trajectory.
     """
     start = None if actor.at is None else actor.at.pose
     line = line_of(_trajectory(action), player.network, player.place_of, start)
-    actor.at = Place(line, number(action, "initialDistanceOffset", 0.0), 0.0)
-    actor.sideways = None
+    offset = number(action, "initialDistanceOffset", 0.0)
+    actor.at = Place(line, offset, 0.0)
+    travelled = float(actor.travelled[player.sample])
+    sideways = actor.begin(
+        "sideways", line.length - offset, travelled, np.zeros_like, over_distance=True
+    )
     timing = action.find("TimeReference/Timing")
     if timing is None:
-        return []
+        return [sideways]
     if not line.times:
         raise unsupported(
-            "FollowTrajectoryAction with Timing: every vertex needs a time", "Vertex with time"
+            "FollowTrajectoryAction with Timing: the trajectory has no times",
+            "time at each Vertex, startTime and stopTime of a Clothoid",
         )
     is_relative = timing.get("domainAbsoluteRelative") == "relative"
     begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
@@ -326,8 +331,7 @@ INIT_ORDER = (
     ("SpeedAction",),
     ("AssignRouteAction", "AcquirePositionAction"),
 )
-"""The order of actions in Init, whose list has none: places, speeds, routes, and then all others.
-"""
+"""The order of actions in Init, whose list has none: places, speeds, routes, then all others."""
 
 
 def leaf_of(action: Element) -> Element:

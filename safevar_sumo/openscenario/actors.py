@@ -161,6 +161,8 @@ class Actor:
             self.follows = None
             self.stations = None
         else:
+            if self.stations is not None:  # who leaves a trajectory with times keeps its speed
+                self.hold()
             self.sideways = Motion(since, value, until if over_distance else None)
         return running
 

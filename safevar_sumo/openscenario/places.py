@@ -11,7 +11,15 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from safevar_sumo.errors import one_of
-from safevar_sumo.openscenario.document import Element, attribute, number, part, unsupported, whole
+from safevar_sumo.openscenario.document import (
+    Element,
+    attribute,
+    number,
+    part,
+    truth,
+    unsupported,
+    whole,
+)
 from safevar_sumo.openscenario.lines import Line, Piece, Pose, unit
 from safevar_sumo.openscenario.road import Network, Road
 from safevar_sumo.openscenario.ways import AHEAD, MAX_DETOUR, Crossing, Way
@@ -318,6 +326,8 @@ def line_of(
     trajectory: Element, network: Network, entity: Entity, start: Pose | None = None
 ) -> Line:
     """The line of a Trajectory (class Shape); `start` is where its actor is."""
+    if truth(trajectory, "closed"):
+        raise unsupported("a closed Trajectory is not supported", "closed = false")
     shape = part(trajectory, "Shape/*")
     match shape.tag:
         case "Polyline":
@@ -329,7 +339,9 @@ def line_of(
             length = number(shape, "length")
             first = number(shape, "curvature")
             slope = number(shape, "curvaturePrime", number(shape, "curvatureDot", 0.0))
-            return Line([Piece(pose, length, first, first + slope * length)])
+            piece = Piece(pose, length, first, first + slope * length)
+            times = [number(shape, key) for key in ("startTime", "stopTime") if key in shape.attrib]
+            return Line([piece], (0.0, length), times if len(times) == 2 else ())
     raise unsupported(
         f"the trajectory's {shape.tag} is not supported; supported: Polyline, Clothoid,"
         " ClothoidSpline",

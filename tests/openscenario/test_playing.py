@@ -6,6 +6,7 @@ our own.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import STEP, Moved, Played, play
 from safevar_sumo.openscenario.lines import Piece, Pose
 from tests.openscenario.writing import (
@@ -202,6 +204,41 @@ def test_a_trajectory_with_times_and_without(tmp_path: Path) -> None:
     free = only(play(write(tmp_path, car=(polyline(*VERTICES, timing="<None/>"), speed(5))), {}))
     for time, where in {2.0: 106 + 8j, 1.0: 103 + 4j, 4.0: 116 + 8j, 6.0: 126 + 8j}.items():
         assert abs(origin(free)[round(time / STEP)] - where) < 1e-6
+
+
+def test_a_trajectory_ends_where_its_line_ends(tmp_path: Path) -> None:
+    """10 + 12 m at 5 m/s from 1 s on; what waits for its end begins then."""
+    along = event(polyline(*VERTICES, timing="<None/>"), AT_ONCE.format(1))
+    then = event(speed(9), DONE.format("event", "Event"), "Then")
+    car = teleport(at(-2, 90)), speed(5)
+    played = play(write(tmp_path, along, then, car=car), {})
+    assert played.events[0][3] == pytest.approx(5.4)
+    assert np.flatnonzero(only(played).speed > 5)[0] * STEP == pytest.approx(5.4)
+
+
+def test_who_leaves_a_trajectory_with_times_keeps_its_speed(tmp_path: Path) -> None:
+    """6 m/s in lane -2 by times; the lane change begins at 1 s and takes 2 s."""
+    vertices = (0.0, 100.0, 14.0), (4.0, 124.0, 14.0)
+    timing = "<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>"
+    change = event(lane_change(-1, "linear", "time", 2), AT_ONCE.format(1))
+    car = only(play(write(tmp_path, change, car=(polyline(*vertices, timing=timing),)), {}))
+    steps = np.abs(np.diff(origin(car)))
+    assert np.abs(steps - 6 * STEP).max() < 1e-6
+    assert origin(car)[300:].imag == pytest.approx(18)
+
+
+def test_a_clothoid_has_times(tmp_path: Path) -> None:
+    """24 m in 3 s, straight on."""
+    clothoid = f'<Clothoid curvature="0" curvaturePrime="0" length="24" startTime="1" stopTime="4"><Position>{world(100, 14)}</Position></Clothoid>'
+    action = polyline(timing="<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>")
+    action = re.sub("<Polyline>.*</Polyline>", clothoid, action)
+    car = only(play(write(tmp_path, car=(action,)), {}))
+    assert origin(car)[[0, 100, 250, 400]] == pytest.approx(
+        np.array([100, 100, 112, 124]) + 14j, abs=0.05
+    )
+    closed = action.replace('closed="false"', 'closed="true"')
+    with pytest.raises(InputError, match="a closed Trajectory is not supported"):
+        play(write(tmp_path, car=(closed,)), {})
 
 
 def test_a_distance_is_kept_between_bodies(tmp_path: Path) -> None:
