@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from safevar_sumo.errors import one_of
-from safevar_sumo.openscenario.actors import Actor, Array, Following, Motion, Running
+from safevar_sumo.openscenario.actors import Actor, Following, Running
 from safevar_sumo.openscenario.document import (
     IS_READ,
     Element,
@@ -23,15 +23,15 @@ from safevar_sumo.openscenario.document import (
     unsupported,
     whole,
 )
-from safevar_sumo.openscenario.places import (
-    Place,
-    line_of,
-    neighbour,
-    of_reference,
-    way_of,
-    way_through,
-)
+from safevar_sumo.openscenario.places import Place, line_of, neighbour, of_reference
 from safevar_sumo.openscenario.player import Player
+from safevar_sumo.openscenario.routing import (
+    acquire_position_action,
+    assign_route_action,
+    follow_trajectory_action,
+    teleport_action,
+    trajectory_of,
+)
 from safevar_sumo.openscenario.synchronize import relative_speed, synchronize_action
 from safevar_sumo.openscenario.transitions import SHAPES, Transition, transition_of
 from safevar_sumo.openscenario.ways import AHEAD, Way
@@ -214,102 +214,6 @@ def _sideways(player: Player, actor: Actor, goal: float, transition: Transition)
     )
 
 
-# Places, routes and trajectories
-
-
-def teleport_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """TeleportAction."""
-    if player.sample:
-        raise unsupported(
-            f"TeleportAction of {actor.name} after the start: no body jumps",
-            "a TeleportAction in Init",
-        )
-    actor.at = player.place(part(action, "Position/*"))
-    return []
-
-
-def assign_route_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """AssignRouteAction: the actor goes on along the roads of a route, beginning with its own."""
-    return _go_on(actor, way_of(part(action, "Route"), player.network))
-
-
-def acquire_position_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """AcquirePositionAction: the actor goes on along the shortest way to a position on a road."""
-    return _go_on(
-        actor, way_through([actor.here, player.place(part(action, "Position/*"))], player.network)
-    )
-
-
-def _go_on(actor: Actor, way: Way) -> list[Running]:
-    """Go on along a way."""
-    here = actor.here
-    if isinstance(here.path, Way) and here.path.chain != way.chain:
-        there = here.path.road_at(here.distance, here.left)
-        distance = way.distance_to(there.road.id, there.s)
-        if distance is None:
-            raise unsupported(
-                f"{actor.name} is not on its route", "a route that begins with its road"
-            )
-        actor.at = here._replace(path=way, distance=distance)
-    return []
-
-
-def follow_trajectory_action(player: Player, action: Element, actor: Actor) -> list[Running]:
-    """FollowTrajectoryAction: at the actor's speed, or at the times of the vertices, even speeds in
-    between. It ends at the end of the trajectory.
-    """
-    start = None if actor.at is None else actor.at.pose
-    line = line_of(_trajectory(action), player.network, player.place_of, start)
-    offset = number(action, "initialDistanceOffset", 0.0)
-    actor.at = Place(line, offset, 0.0)
-    travelled = float(actor.travelled[player.sample])
-    sideways = actor.begin(
-        "sideways", line.length - offset, travelled, np.zeros_like, over_distance=True
-    )
-    timing = action.find("TimeReference/Timing")
-    if timing is None:
-        return [sideways]
-    if not line.times:
-        raise unsupported(
-            "FollowTrajectoryAction with Timing: the trajectory has no times",
-            "time at each Vertex, startTime and stopTime of a Clothoid",
-        )
-    is_relative = timing.get("domainAbsoluteRelative") == "relative"
-    begin = (player.now if is_relative else 0.0) + number(timing, "offset", 0.0)
-    times = np.asarray(line.times) * number(timing, "scale", 1.0) + begin
-    if (np.diff(times) <= 0).any():
-        raise unsupported(
-            "FollowTrajectoryAction with Timing: the times of the vertices do not grow",
-            "a larger time at each vertex",
-        )
-    now = player.now
-    stations = np.asarray(line.stations)
-    speeds = np.diff(stations) / np.diff(times)
-    # Who changes its speed evenly has the mean of two neighbours at the vertex in between.
-    at_vertices = np.array(
-        [speeds[0] if times[0] <= now else 0.0, *(speeds[1:] + speeds[:-1]) / 2, speeds[-1]]
-    )
-    actor.speed_now = float(np.interp(now, times, at_vertices))
-    running = actor.begin(
-        "along", float(times[-1]) - now, now, lambda time: np.interp(time + now, times, at_vertices)
-    )
-
-    def station(time: Array) -> Array:
-        beyond = np.maximum(time + now - times[-1], 0.0)
-        return np.interp(time + now, times, stations) + beyond * speeds[-1]
-
-    actor.stations = Motion(now, station)
-    return [running]
-
-
-def _trajectory(action: Element) -> Element:
-    """The trajectory of a FollowTrajectoryAction; in version 1.0 it had no TrajectoryRef around
-    it.
-    """
-    found = action.find("TrajectoryRef/Trajectory")
-    return part(action, "Trajectory") if found is None else found
-
-
 PRIVATE: dict[str, Callable[[Player, Element, Actor], list[Running]]] = {
     "TeleportAction": teleport_action,
     "SpeedAction": speed_action,
@@ -332,6 +236,8 @@ INIT_ORDER = (
     ("AssignRouteAction", "AcquirePositionAction"),
 )
 """The order of actions in Init, whose list has none: places, speeds, routes, then all others."""
+LATER = "SpeedAction", "AssignRouteAction", "AcquirePositionAction"
+"""Actions that Ego may have after the start."""
 
 
 def leaf_of(action: Element) -> Element:
@@ -389,12 +295,12 @@ def act(player: Player, action: Element, actors: list[Actor]) -> list[Running]:
     if player.ego in actors and player.has_begun and leaf.tag == "FollowTrajectoryAction":
         player.ignored.add(f"{leaf.tag} of {player.ego.name}")
         # It is a record of a run; the driving system drives anew.
-        line = line_of(_trajectory(leaf), player.network, player.place_of)
+        line = line_of(trajectory_of(leaf), player.network, player.place_of)
         player.refuse_turn(line.samples)
         return []
-    if player.sample and player.ego in actors and leaf.tag != "SpeedAction":
+    if player.sample and player.ego in actors and leaf.tag not in LATER:
         raise unsupported(
             f"{leaf.tag} of {player.ego.name} after the start: its driving system drives",
-            "other actions of it in Init, and later SpeedActions alone",
+            f"other actions of it in Init, and later {', '.join(LATER)} alone",
         )
     return [running for actor in actors for running in PRIVATE[leaf.tag](player, leaf, actor)]

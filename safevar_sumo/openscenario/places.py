@@ -68,7 +68,9 @@ class Place(NamedTuple):
 
 
 def located(place: Place, network: Network) -> Place:
-    """A place on the straight road on which it lies; as it is if there is none."""
+    """A place in the plane on the straight road on which it lies; as it is if there is none."""
+    if isinstance(place.path, Way):
+        return place
     pose = place.pose
     for road in network.roads.values():
         if road.flaw or not road.line.is_straight:
@@ -143,9 +145,7 @@ def lane_position(position: Element, network: Network, entity: Entity) -> Place:
     too.
     """
     road = network.road(attribute(position, "roadId"))
-    lane = whole(position, "laneId")
-    s = number(position, "s")
-    return _in_lane(position, road, network, lane, s)
+    return _in_lane(position, road, network, whole(position, "laneId"), number(position, "s"))
 
 
 def _in_lane(position: Element, road: Road, network: Network, lane: int, s: float) -> Place:
@@ -270,7 +270,7 @@ def way_of(route: Element, network: Network) -> Way:
     """The roads of a route (class Route): the shortest chain from waypoint to waypoint."""
     return way_through(
         [
-            place_of(part(point, "Position/*"), network, _nobody)
+            located(place_of(part(point, "Position/*"), network, _nobody), network)
             for point in route.findall("Waypoint")
         ],
         network,

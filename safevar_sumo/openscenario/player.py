@@ -11,7 +11,7 @@ from safevar_sumo.openscenario.own_speed import OwnSpeeds
 from safevar_sumo.openscenario.places import Place, located, place_of, turn_of
 from safevar_sumo.openscenario.reading import Document
 from safevar_sumo.openscenario.road import read_network, straight_network
-from safevar_sumo.openscenario.ways import STRAY, Way
+from safevar_sumo.openscenario.ways import STRAY
 
 Key = tuple[str, str]
 """An element in conditions on states: its kind, and its name after those of all around it, joined
@@ -77,8 +77,7 @@ class Player:
 
     def place_of(self, name: str) -> Place:
         """The place of an entity now: on a road also if it follows a trajectory there."""
-        here = self.actor(name).here
-        return here if isinstance(here.path, Way) else located(here, self.network)
+        return located(self.actor(name).here, self.network)
 
     def place(self, position: Element) -> Place:
         """The place that the child of a Position names."""

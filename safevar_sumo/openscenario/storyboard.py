@@ -26,6 +26,8 @@ AFTER = 4.0
 """Time after the StopTrigger that is played [s]: with a vehicle that brakes, all happens later."""
 TIMES = np.round(np.arange(round((LONGEST + AFTER) / STEP) + 1) * STEP, 9)
 """Times of the samples of the longest scene [s]."""
+CRITERIA = "criteria_"
+"""What names of conditions begin with that are criteria of CARLA's scenario runner."""
 BLOCK = 1000
 """Samples that are played at once at most."""
 
@@ -54,6 +56,7 @@ class Storyboard(Player):
         self.is_cut = False
         """Whether the scene ends where Ego's way bends, before its StopTrigger holds."""
         self._board = part(document.root, "Storyboard")
+        self._leave_out_criteria()
         self._refuse_states_of_nothing()
         self.acts = [
             self._act(each, ("story", attribute(story, "name")))
@@ -83,6 +86,18 @@ class Storyboard(Player):
         found = Act(element, act_key, events)
         self._note_reactions(found)
         return found
+
+    def _leave_out_criteria(self) -> None:
+        """Leave out conditions of the StopTrigger by which CARLA's scenario runner judges a run."""
+        for outer in self._board.findall("StopTrigger"):
+            for group in outer.findall("ConditionGroup"):
+                for one in group.findall("Condition"):
+                    name = one.get("name", "")
+                    if name.startswith(CRITERIA) and one.find(".//ParameterCondition") is not None:
+                        self.ignored.add(name)
+                        group.remove(one)
+                if not len(group):
+                    outer.remove(group)
 
     def _refuse_states_of_nothing(self) -> None:
         """Refuse conditions on the state of an element that the storyboard does not have."""

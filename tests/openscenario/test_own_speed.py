@@ -27,6 +27,7 @@ from tests.openscenario.writing import (
     teleport,
     trigger,
     watching,
+    world,
     write,
 )
 from tests.scenarios.holding import CARLA, NATIVE, Hold, Pedals, driven
@@ -215,3 +216,30 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
         own = assemble(load_study("wear", scenario={"file": file, "values": {"v": value}}))
         alone = drive_and_score(own, own.characteristics.original[np.newaxis])
         assert alone.f_safe[0] == pytest.approx(degree, abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["AssignRouteAction", "AcquirePositionAction"])
+def test_a_route_of_ego_after_the_start_straight_on_changes_nothing(
+    tmp_path: Path, kind: str
+) -> None:
+    """Its waypoints may be places in the plane: y of the lane is 18, its road begins at x = 10."""
+    points = [f"<Position>{world(x, 18)}</Position>" for x in (60, 900)]
+    inner = points[-1]
+    if kind == "AssignRouteAction":
+        inner = f"<Route>{''.join(f'<Waypoint>{one}</Waypoint>' for one in points)}</Route>"
+    route = event(f"<RoutingAction><{kind}>{inner}</{kind}></RoutingAction>", AT_ONCE.format(1))
+    moving = private("Ego", teleport(world(60, 18)), speed(20))
+    scene, plain = (played(tmp_path, *one, ego=moving) for one in ((route,), ()))
+    assert scene.speed == plain.speed == 20
+    assert np.abs(scene.others[0].place - plain.others[0].place).max() < 1e-9
+    assert scene.events[0][2] == pytest.approx(1)
+    with pytest.raises(InputError, match="a waypoint that is not on a road"):
+        played(tmp_path, route.replace('x="900"', 'x="9000"'), ego=moving)
+
+
+def test_criteria_of_carlas_scenario_runner_do_not_end_a_scene(tmp_path: Path) -> None:
+    condition = '<ParameterCondition parameterRef="" value="" rule="lessThan"/>'
+    criterion = trigger(condition, "").replace('name=""', 'name="criteria_CollisionTest"')
+    scene = play(write(tmp_path, stop=criterion + trigger(AT_ONCE.format(7), "")), {})
+    assert scene.duration == pytest.approx(11)
+    assert "without effect here: criteria_CollisionTest" in scene.remarks
