@@ -23,6 +23,12 @@ FILE_KEY = ""
 """Who reads a file names it, and the study."""
 LEGAL = tomllib.loads(Path(__file__).with_name("legal.toml").read_text(encoding="utf-8"))
 """The words of an enumeration, or `SIZE`, by attribute."""
+CHILDREN: dict[str, list[str]] = LEGAL.pop("children")
+"""What an element may have in it, by its tag: with `*` more than once."""
+CHOICES: list[str] = LEGAL.pop("choices")["names"]
+"""Elements that have exactly one in them."""
+NEEDED = {"ConditionGroup": "Condition", "Event": "Action"}
+"""What an element must have in it, by its tag."""
 SIZE = "at least 0"
 
 
@@ -111,7 +117,10 @@ def whole(element: Element, name: str) -> int:
 
 
 def check_element(element: Element) -> None:
-    """Refuse a word that an enumeration does not have, and a negative size (a rate has no sign)."""
+    """Refuse a word that an enumeration does not have, a negative size (a rate has no sign), and
+    elements in it that the schema does not have there.
+    """
+    _check_children(element)
     for name, value in element.attrib.items():
         legal = LEGAL.get(f"{element.tag}.{name}", LEGAL.get(name))
         is_transition = name == "value" and element.get("dynamicsDimension", "rate") != "rate"
@@ -120,6 +129,23 @@ def check_element(element: Element) -> None:
                 raise unsupported(f"{element.tag}: {name} = {value!r}", f"a number of {SIZE}")
         elif legal and value not in legal:
             raise unsupported(f"{element.tag}: {name} = {value!r}", one_of(legal))
+
+
+def _check_children(element: Element) -> None:
+    tags = Counter(child.tag for child in element)
+    legal = CHILDREN.get(element.tag)
+    if element.tag in CHOICES and len(element) != 1:
+        raise unsupported(f"{element.tag} has {len(element)} elements in it", "one")
+    if element.tag in NEEDED:
+        part(element, NEEDED[element.tag])
+    for tag, count in tags.items():
+        if legal is None or f"{tag}*" in legal:
+            continue
+        if tag not in legal:
+            problem = f"{element.tag} has a {tag} in it"
+            raise unsupported(problem, one_of(name.rstrip("*") for name in legal))
+        if count > 1:
+            raise unsupported(f"{element.tag} has {count} of {tag}", "one")
 
 
 def truth(element: Element, name: str) -> bool:

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import pytest
 import scenariogeneration
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import play
-from safevar_sumo.openscenario.document import LEGAL, SIZE
+from safevar_sumo.openscenario.document import CHILDREN, LEGAL, SIZE
 from tests.openscenario.writing import body, group, write
 
 EVENT = """<Event name="Never" priority="skip" maximumExecutionCount="1">
@@ -58,6 +60,10 @@ EVENT = """<Event name="Never" priority="skip" maximumExecutionCount="1">
 """Actions that never begin, and conditions that never hold."""
 CAR = body("Car").replace("</Vehicle>", '<Trailer><TrailerRef entityRef=""/></Trailer></Vehicle>')
 """A trailer that names nobody is none."""
+SCHEMAS = sorted(
+    Path(scenariogeneration.__file__).parents[1].glob("schemas/OpenSCENARIO_1*.xsd"), reverse=True
+)
+XSD = "{http://www.w3.org/2001/XMLSchema}"
 SIZES = """Condition.delay Event.maximumExecutionCount SpeedActionDynamics.value LaneChangeActionDynamics.value
 LaneOffsetActionDynamics.maxLateralAcc LongitudinalDistanceAction.distance LongitudinalDistanceAction.timeGap
 TargetDistanceSteadyState.distance TargetTimeSteadyState.time FollowTrajectoryAction.initialDistanceOffset
@@ -98,12 +104,74 @@ def test_what_is_illegal_is_refused_with_all_that_names_it(
         assert legal in caught.value.legal
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("<Event ", "<Evnt ", "Maneuver has a Evnt in it"),
+        ("<ConditionGroup>", "<Group>", "(Start|Stop)Trigger has a Group in it"),
+        ("<PrivateAction>", "<Axles>", "Private has a Axles in it"),
+        ("<Condition ", "<Properties ", "ConditionGroup has a Properties in it"),
+        ("<EntityRef ", "<Entity ", "Actors has a Entity in it"),
+        (
+            "<AbsoluteTargetSpeed ",
+            '<AbsoluteTargetSpeed value="3"/><AbsoluteTargetSpeed ',
+            "SpeedActionTarget has 2 elements in it",
+        ),
+        (
+            "<LaneChangeTarget>",
+            "<LaneChangeTarget/><LaneChangeTarget>",
+            "has 2 of LaneChangeTarget",
+        ),
+        ("<StartTrigger>", "<StartTrigger/><StartTrigger>", "has 2 of StartTrigger"),
+        (
+            "<ConditionGroup>",
+            "<ConditionGroup/><ConditionGroup>",
+            "ConditionGroup has no Condition",
+        ),
+    ],
+)
+def test_an_element_that_is_not_where_it_stands_is_refused(
+    tmp_path: Path, old: str, new: str, problem: str
+) -> None:
+    """Before, who does what and when lost an element without a word."""
+    file = Path(write(tmp_path, groups=group(EVENT), entities=body("Ego") + CAR))
+    tag = old.strip("<> ")
+    head, _, rest = file.read_text().partition(old)
+    if new.count("<") == 1:
+        end = f"</{tag}>"
+        renamed = f"</{new.strip('<> ')}>"
+        rest = rest.replace(end, renamed, 1) if end in rest else rest
+    file.write_text(head + new + rest)
+    with pytest.raises(InputError, match=problem) as caught:
+        play(str(file), {})
+    assert caught.value.legal.startswith("one") or "schema" in caught.value.legal
+
+
+def children_of(kind: Element | None, types: dict[str | None, Element]) -> list[Element]:
+    """The elements that a type of a schema has, also by its groups."""
+    inner = [] if kind is None else [*kind.iter()]
+    groups = [types[one.get("ref")] for one in inner if one.tag == f"{XSD}group" and one.get("ref")]
+    own = [one for one in inner if one.tag == f"{XSD}element"]
+    return own + [each for one in groups for each in children_of(one, types)]
+
+
+def test_the_elements_are_those_of_the_schemas_of_all_versions() -> None:
+    """An element has the children that some version has, several only if some version says so."""
+    found: dict[str, set[str]] = {}
+    for path in SCHEMAS:
+        types = {one.get("name"): one for one in ElementTree.parse(path).getroot()}
+        for kind in types.values():
+            for one in children_of(kind, types):
+                for child in children_of(types.get(one.get("type")), types):
+                    star = "*" * (child.get("maxOccurs") == "unbounded")
+                    found.setdefault(str(one.get("name")), set()).add(f"{child.get('name')}{star}")
+    for name, legal in CHILDREN.items():
+        assert {one.rstrip("*") for one in legal} == {one.rstrip("*") for one in found[name]}, name
+        assert {*legal} <= found[name] | {"GlobalAction*", "UserDefinedAction*", "Private*"}, name
+
+
 def test_the_words_are_those_of_the_schemas_of_all_versions() -> None:
-    schemas = sorted(
-        Path(scenariogeneration.__file__).parents[1].glob("schemas/OpenSCENARIO_1*.xsd"),
-        reverse=True,
-    )
-    text = "".join(path.read_text() for path in schemas)
+    text = "".join(path.read_text() for path in SCHEMAS)
     for key, legal in LEGAL.items():
         within = key.replace(".", '".*?name="') if "." in key else f'.*?name="{key}'
         (kind, *_) = re.findall(rf'complexType name="{within}" type="(\w+)"', text, re.DOTALL)
