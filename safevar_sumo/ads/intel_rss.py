@@ -10,11 +10,15 @@ from functools import reduce
 from typing import Any
 
 from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
 from safevar_sumo.shipped import shipped_table
 
 ROLLING_OUT = 1.0
 """Deceleration after a demand to brake, while somebody is in the way [m/s^2]: assumption."""
+
+MOST = 1000.0
+"""Largest number of the rule that the library takes."""
 
 
 class AdRss(ScalarAds):
@@ -53,6 +57,18 @@ class AdRss(ScalarAds):
         cruise_speed: float | None = None,
         corridor: float = CORRIDOR,
     ) -> None:
+        # Numbers that the library refuses it also logs itself, so they are refused before.
+        sizes = {
+            "response_time": response_time,
+            "accel_max": accel_max,
+            "brake_min": brake_min,
+            "brake_max": brake_max,
+        }
+        for name, value in sizes.items():
+            most = brake_max if name == "brake_min" else MOST
+            if not 0 <= value <= most or (value == 0 and name != "accel_max"):
+                legal = f"a number above 0, up to {most:g}"
+                raise InputError("", f"ads.parameters.{name} = {value:g}", legal)
         self.response_time = response_time
         self.accel_max = accel_max
         self.brake_min = brake_min

@@ -40,9 +40,8 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     metrics = study.metrics
     matrix = study.matrix
     known = [metric.name for metric in assemble(study).measuring.scoring.metrics]
-    check_name(
-        "unsafe", f"study {study.name!r} has no metric {name!r}", name, [*known, *OPTIONAL_METRICS]
-    )
+    legal = {*known, *OPTIONAL_METRICS}
+    check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, legal)
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)

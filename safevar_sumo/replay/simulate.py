@@ -17,6 +17,7 @@ from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
+from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
@@ -24,7 +25,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
-from safevar_sumo.records import FloatArray, JsonObject, Outcome
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
@@ -33,7 +34,13 @@ from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_ha
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import at_point, point_record, simulate_all_points, vehicle_remarks
+from safevar_sumo.sumo.matrix import (
+    PointResult,
+    at_point,
+    point_record,
+    simulate_all_points,
+    vehicle_remarks,
+)
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -217,6 +224,19 @@ def show_simulation(
     return replace(answer, draw=lambda _: draw_comparison(comparison))
 
 
+def _fails(study: Study, result: PointResult) -> bool:
+    """Whether the first setting fails at a point: by the study's own criterion, or by a contact
+    that is faster than the point allows.
+    """
+    criterion = Unsafe.parse(study.unsafe.criterion or COLLISION)
+    bound = criterion.bound
+    evaluations = result.evaluations
+    if bound is not None and bound.measure in evaluations.metrics:
+        return bool(criterion.of(evaluations)[0])
+    is_allowed = result.runs.relative_speed[0] <= result.point.allowed_impact_speed
+    return bool(evaluations.collided[0] and not is_allowed)
+
+
 def _answer(target: Target, system: System, simulation: Simulation, *, with_spread: bool) -> Answer:
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix.
@@ -249,18 +269,13 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
             f"The command `rating` simulates all {len(system.matrix)} cells and variations."
         )
     elif system.matrix:
-        records = map(point_record, simulate_all_points(system, setting[np.newaxis]))
+        results_by_point = [*simulate_all_points(system, setting[np.newaxis])]
+        records = map(point_record, results_by_point)
         points = [
             {**row, **row.get("contact", {})} for row in records
         ]  # side and place are columns
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
-        allowed = {point.name: point.allowed_impact_speed for point in system.matrix}
-        failing = [
-            row["point"]
-            for row in points
-            if row["outcome"] == Outcome.COLLISION
-            and row["relative_impact_speed"] > allowed[row["point"]]
-        ]
+        failing = [one.point.name for one in results_by_point if _fails(study, one)]
         verdict.append(points_in_words(failing, len(points)))
 
     # The model's own uncertainty.
