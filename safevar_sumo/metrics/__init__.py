@@ -10,21 +10,21 @@ from safevar_sumo.metrics.base import (
     Scoring as Scoring,
     checked_measure as checked_measure,
 )
-from safevar_sumo.metrics.measures import (
-    AVE_DECE,
-    BRAKE_HARSHNESS,
-    DRAC,
+from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
+from safevar_sumo.metrics.legal import (
     IMPACT_EXCESS as IMPACT_EXCESS,
     IMPACT_SPEED as IMPACT_SPEED,
-    MAX_JERK,
     MFDD,
+    STOP_FROM_PEDAL,
+    STOPPING_DISTANCE as STOPPING_DISTANCE,
+)
+from safevar_sumo.metrics.measures import (
+    AVE_DECE,
+    DRAC,
     PET,
     RATING_POINTS as RATING_POINTS,
     REACTION_TIME,
-    RMS_ACCELERATION,
     SAFETY_DEGREE_METRIC,
-    STOP_FROM_PEDAL,
-    STOPPING_DISTANCE as STOPPING_DISTANCE,
     TET,
     TIT,
     TTC_MIN,

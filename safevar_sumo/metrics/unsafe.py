@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
-from safevar_sumo.metrics.measures import IMPACT_EXCESS, IMPACT_SPEED, RATING_POINTS
+from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
+from safevar_sumo.metrics.measures import RATING_POINTS
 from safevar_sumo.records import KMH_PER_MS, BoolArray, Evaluations, FloatArray, Outcome, Quantity
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables

@@ -18,7 +18,7 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, time_to_collision
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.protocol.cells import MODELS
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
@@ -190,10 +190,12 @@ def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
 def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> None:
     """A column has one name, so the copies have others."""
     shipped = {**METRICS, **OPTIONAL_METRICS}
-    module, _, _ = copied(time_to_collision, in_tmp).partition(":")
+    own_functions = [inspect.unwrap(one.function) for one in shipped.values()]
+    functions = {inspect.getfile(one): one for one in own_functions}
+    modules = [copied(function, in_tmp).partition(":")[0] for function in functions.values()]
     lines = [
         "import msgspec",
-        f"from {module} import *",
+        *(f"from {module} import *" for module in modules),
         "from safevar_sumo.metrics import Measure",
     ]
     lines.append("known = [one for one in list(globals().values()) if isinstance(one, Measure)]")
