@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
-from safevar_sumo.campaign.share import Share, carry_share
+from safevar_sumo.campaign.share import SAFE_SIMULATIONS, Share, carry_share, verification_file
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -37,6 +38,12 @@ PROBE_TIME = 5.0
 """Time of a measurement with a driving system that is called for each vehicle, roughly [s]."""
 PROBE_VEHICLES = 4000
 """Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
+VERIFIED_IN_SUMO = (
+    "each unsafe solution at its worst point, and up to"
+    f" {SAFE_SIMULATIONS} safe simulations of all tests and outcomes, half of them with the least"
+    " clearance"
+)
+"""What SUMO repeats of a search in recorded scenes, as the manifest says it."""
 ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
 """The engines that a study may name."""
 
@@ -91,7 +98,12 @@ def run_campaign(
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)
-    results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
+    verifies = engine_used is Engine.RECORDED
+    results.manifest["engine"] = {
+        "name": str(engine_used),
+        "reason": reason,
+        **({"verified": VERIFIED_IN_SUMO} if verifies else {}),
+    }
     results.manifest |= _about_algorithms(study)
     task = Task(
         study=study,
@@ -100,7 +112,7 @@ def run_campaign(
     )
 
     # What the user should know before the search begins.
-    show_journals = journal_progress(study, keys, directory, progress)
+    show_journals = journal_progress(study, keys, directory, progress, verifies=verifies)
     show_journals([])
     compile_vehicle(study, pool, progress)
     no_verdict = ask_why_no_verdict(study, pool)
@@ -111,14 +123,9 @@ def run_campaign(
     results.begin(original)
 
     # Each worker carries out a share of the runs.
-    verifies = engine_used is Engine.RECORDED
-    shares = [
-        (
-            task,
-            Share(dealt, directory.absolute(), results.manifest, original, verifies, retry_failed),
-        )
-        for dealt in deal(keys, pool.workers, task.batch_size, study.search.population)
-    ]
+    hands = deal(keys, pool.workers, task.batch_size, study.search.population)
+    about = directory.absolute(), results.manifest, original, verifies, retry_failed
+    shares = [(task, Share(dealt, *about, k, len(hands))) for k, dealt in enumerate(hands)]
     runs = list[RunResult]()
     for finished_runs, remark in carry_out(carry_share, shares, pool, show_journals):
         runs += finished_runs
@@ -191,18 +198,40 @@ def deal(
 
 
 def journal_progress(
-    study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
+    study: Study,
+    keys: Sequence[RunKey],
+    directory: Path,
+    progress: Progress,
+    *,
+    verifies: bool = False,
 ) -> Callable[[Sequence[int]], None]:
-    """A function that shows the evaluations that runs have asked for, as their journals tell."""
+    """A function that shows the evaluations that runs have asked for, as their journals tell, and
+    the simulations that SUMO repeats, which count as evaluations.
+    """
     readers = [
         JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys
     ]
+    counters = [verification_file(directory, key) for key in keys]
+    for counter in counters:
+        with suppress(OSError):
+            counter.unlink()  # of a command that was killed
+    counts = dict[Path, tuple[int, int]]()
 
     def show(ended: Sequence[int]) -> None:
-        asked = [reader.asked() for reader in readers]
+        asked = sum(reader.asked() for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
+
+        # A share's file is gone when its verification has ended.
+        for counter in counters:
+            with suppress(OSError, ValueError):
+                repeated, expected = map(int, counter.read_text().split())
+                counts[counter] = repeated, expected
+        repeated, expected = map(sum, zip(*counts.values(), strict=True)) if counts else (0, 0)
         phase = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
-        progress(phase, sum(asked), len(keys) * study.search.evaluations)
+        if counts:
+            phase = f"{study.name}: verifying in SUMO: {repeated} of {expected}; all"
+        left = max(expected, SAFE_SIMULATIONS if verifies else 0)
+        progress(phase, asked + repeated, len(keys) * study.search.evaluations + left)
 
     return show
 

@@ -4,25 +4,42 @@ all actors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import user_errors
-from safevar_sumo.records import ROUNDING, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import (
+    ROUNDING,
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    IntArray,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.sumo.batch import observer_of, open_points_world, traffic_of
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
-from safevar_sumo.sumo.matrix import batch_size, simulate_groups
+from safevar_sumo.sumo.matrix import batch_size, settings_per_batch, simulate_groups
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.world import SumoWorld
 
-RATED_POINTS = 8
-"""Number of a rating's cells at which settings are verified, spread over all cells."""
+SPREAD_POINTS = 16
+"""Number of points of a matrix, spread over all, at which settings are verified; and one of each
+test that has none of them.
+"""
+SAFE_POINTS = 6
+"""Number of points that a sample's safe simulations fill first, or one of each test."""
+FIRST_OTHERS = 8
+"""Least number of other settings that are simulated together with the unsafe ones of a sample."""
 COMPARED = ("position", "gap", "lateral", "obstacle_speed")
 """Quantities of a trace that SUMO must repeat [m, m/s]."""
 
@@ -84,8 +101,7 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
     """
     points = system.points
     if system.rater is not None:
-        evenly_spaced = np.linspace(0, len(points) - 1, RATED_POINTS).astype(int)
-        points = tuple(points[number] for number in evenly_spaced)
+        points = tuple(points[number] for number in spread_points(system))
     reduced = replace(system, matrix=points, rater=None)
     remark = ""
     size = batch_size(system, Engine.RECORDED)
@@ -97,6 +113,108 @@ def verify_in_sumo(system: System, settings: FloatArray) -> str:
             except SimulationError as error:
                 remark = f"some of {len(batch)} settings could not be verified in SUMO: {error}"
     return remark
+
+
+class Sample(NamedTuple):
+    """What SUMO repeats of a search: each of K unsafe settings, shape (K, n), at its worst point,
+    whose number is in `worst`, and `number` safe simulations of these and other settings, shape
+    (M, n), at `points`.
+    """
+
+    unsafe: FloatArray
+    worst: IntArray
+    others: FloatArray
+    number: int
+    points: Sequence[int]
+
+
+def spread_points(system: System) -> list[int]:
+    """Numbers of some points of a system: evenly spread over all, and one of every test."""
+    points = system.points
+    tests = [dict(point.parameters).get("test") for point in points]
+    evenly = {
+        *np.linspace(0, len(points) - 1, min(SPREAD_POINTS, len(points))).astype(int).tolist()
+    }
+    missed = {*tests} - {tests[number] for number in evenly}
+    return sorted(evenly | {tests.index(test) for test in missed})
+
+
+def verify_sample(
+    system: System, criterion: Unsafe, sample: Sample, show: Callable[[int], None]
+) -> tuple[int, str]:
+    """Repeat a sample of recorded simulations in SUMO. Returns the number of safe simulations among
+    them, and why SUMO could not simulate some, "" if it could; `show` is called with the number of
+    all that are repeated. Raises the error of `verify_in_sumo`.
+    """
+    if criterion.is_of_points:  # which no single simulation has
+        criterion = Unsafe()
+    remark = ""
+    repeated = safe = 0
+    numbers = sorted({*sample.points, *sample.worst.tolist()})
+    by_name = {system.points[number].name: number for number in numbers}
+    reduced = replace(system, matrix=tuple(system.points[number] for number in numbers), rater=None)
+
+    # The unsafe settings follow a few others; further others come until enough are safe.
+    enough = math.ceil(5 * sample.number / len(sample.points))
+    first = min(max(enough - len(sample.unsafe), FIRST_OTHERS), len(sample.others))
+    settings = np.concatenate([sample.others[:first], sample.unsafe, sample.others[first:]])
+    worst = np.full(len(settings), -1)
+    worst[first : first + len(sample.unsafe)] = sample.worst
+    size = min(settings_per_batch(system, Engine.RECORDED), first + len(sample.unsafe))
+    for start in range(0, len(settings), max(size, 1)):
+        if safe >= sample.number and start >= first + len(sample.unsafe):
+            break
+        batch = settings[start : start + size]
+        results = [*chain.from_iterable(simulate_groups(reduced, batch))]
+        numbers = [by_name[result.point.name] for result in results]
+        are_safe = [
+            ~criterion.of(result.evaluations) & ~result.evaluations.failed for result in results
+        ]
+
+        # Of every test the point with the most safe simulations, then those with the most.
+        counts = np.array([np.count_nonzero(is_safe) for is_safe in are_safe])
+        tests = [dict(result.point.parameters).get("test") for result in results]
+        most_first = np.argsort(-counts, kind="stable").tolist()
+        best = dict.fromkeys(tests[place] for place in most_first)
+        best = {test: next(k for k in most_first if tests[k] == test) for test in best}
+        order = [*dict.fromkeys([*best.values(), *most_first])]
+        shared = min(max(SAFE_POINTS, len(best)), len(order))
+        for turn, place in enumerate(order):
+            result = results[place]
+            is_repeated = worst[start : start + size] == numbers[place]
+            if numbers[place] in sample.points:
+                count = math.ceil((sample.number - safe) / max(shared - turn, 1))
+                chosen = _sampled(criterion, result.evaluations, are_safe[place], count)
+                safe += len(chosen)
+                is_repeated[chosen] = True
+            rows = np.flatnonzero(is_repeated)
+            if not len(rows):
+                continue
+            try:
+                _verify_point(system.at(result.point), batch[rows], result.runs.of(rows))
+            except SimulationError as error:
+                remark = f"some of {len(rows)} settings could not be verified in SUMO: {error}"
+            repeated += len(rows)
+            show(repeated)
+    return safe, remark
+
+
+def _sampled(
+    criterion: Unsafe, evaluations: Evaluations, is_safe: BoolArray, number: int
+) -> IntArray:
+    """Rows of `number` safe simulations: half of them with the least clearance, the first of each
+    kind of outcome, and others spread over all.
+    """
+    if number <= 0:
+        return np.zeros(0, dtype=np.intp)
+    rows = np.flatnonzero(is_safe)
+    least_first = rows[np.argsort(criterion.robustness(evaluations)[rows], kind="stable")]
+    _, first = np.unique(evaluations.outcome[rows], return_index=True)
+    chosen = np.union1d(least_first[: math.ceil(number / 2)], rows[first])
+    left = np.setdiff1d(rows, chosen)
+    missing = min(max(number - len(chosen), 0), len(left))
+    spread = np.linspace(0, len(left) - 1, missing).astype(int)
+    return np.union1d(chosen, left[spread])
 
 
 def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) -> None:

@@ -18,12 +18,13 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
-from safevar_sumo.campaign.campaign import deal, measure_speed
+from safevar_sumo.campaign.campaign import deal, journal_progress, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
-from safevar_sumo.campaign.share import VERIFIED_OTHERS, settings_to_verify
+from safevar_sumo.campaign.share import settings_to_verify, verification_file
 from safevar_sumo.errors import SafevarError
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
@@ -205,21 +206,24 @@ def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
     assert pool.sizes == [1, 1, 10]
 
 
-def test_sumo_repeats_each_unsafe_solution_of_a_share_once_and_200_other_settings() -> None:
-    """Of 5,000 settings half collide, and those are solutions twice; without a collision, less than
-    half of the original's safety degree is unsafe.
-    """
+def test_each_unsafe_solution_is_verified_once_and_the_least_safe_of_each_kind_of_others() -> None:
+    """Of 5,000 settings half collide, and those are solutions twice."""
     rng = np.random.default_rng(1)
     requested = made_up_evaluations(rng.uniform(-1, 1, 5000), settings=rng.random((5000, 3)))
-    solutions = Evaluations.concatenate([requested, requested]).take(np.arange(0, 10_000, 2))
-    original = made_up_evaluations([1.0], settings=np.zeros((1, 3)))
-    unsafe = solutions.take(np.flatnonzero(solutions.collided)).settings
-    verified = {row.tobytes() for row in settings_to_verify(requested, solutions, original)}
-    assert verified >= {row.tobytes() for row in unsafe}
-    assert len(verified - {row.tobytes() for row in unsafe}) == VERIFIED_OTHERS == 200
-    safe = requested.take(np.flatnonzero(~requested.collided))
-    verified = {row.tobytes() for row in settings_to_verify(safe, safe, original)}
-    assert verified >= {row.tobytes() for row in safe.settings[safe.f_safe < 0.5]}
+    both = Evaluations.concatenate([requested, requested])
+    solutions = both.take(np.arange(0, 10_000, 4))
+    unsafe, others = settings_to_verify(requested, solutions, Unsafe(), 100)
+    collided = solutions.take(solutions.collided).settings
+    assert {row.tobytes() for row in unsafe} == {row.tobytes() for row in collided}
+    assert len(unsafe) == len({row.tobytes() for row in unsafe})
+    named = {row.tobytes() for row in others}
+    safe = requested.take(~requested.collided)
+    assert {row.tobytes() for row in safe.settings[np.argsort(safe.f_safe)[:100]]} <= named
+    assert not {row.tobytes() for row in collided} & named
+    kinds = Counter(requested.outcome[[row.tobytes() in named for row in requested.settings]])
+    assert min(kinds.values()) >= 100
+    assert len(kinds) == len({*requested.outcome})
+    assert len(others) <= 300
 
 
 def test_what_sumo_refused_and_searches_without_a_solution_are_not_repeated() -> None:
@@ -228,13 +232,37 @@ def test_what_sumo_refused_and_searches_without_a_solution_are_not_repeated() ->
     failed = dataclasses.replace(
         requested, outcome=np.array(["stopped", "stopped", Outcome.SIMULATOR_ERROR.value])
     )
-    assert np.array_equal(
-        settings_to_verify(failed, failed.take([]), requested.take([0])), settings[:2]
+    unsafe, others = settings_to_verify(failed, failed.take([]), Unsafe(), 300)
+    assert unsafe.shape == (0, 2)
+    assert np.array_equal(others, settings[:2])
+    unsafe, others = settings_to_verify(failed.take([2]), failed.take([2]), Unsafe(), 300)
+    assert unsafe.shape == others.shape == (0, 2)
+
+
+@pytest.mark.parametrize("killed_before", [False, True])
+def test_progress_counts_what_sumo_repeats_and_leaves_time_for_it(
+    tmp_path: Path, *, killed_before: bool
+) -> None:
+    """A file of a command that was killed counts for nothing."""
+    study = with_search(load_study("smoke"), algorithms=["rs"], runs=2, evaluations=100)
+    shown = list[tuple[str, int, int]]()
+    keys = [RunKey("rs", 0), RunKey("rs", 1)]
+    files = [verification_file(tmp_path, key) for key in keys]
+    files[0].parent.mkdir()
+    if killed_before:
+        files[0].write_text("290 300")
+    progress = journal_progress(
+        study, keys, tmp_path, lambda *values: shown.append(values), verifies=True
     )
-    assert settings_to_verify(failed.take([2]), failed.take([2]), requested.take([0])).shape == (
-        0,
-        2,
-    )
+    progress([])
+    assert shown[-1] == ("smoke: 0/2 runs, evaluations", 0, 500)
+    files[0].write_text("120 155")
+    progress([])
+    files[0].unlink()
+    files[1].write_text("0 160")
+    progress([])
+    assert [(done, total) for _, done, total in shown[1:]] == [(120, 500), (120, 515)]
+    assert "verifying in SUMO: 120 of 315" in shown[-1][0]
 
 
 ROOT = Path(__file__).parents[2]
