@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
@@ -15,9 +16,15 @@ import pandas as pd
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
-from safevar_sumo.campaign.campaign import choose_engine, measure_speed
+from safevar_sumo.campaign.campaign import (
+    choose_engine,
+    evaluate_original,
+    measure_speed,
+    measure_verification,
+)
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.questions import ask_why_no_verdict
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
 from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, RATING_POINTS, Unsafe, impact_in_words
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -44,7 +51,7 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, Study
-from safevar_sumo.sumo import assemble, drive_and_score, settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import show_no_progress
@@ -255,19 +262,24 @@ def _measured(
     # The speed on this machine.
     used, reason = choose_engine(system, engine)
     task = Task(study=study, engine=used, batch_size=batch or settings_per_batch(system, used))
+    begin = time.monotonic()
+    evaluate_original(task, pool)
+    ask_why_no_verdict(study, pool)
+    start = time.process_time() + time.monotonic() - begin  # of this process and of a worker
     rate = measure_speed(task, pool, runs)
+    verification = measure_verification(task, pool) if used is Engine.RECORDED else 0.0
 
-    # The time that follows for all evaluations.
+    # The time that follows for all evaluations, with the start and the verification.
     evaluations = runs * study.search.evaluations
-    seconds = evaluations / rate
-    time = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
+    seconds = start + evaluations / rate + verification
+    duration = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
     names = ", ".join(study.search.labels)
     return Answer(
         question="study",
         study=study,
         verdict=(
-            f"About {time} for at most {evaluations} evaluations, {runs} runs of {names}; nothing"
-            " was written."
+            f"About {duration} for at most {evaluations} evaluations, {runs} runs of {names};"
+            " nothing was written."
         ),
         numbers={
             "runs": runs,

@@ -19,11 +19,17 @@ from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
-from safevar_sumo.campaign.share import SAFE_SIMULATIONS, Share, carry_share, verification_file
+from safevar_sumo.campaign.share import (
+    SAFE_SIMULATIONS,
+    Share,
+    carry_share,
+    verification_file,
+    verify_safe,
+)
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
@@ -258,11 +264,8 @@ def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
     """
     workers = min(pool.workers, runs or pool.workers)
     system = system_of(task.study)
-    characteristics = system.characteristics
     size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
-    rng = np.random.default_rng(task.study.search.seed)
-    shape = (workers, size, len(characteristics))
-    settings = rng.uniform(characteristics.lower, characteristics.upper, shape)
+    settings = _random_settings(task.study, workers, size)
 
     def simulate(number: int) -> None:
         carry_out(evaluate_settings, [(task, rows[:number]) for rows in settings], pool)
@@ -277,3 +280,20 @@ def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
     start = time.perf_counter()
     simulate(size)
     return workers * size / (time.perf_counter() - start)
+
+
+def measure_verification(task: Task, pool: Pool) -> float:
+    """The time that the verification of safe simulations in SUMO takes, measured with those of
+    random settings [s].
+    """
+    settings = _random_settings(task.study, SAFE_SIMULATIONS)
+    start = time.monotonic()
+    carry_out(verify_safe, [(task, settings)], pool)
+    return time.monotonic() - start
+
+
+def _random_settings(study: Study, *shape: int) -> FloatArray:
+    """Settings of a study, drawn uniformly, in an array of this shape and their values."""
+    characteristics = system_of(study).characteristics
+    rng = np.random.default_rng(study.search.seed)
+    return rng.uniform(characteristics.lower, characteristics.upper, (*shape, len(characteristics)))

@@ -201,6 +201,15 @@ def _worst_points(evaluations: Evaluations) -> dict[bytes, int]:
     return dict(zip(keys, evaluations.points.tolist(), strict=True))
 
 
+def verify_safe(task: Task, settings: FloatArray) -> None:
+    """Verify as many safe simulations of some settings, shape (M, n), as a search does."""
+    system = system_of(task.study)
+    no_points = np.zeros(0, dtype=np.intp)
+    points = spread_points(system)
+    sample = Sample(settings[:0], no_points, settings, SAFE_SIMULATIONS, points)
+    verify_sample(system, Unsafe(), sample, lambda repeated: None)
+
+
 def settings_to_verify(
     requested: Evaluations, solutions: Evaluations, criterion: Unsafe, number: int
 ) -> tuple[FloatArray, FloatArray]:

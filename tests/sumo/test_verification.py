@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safevar_sumo.api import study as command
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import all_runs, run_campaign
 from safevar_sumo.errors import InputError
@@ -130,3 +131,15 @@ def test_points_of_a_sample_are_of_every_test() -> None:
     names = {dict(system.points[number].parameters)["test"] for number in spread_points(system)}
     assert names == {test["name"] for test in [many, *few]}
     assert len(spread_points(system)) <= 26
+
+
+@pytest.mark.slow
+def test_a_dry_run_counts_the_start_and_the_verification(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evaluations that take no time leave both."""
+    monkeypatch.setattr(command, "measure_speed", lambda *arguments: 1e9)
+    alone = command.study("smoke", dry_run=True, jobs=1).numbers["seconds"]
+    monkeypatch.setattr(command, "measure_verification", lambda *arguments: 1000.0)
+    assert 0.5 < alone < 1000
+    assert command.study("smoke", dry_run=True, jobs=1).numbers["seconds"] > 1000
+    in_sumo = command.study("smoke", dry_run=True, jobs=1, engine="sumo").numbers
+    assert in_sumo["seconds"] < 1000, "SUMO verifies nothing that it has simulated itself"
