@@ -160,10 +160,10 @@ def verify_sample(
     settings = np.concatenate([sample.others[:first], sample.unsafe, sample.others[first:]])
     worst = np.full(len(settings), -1)
     worst[first : first + len(sample.unsafe)] = sample.worst
-    size = min(settings_per_batch(system, Engine.RECORDED), first + len(sample.unsafe))
-    for start in range(0, len(settings), max(size, 1)):
-        if safe >= sample.number and start >= first + len(sample.unsafe):
-            break
+    largest = settings_per_batch(system, Engine.RECORDED)
+    size = min(largest, max(first + len(sample.unsafe), 1))
+    start = 0
+    while start < len(settings) and (safe < sample.number or start < first + len(sample.unsafe)):
         batch = settings[start : start + size]
         results = [*chain.from_iterable(simulate_groups(reduced, batch))]
         numbers = [by_name[result.point.name] for result in results]
@@ -196,6 +196,12 @@ def verify_sample(
                 remark = f"some of {len(rows)} settings could not be verified in SUMO: {error}"
             repeated += len(rows)
             show(repeated)
+
+        # As many further settings as are expected to bring the missing safe simulations.
+        start += size
+        if start >= first + len(sample.unsafe):
+            size = math.ceil(start * (sample.number - safe) / max(safe, 1))
+            size = min(max(size, FIRST_OTHERS), largest)
     return safe, remark
 
 
