@@ -313,10 +313,11 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         return "The search found no solution.", []
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
-        f"The search found {len(solutions)} different solutions; {len(failures)} of them are"
-        f" unsafe: {case.unsafe.description}."
+        f"The search found {number_of(len(solutions), 'different solution')};"
+        f" {len(failures) or 'none'} of them {case.unsafe.they_in_words}."
     )
-    counts = " ".join([counts, *demanded_in_words(results.study)])
+    remarks = filter(None, [case.unsafe.remark])
+    counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
     if failures.empty:
         return counts, []
     fewest = failures.iloc[0]
@@ -332,7 +333,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
 
     # How it ends, and what it changes.
     if system.rater:
-        ending = f"keeps {fewest[RATING_POINTS.name]:.2f} points"
+        ending = f"earns {fewest[RATING_POINTS.name]:.2f} points"
     elif case.unsafe.is_of_impacts:
         ending = (
             f"has an {impact_in_words(bounded[IMPACT_SPEED.name], bounded[IMPACT_EXCESS.name])}"
@@ -347,10 +348,10 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         for item in case.characteristics
         if by_name[item.name] != item.original
     ]
-    listed = f"{number_of(len(texts), 'change')}, which the second table lists"
+    listed = f"{number_of(len(texts), 'change')}, listed in the second table"
     if len(texts) <= MAX_LISTED:
         listed = ", ".join(texts) or "no change at all"
-    return f"{counts} With the fewest changes the vehicle {ending}: {listed}.", rows
+    return f"{counts} The one with the fewest changes {ending}: {listed}.", rows
 
 
 def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:

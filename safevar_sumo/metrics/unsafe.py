@@ -123,25 +123,36 @@ class Unsafe:
 
     @property
     def description(self) -> str:
-        """The criterion in words, rounded: `collision, or stops less than 0.30 m short`, `safety
-        degree below 1.4 m (half of the original's, a screening limit)`, `drac > 6, or a collision`.
+        """The criterion in words, rounded: `collision, or clearance below 0.3 m`, `safety degree
+        below 1.4 m, half of the original's`, `drac > 6, or a collision`.
         """
         if self.points is not None:
             return f"at most {self.points:g} points"
         if self.bound is not None:
             return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
         if self.below is None:
-            kept = self._keep_in_words
             where = ", from bumper to bumper" if self.contact else ""
-            return (
-                f"collision, or stops less than {kept} m short{where}" if self.keep else "collision"
-            )
-        share = " (half of the original's, a screening limit)" if self.is_half else ""
+            clearance = f"collision, or clearance below {self.keep:g} m{where}"
+            return clearance if self.keep else "collision"
+        share = ", half of the original's" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
     @property
-    def _keep_in_words(self) -> str:
-        return f"{self.keep:.2f}" if round(self.keep, 2) == self.keep else f"{self.keep:g}"
+    def they_in_words(self) -> str:
+        """What unsafe vehicles do: `collide`, `are unsafe (drac > 6, or a collision)`."""
+        if self.is_collision and not self.keep:
+            return "collide"
+        return f"are unsafe ({self.description})"
+
+    @property
+    def remark(self) -> str:
+        """What to know of a screening limit, in a sentence; empty for any other criterion."""
+        if not self.is_half:
+            return ""
+        return (
+            "No vehicle collided, so a screening limit decides; --unsafe collision counts"
+            " collisions alone."
+        )
 
     @property
     def smaller_demand(self) -> str:
@@ -150,16 +161,17 @@ class Unsafe:
         """
         if self.is_collision and not self.keep:
             return ""
-        return f"Demand less, with {'--margin' if self.is_collision else '--unsafe'}."
+        option = "--margin" if self.is_collision else "--unsafe"
+        return f"Ask again with a weaker criterion ({option})."
 
     @property
     def in_words(self) -> str:
-        """What an unsafe vehicle does: `collides`, `SD is below 1.4`, `has drac > 6`."""
+        """What an unsafe vehicle does: `collides`, `has drac > 6`."""
         if self.points is not None:
-            return f"keeps at most {self.points:g} points"
+            return f"earns at most {self.points:g} points"
         if self.bound is not None:
             return f"has {self.bound}"
-        return "collides" if self.below is None else f"SD is below {self.below:.3g}"
+        return "collides" if self.below is None else f"has a safety degree below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
@@ -224,14 +236,14 @@ class Unsafe:
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
         """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
-        3.21 m/s`, `stops 0.04 m short, less than 0.30 m`.
+        3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`.
         """
         degree = float(vehicle.f_safe[0])
 
         # In the unit of the criterion: points, a metric, or a safety degree.
         if self.points is not None:
             return (
-                f"keeps {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
+                f"earns {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
             )
         if self.is_of_impacts and vehicle.collided[0]:
             columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
@@ -246,14 +258,13 @@ class Unsafe:
         if self.below is not None and (degree >= 0 or self.below < 0):
             unit = "m" if degree >= 0 else "m/s"
             text = _on_its_side(degree, self.below, "g", 3)
-            return f"has safety degree {text} {unit}, below {self.below:.3g} {unit}"
+            return f"has a safety degree of {text} {unit}, below {self.below:.3g} {unit}"
 
         # Otherwise a collision, or a distance that is too small.
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"
         left = _on_its_side(degree - self.contact, self.keep, "f", 2)
-        verb, end = ("stops", " short") if vehicle.outcome[0] == Outcome.STOPPED else ("keeps", "")
-        return f"{verb} {left} m{end}, less than {self._keep_in_words} m"
+        return f"keeps {left} m of clearance, less than {self.keep:g} m"
 
     @classmethod
     def parse(cls, criterion: CriterionLike) -> Unsafe:

@@ -257,6 +257,8 @@ class Answer:
                 *(latex_table(self._label_of(name), frame) for name, frame in shown.items()),
             ]
             parts += [] if remarks is None else [latex_notes(remarks)]
+            tested = pd.DataFrame([self._tested_in_words])
+            parts += [latex_notes(tested)] if self.tested else []
             return "\n".join(parts)
         if form == "html":
             first, *later = map(escape, SENTENCE_END.split(self.verdict))
@@ -286,10 +288,10 @@ class Answer:
         for text in filter(None, (self._tested_in_words, self._other_tables)):
             print_text(console, text)
         if self.study is not None:  # `list` has checked nothing
-            print_text(
-                console,
-                "; ".join(f"{name}: {cell_text(value)}" for name, value in self.numbers.items()),
-            )
+            in_table = self.tables.get("results", pd.DataFrame({"result": []}))["result"].tolist()
+            numbers = {name: value for name, value in self.numbers.items() if name not in in_table}
+            texts = (f"{name}: {cell_text(value)}" for name, value in numbers.items())
+            print_text(console, "; ".join(texts))
 
     @property
     def _tested_in_words(self) -> str:

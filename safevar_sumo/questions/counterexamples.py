@@ -98,7 +98,7 @@ def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
     worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
-    fit = f" (fit {model.fit} of the vehicle)" if model.fit else ""
+    fit = f" (parameter set {model.fit})" if model.fit else ""
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[worst[row]]

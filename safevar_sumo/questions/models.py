@@ -1,5 +1,5 @@
-"""Models of the vehicle in which a claim is tested: the fits of its study, at the study's points
-and between them.
+"""Models of the vehicle in which a claim is tested: the parameter sets of its study, at the study's
+points and between them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ BETWEEN_DECIMALS = 2
 
 
 class Model(NamedTuple):
-    """A fit of the vehicle, and what is unsafe with it: what a claim about a study is tested in.
+    """A parameter set of the vehicle model, in which a claim about a study is tested, and what is
+    unsafe with it.
 
     Attributes
     ----------
@@ -100,8 +101,8 @@ def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
 
 
 class Models(NamedTuple):
-    """The fits in which a claim is tested, the study's own first, and the numbers of those left
-    out: fits in which the original itself is unsafe, or keeps less than the margin.
+    """The parameter sets in which a claim is tested, the study's own first, and the numbers of
+    those left out, in which the original itself is unsafe, or keeps less than the margin.
     """
 
     members: tuple[Model, ...]
@@ -109,7 +110,7 @@ class Models(NamedTuple):
 
     @classmethod
     def own_alone(cls, evaluator: Evaluator, unsafe: Unsafe) -> Self:
-        """The study's own fit."""
+        """The study's own parameter set."""
         return cls((Model(0, evaluator, unsafe),), ())
 
     @property
@@ -161,9 +162,9 @@ def distance_to_keep(study: Study, margin: float | None) -> float:
 def models_of(
     evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False
 ) -> Models:
-    """The first `fits` fits of a study, by default all: what is unsafe holds in the study's own,
-    and a distance to keep there alone. No other fit may collide. Those with an unsafe original are
-    left out unless they are wanted.
+    """The first `fits` parameter sets of a study, by default all: what is unsafe holds in the
+    study's own, and a distance to keep there alone. No other set may collide. Those with an unsafe
+    original are left out unless they are wanted.
     """
     study = evaluator.study
     studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
@@ -173,7 +174,7 @@ def models_of(
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(
-            evaluator.characteristics.original[np.newaxis], "original with each fit"
+            evaluator.characteristics.original[np.newaxis], "original with each parameter set"
         )
         if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
             left_out.append(number)
@@ -258,5 +259,5 @@ def _draw(ends: tuple[Any, ...], rng: np.random.Generator) -> Any:
 
 
 def fit_names(fits: Sequence[int]) -> str:
-    """Fits in words: `fits 2, 5 and 8`."""
-    return f"fit{'' if len(fits) == 1 else 's'} {join_phrases(map(str, fits))}"
+    """Parameter sets in words: `parameter sets 2, 5 and 8`."""
+    return f"parameter set{'' if len(fits) == 1 else 's'} {join_phrases(map(str, fits))}"

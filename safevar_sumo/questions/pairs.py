@@ -24,12 +24,12 @@ settings.
 """
 SETTING_COLUMNS = {
     "solution": Column("", "handle of the solution"),
-    "unsafe_in": Column("", f"systems in which it is unsafe: {', '.join(UNSAFE_IN)}"),
+    "unsafe_in": Column("", f"systems in which the setting is unsafe: {', '.join(UNSAFE_IN)}"),
     **{
         f"{side}_{name}": column
         for side in SIDES
         for name, column in (
-            ("outcome", Column("", f"outcome in {side.upper()}")),
+            ("outcome", Column("", f"how the simulation ends in {side.upper()}")),
             (
                 "degree",
                 Column("m", f"safety degree in {side.upper()}; in -m/s on a collision", ".2f"),

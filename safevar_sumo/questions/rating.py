@@ -53,7 +53,7 @@ TESTS: Columns = TEST | {
     "robustness": POINTS(meaning="points of robustness layers"),
     "possible_standard": POINTS(meaning="points of the test in the standard range", is_shown=False),
     "possible_extended": POINTS(meaning="points of the test in the extended range", is_shown=False),
-    "failing_layers": "robustness layers that do not hold",
+    "failing_layers": "robustness layers that the vehicle does not pass",
     "claimed_layers": "robustness layers that the study claims and that are not simulated",
 }
 VEHICLES: Columns = VEHICLE | {
@@ -61,7 +61,7 @@ VEHICLES: Columns = VEHICLE | {
     "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
     "changes": "values that differ from the original's, in the study's units",
     "invalid_cells": "cells in which the vehicle cannot hold the speed; they earn nothing",
-    "remark": "what the protocol or its calculator makes of this vehicle",
+    "remark": "what to know about the points of this vehicle",
 }
 NOT_SIMULATED: Columns = {
     "test": "test of the protocol",
@@ -97,13 +97,15 @@ def rating(
     """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as
     Euro NCAP does in 2026.
 
-    Tests by day take place in the study's weather. Its numbers are the points of the original
-    vehicle, the possible ones, and those that the variant loses.
+    Tests by day take place in the study's weather. The numbers are the points of the original
+    vehicle, the points that the simulated tests give at most, and the points that the variant
+    loses.
 
     Parameters
     ----------
     set
-        A characteristic of the variant, in its unit or as +10% of the original; may be repeated.
+        Value of a characteristic of the variant, in its unit or as +10% of the original; may be
+        repeated.
     solution
         The variant is the N-th solution of a run, from 0, of a results directory; `set` changes it
         further.
@@ -193,7 +195,7 @@ def rate(
         "Vehicles", VEHICLES, zip(names, scores.total, lost, changes, invalid, remarks, strict=True)
     )
     not_simulated = tabulate(
-        "Not simulated, neither passed nor failed",
+        "Tests that are not simulated: neither passed nor failed",
         NOT_SIMULATED,
         protocol.points_not_simulated.items(),
     )
@@ -290,16 +292,17 @@ def _remarks(rater: Rater, scores: Points, cells: CellResults) -> Iterator[str |
         remarks = []
         if fails:
             remarks.append(
-                f"it earns nothing, because {REQUIRED} is not green in the whole standard range"
+                f"The vehicle earns nothing: {REQUIRED} is not green in the whole standard range."
             )
         elif scores.colours[number, protocol.unchecked_cells].any():
             remarks.append(
-                f"{UNCHECKED} is not green, which Euro NCAP requires; Euro NCAP's calculator "
-                f"{protocol.calculator_version} does not check this, nor do these points"
+                f"Euro NCAP requires that {UNCHECKED} is green, and it is not. Euro NCAP's"
+                f" calculator {protocol.calculator_version} does not check this, and neither do"
+                " these points."
             )
         if np.isnan(cells.warning[number]).all():
-            remarks.append("it never warns: rows with FCW are red")
-        yield "; ".join(remarks) or None
+            remarks.append("The vehicle never warns, so rows with FCW are red.")
+        yield " ".join(remarks) or None
 
 
 def _points_of_open_layers(rater: Rater) -> float:
@@ -329,8 +332,8 @@ def _verdict(
     road = ""
     if weather.water or weather.road_friction != 1:
         road = (
-            f" Euro NCAP tests on a dry road; this rating has the weather {weather.name!r}, by"
-            f" night {darken(weather).name!r}."
+            " Not comparable with an official rating: Euro NCAP tests on a dry road, and here the"
+            f" weather is {weather.name!r} by day and {darken(weather).name!r} by night."
         )
 
     # Without a variant, what the original earns.
@@ -338,33 +341,33 @@ def _verdict(
     earned = f"{scores.total[0]:.2f}"
     if not others:
         return (
-            f"The original vehicle earns {earned} of the {possible:g} points of the tests that are"
-            f" simulated.{road}"
+            f"The original vehicle earns {earned} of the {possible:g} points that the simulated"
+            f" tests give.{road}"
         )
 
     # What changes, what it costs, and where.
     items = {item.name: item for item in CharacteristicSet.of(study)}
     changes = [
-        f"{items[name].short_name} {float(items[name].text(value)):g}{items[name].suffix}"
+        f"{items[name].short_name} at {float(items[name].text(value)):g}{items[name].suffix}"
         for name, value in _changes(study, settings[variant]).items()
     ]
     lost = round(scores.total[0] - scores.total[-1], DECIMALS)
     where = ""
-    result = (
-        f"earns {-lost:.2f} points more, {scores.total[-1]:.2f} instead"
-        if lost < 0
-        else f"loses {lost:.2f}"
-    )
+    result = f"loses {lost:.2f} of the {earned} points that the original vehicle earns"
+    if lost <= 0:
+        more = f"{-lost:.2f} more than" if lost < 0 else "as many as"
+        result = f"earns {scores.total[-1]:.2f} points, {more} the original vehicle"
     losses = tests[tests["variant"] == variant]
     largest = losses[losses["lost"] == losses["lost"].max()]
     if lost > 0:
         prefix = "each of " if len(largest) > 1 else ""
         where = (
-            f", {largest['lost'].iloc[0]:.2f} of them in {prefix}{join_phrases([*largest['test']])}"
+            f" It loses most in {prefix}{join_phrases([*largest['test']])}:"
+            f" {largest['lost'].iloc[0]:.2f} points."
         )
     return (
-        f"With {join_phrases(changes or ['no change at all'])} the vehicle {result} of the {earned}"
-        f" points that the original earns (of {possible:g} that are simulated){where}.{road}"
+        f"With {join_phrases(changes or ['no change at all'])}, the vehicle {result}; the simulated"
+        f" tests give {possible:g}.{where}{road}"
     )
 
 

@@ -33,7 +33,12 @@ from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    counted_in_words,
+    join_phrases,
+    percentage,
+)
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
@@ -42,7 +47,7 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
-"""Stages of progress."""
+"""Phases of progress."""
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
 RESAMPLES = 200
@@ -95,7 +100,7 @@ def risk(
     Parameters
     ----------
     samples
-        Number of vehicles, drawn as [variation] says, without it uniformly over the domain.
+        Number of vehicles, sampled as [variation] says, without it uniformly over the domain.
     confidence
         Confidence of the intervals.
     unsafe
@@ -140,8 +145,8 @@ def risk(
 
     # In words.
     verdict = (
-        f"{_probability_in_words(study, failures, total)} ({criterion.description};"
-        f" {100 * confidence:g} % confidence interval {100 * low:.3g} to {100 * high:.3g} %)."
+        f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
+        f" confidence interval {percentage(low)} to {percentage(high)} %)."
         f"{NO_PROBABILITY if not study.variation else ''}"
     )
     left_out = int(drawn.infeasible.sum())
@@ -150,7 +155,8 @@ def risk(
             f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
         )
     verdict += deciding_in_words(table, failures)
-    verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
+    remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
+    verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
         question="risk",
         study=study,
@@ -175,8 +181,8 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     if np.isfinite(share):
         name = first["characteristic"]
         words = (
-            f" {name} has the largest share of the safety degree's variance, {share:.2f} ({low:.2f}"
-            f" to {high:.2f})."
+            f" {name} decides most: it causes {100 * share:.0f} % of the variance of the safety"
+            f" degree ({100 * low:.0f} to {100 * high:.0f} %)."
         )
 
     # Shares that are too unsure.
@@ -186,22 +192,23 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     for name, widths in of_output.items():
         if widths.max() > UNSURE:
             words += (
-                f" Shares of {OUTPUTS[name]} are unsure: intervals of up to {widths.max():.2f}."
+                f" The shares for {OUTPUTS[name]} are uncertain: their intervals are up to"
+                f" {100 * widths.max():.0f} percentage points wide."
             )
     if failures and of_output["unsafe"].isna().all():
         words += (
-            " Too few vehicles of the design are unsafe, or safe, for shares of that"
-            f" ({MIN_OUTCOMES})."
+            " What decides whether a vehicle is unsafe is unknown: that needs"
+            f" {MIN_OUTCOMES} unsafe and as many safe vehicles."
         )
     return words
 
 
-def _probability_in_words(study: Study, failures: int, total: int) -> str:
+def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total: int) -> str:
     """The share of unsafe vehicles, and how vehicles vary."""
-    share = f"{100 * failures / total:.3g} %"
+    share = f"{percentage(failures / total)} %"
     if not study.variation:
         vehicles = f"{total:,} vehicles that were sampled uniformly over the whole domain"
-        return f"Of {vehicles}, {failures:,} are unsafe: {share}"
+        return f"Of {vehicles}, {failures:,} {criterion.they_in_words}: {share}"
 
     # Distributions other than the uniform one.
     variation = [
@@ -211,10 +218,9 @@ def _probability_in_words(study: Study, failures: int, total: int) -> str:
     ]
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
-    vehicles = f"{failures:,} of {total:,} vehicles"
+    vehicles = f"Of {total:,} vehicles that vary as the study says ({manner})"
     return (
-        f"With the variation that the study states ({manner}), a vehicle is unsafe with a"
-        f" probability of {share}: {vehicles}"
+        f"{vehicles}, {failures:,} {criterion.they_in_words}. So the probability is about {share}"
     )
 
 
@@ -250,7 +256,9 @@ def sobol_indices(
     outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
-        names, found, {"first": ("S1", "first order"), "total": ("ST", "total, with all others")}
+        names,
+        found,
+        {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")},
     )
 
 
@@ -293,7 +301,10 @@ def given_data_indices(
     return _table(
         names,
         found,
-        {"first": ("S1", "first order, with what is correlated with it"), "total": UNDEFINED},
+        {
+            "first": ("S1", "first order, with everything that is correlated with it"),
+            "total": UNDEFINED,
+        },
     )
 
 
@@ -337,4 +348,4 @@ def _table(
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
-    return tabulate("What decides", columns, frame)
+    return tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)

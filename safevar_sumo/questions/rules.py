@@ -21,7 +21,12 @@ from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    counted_in_words,
+    join_phrases,
+    percentage,
+)
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -46,10 +51,12 @@ UNLIMITED = np.array([[-np.inf], [np.inf]])
 row 1.
 """
 COLUMNS: Columns = {
-    "rule": "limits of the characteristics; all others anywhere in their domains",
-    **with_interval("density", Column("-", "unsafe share of the vehicles within the rule", ".2f")),
+    "rule": "region: limits of some characteristics; all others anywhere in their domains",
     **with_interval(
-        "coverage", Column("-", "share of all unsafe vehicles that lie within the rule", ".2f")
+        "density", Column("-", "share of the vehicles within the region that are unsafe", ".2f")
+    ),
+    **with_interval(
+        "coverage", Column("-", "share of all unsafe vehicles that lie within the region", ".2f")
     ),
 }
 
@@ -65,14 +72,14 @@ def rules(
 ) -> Answer:
     """Find rules, in physical units, that say where in the domain a study is unsafe.
 
-    In a rule all characteristics vary together over the whole domain; how far one may go while all
-    others stay as in the original says `tolerance`.
+    All characteristics vary at the same time over the whole domain. `tolerance` says how far one
+    characteristic may change while all others stay as in the original.
 
     Parameters
     ----------
     samples
-        Number of vehicles, drawn as [variation] says, without it evenly over the domain; one half
-        yields the rules, the other half tests them.
+        Number of vehicles, sampled as [variation] says, without it uniformly over the domain; one
+        half yields the rules, the other half tests them.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
@@ -103,7 +110,7 @@ def rules(
     ]
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
-    table = tabulate("Where failures lie", COLUMNS, frame)
+    table = tabulate("Regions in which many vehicles are unsafe", COLUMNS, frame)
 
     # The share of unsafe vehicles, and the rule that covers most of them.
     low, high = clopper_pearson(failures, total)
@@ -113,9 +120,9 @@ def rules(
         else "sampled uniformly over the whole domain"
     )
     verdict = (
-        f"Of {total:,} vehicles {drawn}, {100 * failures / total:.2f} % are unsafe"
-        f" ({criterion.description}; 95 % confidence interval {100 * low:.2f} to"
-        f" {100 * high:.2f} %).{remark}"
+        f"Of {total:,} vehicles {drawn}, {failures:,} {criterion.they_in_words}:"
+        f" {percentage(failures / total)} % (95 % confidence interval"
+        f" {percentage(low)} to {percentage(high)} %).{remark}"
         f"{_rule_in_words(table, failures / total)}"
     )
     numbers = {
@@ -126,7 +133,8 @@ def rules(
         "interval": [low, high],
     }
     left_out = int(evaluations.infeasible.sum())
-    verdict = " ".join([verdict, *counted_in_words(study, left_out), *constraints_in_words(study)])
+    remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
+    verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
         question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
     )
@@ -141,8 +149,8 @@ def _rule_in_words(table: pd.DataFrame, share: float) -> str:
         return ""
     rule = denser.iloc[0]
     return (
-        f" {100 * rule['coverage']:.0f} % of them have {rule['rule']}; of all vehicles like that"
-        f" {100 * rule['density']:.0f} % are unsafe."
+        f" {100 * rule['coverage']:.0f} % of the unsafe vehicles have {rule['rule']}. Of all"
+        f" vehicles in this region {100 * rule['density']:.0f} % are unsafe."
     )
 
 
@@ -181,7 +189,7 @@ def _boxes(
         return _find_boxes(settings, is_unsafe, characteristics), ""
     remark = (
         f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N"
-        " draws more)."
+        " samples more)."
     )
     return [], remark
 

@@ -102,16 +102,19 @@ def number_of(count: int, noun: str) -> str:
 
 
 MAX_POINTS_NAMED = 6
-"""Maximum number of failing test points that a sentence names."""
+"""Maximum number of failing test cases that a sentence names."""
 
 
-def points_in_words(failing_points: Sequence[str], point_count: int) -> str:
-    """A sentence such as `Fails at 2 of 72 points: CPNA, speed 40, impact_location 25; CPLA, speed
-    60, clear.`
+def points_in_words(vehicle: str, failing_points: Sequence[str], point_count: int) -> str:
+    """A sentence such as `The original vehicle fails 2 of 72 test cases: CPNA, speed 40,
+    impact_location 25; CPLA, speed 60, clear.`
     """
+    if not failing_points:
+        tests = f"none of the {point_count} test cases" if point_count > 1 else "no test case"
+        return f"{vehicle} fails {tests}."
     rest = len(failing_points) - MAX_POINTS_NAMED
     names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
-    return f"Fails at {len(failing_points)} of {point_count} points{names and f': {names}'}."
+    return f"{vehicle} fails {len(failing_points)} of {point_count} test cases: {names}."
 
 
 def share_in_words(share: float) -> str:
@@ -121,6 +124,12 @@ def share_in_words(share: float) -> str:
     if share >= 0.995:
         return "nearly all"
     return "hardly any" if share < 0.005 else f"{100 * share:.0f} %"
+
+
+def percentage(share: float) -> str:
+    """A share as a percentage with the digits that decide, without its sign: `37`, `0.043`."""
+    value = 100 * share
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
 
 
 def two_decimals(value: float | None) -> str:

@@ -21,6 +21,7 @@ from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
+from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -259,11 +260,11 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
     tables = {
         "characteristics": _characteristics(simulation),
-        "results": tabulate("Results", RESULTS, results),
+        "results": _without_repetition(tabulate("Results", RESULTS, results), simulation),
     }
 
     # The verdict; of a matrix with the points at which it fails.
-    verdict = [simulation.no_verdict, *_verdict(simulation)]
+    verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
     if system.rater is not None:
         verdict.append(
             f"The command `rating` simulates all {len(system.matrix)} cells and variations."
@@ -276,7 +277,9 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         ]  # side and place are columns
         tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
         failing = [one.point.name for one in results_by_point if _fails(study, one)]
-        verdict.append(points_in_words(failing, len(points)))
+        is_changed = simulation.setting != simulation.original.setting
+        who = "changed" if is_changed else "original"
+        verdict.append(points_in_words(f"The {who} vehicle", failing, len(points)))
 
     # The model's own uncertainty.
     if with_spread:
@@ -434,27 +437,53 @@ def _remark_table(remarks: list[str]) -> pd.DataFrame:
     return tabulate("Remarks", REMARKS, [(remark,) for remark in dict.fromkeys(remarks)])
 
 
+def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataFrame:
+    """A table whose readers see the values of the original vehicle once if nothing is changed."""
+    if simulation.row == 0:
+        columns = frame.attrs["columns"]
+        for name in {"simulated", "changed"} & set(columns):
+            columns[name] = columns[name]._replace(is_shown=False)
+    return frame
+
+
 def _characteristics(simulation: Simulation) -> pd.DataFrame:
     pairs = zip(CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True)
     rows = (
         (item.name, item.unit, item.original, value, value != item.original, item.words)
         for item, value in pairs
     )
-    return tabulate(simulation.study.title, CHARACTERISTICS, rows)
+    return _without_repetition(tabulate(simulation.study.title, CHARACTERISTICS, rows), simulation)
 
 
-def _verdict(simulation: Simulation) -> list[str]:
-    """How the original vehicle and, if it differs, the simulated one end."""
+def _verdict(simulation: Simulation, point_count: int) -> list[str]:
+    """How the simulated vehicle and, if it differs, the original end; of a matrix in the worst of
+    its test cases.
+    """
+    # Where both meet the obstacle: in an encounter, a test case, or the worst of several.
     least = simulation.scoring.safe_original
     name = simulation.pair.point.name
     where = "The" if least is None else "In this encounter the"
-    if name:
+    worst = ""
+    if point_count > 1:
+        kind = "least" if simulation.metrics[SAFETY_DEGREE] > 0 else "worst"
+        worst = f", the {kind} of {point_count} test cases ({name})"
+        where = "The"
+    elif name:
         where = f"In the test case {name}, the"
-    verdict = [f"{where} original vehicle {simulation.original.verdict}."]
-    if simulation.setting != simulation.original.setting:
-        verdict.append(
-            f"The changed vehicle {simulation.verdict}: {_safety_comparison(simulation)}."
-        )
+
+    # The simulated vehicle first if the case is its worst one.
+    original = f"original vehicle {simulation.original.verdict}"
+    changed = f"changed vehicle {simulation.verdict}"
+    comparison = _safety_comparison(simulation)
+    if simulation.setting == simulation.original.setting:
+        verdict = [f"{where} {original}{worst}."]
+    elif worst:
+        verdict = [f"The {changed}{worst}.", f"In the same test case the {original}: {comparison}."]
+    else:
+        verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
+
+    # Why it looks safer, and why a search leaves this encounter out.
+    verdict += _why_safer(simulation)
     if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
         verdict.append(f"Here {NOT_SAFE}: at least {least:.2f} m.")
     return verdict
@@ -465,25 +494,59 @@ def _safety_comparison(simulation: Simulation) -> str:
     stop = simulation.metrics.get(STOPPING_DISTANCE.name, np.nan)
     original_stop = simulation.original.metrics.get(STOPPING_DISTANCE.name, np.nan)
     if np.isfinite(stop / original_stop):
-        return f"in {stop / original_stop:.2f} times the distance of the original"
+        return (
+            f"the stopping distance of the changed vehicle is {stop / original_stop:.2f} times that"
+            " of the original"
+        )
 
     # Else by the safety degree.
     degree = simulation.metrics[SAFETY_DEGREE]
     original = simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):
-        return "whether that is less safe cannot be decided"
+        return "whether the changed vehicle is less safe cannot be decided"
     if degree == original:
-        return "as safe as the original"
-    gaps = (
-        ""
-        if simulation.gap == degree
-        else f", gap {simulation.gap:.2f} against {simulation.original.gap:.2f} m"
-    )
-    change = "less safe" if degree < original else "safer"
-    return (
-        f"{change} than the original, SD {degree:.2f} against"
-        f" {original:.2f}{gaps if degree > 0 else ''}"
-    )
+        return "both are equally safe"
+    return f"the changed vehicle is {'less safe' if degree < original else 'safer'}"
+
+
+def _why_safer(simulation: Simulation) -> list[str]:
+    """Why a changed vehicle has a higher safety degree than an original that does not collide, in a
+    sentence; none if it has not, or if neither pedals nor frames explain it.
+    """
+    gain = simulation.metrics[SAFETY_DEGREE] - simulation.original.metrics[SAFETY_DEGREE]
+    if not (gain > 0 and simulation.original.metrics[SAFETY_DEGREE] > 0):
+        return []
+
+    # Where and how fast each begins to brake, and how hard its driving system brakes.
+    runs = simulation.pair.runs
+    trace = runs.trace
+    rows = range(len(simulation.pair.evaluations))
+    onsets = [brake_onset(runs, row) for row in rows]
+    if None in onsets:
+        return []
+    gaps = [float(trace.gap[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
+    speeds = [float(trace.speed[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
+    brakes = [float(np.max(trace.brake[trace.active[:, row], row])) for row in rows]
+    if brakes[-1] > brakes[0]:
+        return [
+            "The driving system brakes the changed vehicle harder: with up to"
+            f" {100 * brakes[-1]:.0f} instead of {100 * brakes[0]:.0f} % of the pedal."
+        ]
+    if round(speeds[-1], 2) < round(speeds[0], 2):
+        return [
+            f"The changed vehicle arrives more slowly: it begins to brake at {speeds[-1]:.2f}"
+            f" instead of {speeds[0]:.2f} m/s."
+        ]
+
+    # A frame moves the start of braking by up to the way that the vehicle covers in it.
+    way = max(speeds) * trace.step
+    if not 0 < gaps[-1] - gaps[0] <= way:
+        return []
+    return [
+        f"It begins to brake {gaps[-1] - gaps[0]:.2f} m earlier, which is less than a frame: the"
+        f" driving system decides once in {trace.step:g} s, in which the vehicle travels"
+        f" {way:.2f} m. So this gain does not show that the change helps."
+    ]
 
 
 def _remarks(system: System) -> list[str]:

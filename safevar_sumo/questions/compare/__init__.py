@@ -91,21 +91,21 @@ def compare(
 ) -> Answer:
     """Compare two studies or results, A and B: what is better in B, and what is worse.
 
-    A version B whose original vehicle collides where A's does not is not to be released: exit code
-    3. One criterion counts for both. Where the original vehicles differ, the same changes of each
-    are compared. The filter of small changes, whose thresholds are a search's, does not act.
+    A version B whose original vehicle collides where that of A does not must not be released: the
+    command ends with exit code 3. The same criterion counts for both. Where the original vehicles
+    differ, the same changes of each original are compared. Small changes are not filtered out.
 
     Parameters
     ----------
     samples
-        Number of settings that are drawn in the common domain beside the solutions, near to where A
-        and B begin to fail: their counts are no shares of the domain.
+        Number of settings that are sampled in the common domain beside the solutions, near to where
+        A and B begin to fail: their counts are no shares of the domain.
     limits
-        A limit in the characteristic's unit, such as "treadDepth >= 3", within which is compared;
-        may be repeated.
+        A limit in the characteristic's unit, such as "treadDepth >= 3"; only vehicles within it
+        are compared. May be repeated.
     margin
-        Distance to keep from a collision [m], as in `tolerance`; by default the larger one of the
-        two studies.
+        Clearance that every vehicle must keep [m], as in `tolerance`; by default the larger one of
+        the two studies.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     """
@@ -125,6 +125,7 @@ def compare(
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     is_rating = all(is_rated(side.study) for side in evaluators)
+    quantity = "rating" if is_rating else "safety degree"
     tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
@@ -136,7 +137,7 @@ def compare(
         compare_counts(counts, titles[0]),
         compare_limits(limits_table, evaluator.characteristics.vehicle.members),
         difference,
-        compare_values("rating" if is_rating else "safety degree", tested.p, tested.a12),
+        compare_values(quantity, tested.p, tested.a12),
     )
     difference = Difference.joined(differences)
     numbers: JsonObject = {
@@ -151,7 +152,6 @@ def compare(
         *(f"{refusal}." for refusal in refusals),
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         *_verdict(difference, titles, criteria[0], is_measured=bool(numbers["benign_scenes"])),
-        _test_in_words(tested),
         *_basis_in_words(common, limits),
         *counted_in_words(study, pairs.number_infeasible),
     ]
@@ -159,6 +159,7 @@ def compare(
         question="compare",
         study=study,
         verdict=" ".join(sentences),
+        tested=_test_in_words(tested, quantity, titles),
         numbers=numbers,
         tables={"limits": limits_table, "settings": _settings_table(common, settings)},
         failures=refusals,
@@ -256,7 +257,12 @@ def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsaf
 def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
     """The table of settings, those first that are unsafe in one system only."""
     members = common.evaluators[0].characteristics.members
-    columns = {"source": Column("", "a or b, whose solution it is, or sample"), **SETTING_COLUMNS}
+    columns = {
+        "source": Column(
+            "", "where the setting comes from: a solution of a or of b, or the sample"
+        ),
+        **SETTING_COLUMNS,
+    }
     columns |= {item.name: Column(item.unit, item.words, is_shown=False) for item in members}
     for column in np.flatnonzero(common.shift).tolist():
         item = members[column]
@@ -284,7 +290,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
-    unit = "line"
+    unit = "line of settings"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
@@ -300,36 +306,44 @@ def _verdict(
     """Whether B is better: in something and worse in nothing, needless braking included."""
     # Only what is better without anything worse is better.
     a, b = titles
-    better, worse, facts = ("; ".join(phrases) for phrases in difference)
+    better, worse, facts = ("; it ".join(phrases) for phrases in difference)
     if worse and better:
-        yield f"Neither is better. {b} {worse}. But it {better}"
+        yield f"Neither {a} nor {b} is better in everything."
+        yield f"What is worse: {b} {worse}."
+        yield f"What is better: {b} {better}."
     elif worse:
-        yield f"{b} is worse than {a}: it {worse}"
+        yield f"{b} is worse than {a}: it {worse}."
     elif better and is_measured:
-        yield f"{b} is better than {a}: it {better}; nothing that was measured is worse"
+        yield f"{b} is better than {a}: it {better}. Nothing that was measured is worse."
     elif better:
-        yield (
-            f"{b} is not called better than {a}, as needless braking was not measured: it {better}"
-        )
+        yield f"Not enough evidence that {b} is better than {a}, although it {better}."
     else:
-        yield f"No difference between {a} and {b} was found"
-    yield f"(unsafe: {unsafe.description})."
+        yield f"No difference between {a} and {b} was found."
+
+    # What else differs, what was not measured, and what counts as unsafe.
     if facts:
-        yield f"Both new, {b} {facts}."
+        yield f"With the original vehicle, {b} {facts}."
     if not is_measured:
         yield "Needless braking was not measured: no benign scenes are known for this scenario."
+    if not unsafe.is_collision or unsafe.keep:
+        yield f"Counted as unsafe: {unsafe.description}."
+    if unsafe.remark:
+        yield unsafe.remark
 
 
-def _test_in_words(tested: _PairedTest) -> str:
+def _test_in_words(tested: _PairedTest, quantity: str, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
-    return f"Test of {tested.pairs}: p = {tested.p:.2g}, A12 = {tested.a12:.2f}."
+    return (
+        f"A signed-rank test of the {quantity} over {tested.pairs} has p = {tested.p:.2g}; with a"
+        f" probability of {tested.a12:.2f} (A12), the value of {titles[0]} is the larger one."
+    )
 
 
 def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
     """Within which limits, and around which originals."""
     if limits:
-        yield f"Compared within {join_phrases(limits)}."
+        yield f"All vehicles that were compared are within {join_phrases(limits)}."
 
     # Original values that differ.
     members = [side.characteristics.members for side in common.evaluators]
@@ -340,6 +354,6 @@ def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str
     ]
     if texts:
         yield (
-            f"The original vehicles differ ({join_phrases(texts)}): the same changes of each are"
-            " compared."
+            f"The original vehicles differ ({join_phrases(texts)}), so the same changes of each"
+            " original are compared."
         )

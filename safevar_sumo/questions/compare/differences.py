@@ -38,7 +38,7 @@ LIMIT_COLUMNS = {
     **with_interval(
         "b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")
     ),
-    "change": Column("", "what becomes of the interval: grown, shrunk, both, or the same"),
+    "change": Column("", "how the interval changes from A to B: grown, shrunk, both, or the same"),
 }
 GROWN = "grown"
 SHRUNK = "shrunk"
@@ -48,8 +48,8 @@ UNDEFINED = (np.nan, np.nan)
 """The ends of no interval."""
 MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
-OF_OWN_FIT = "with the study's own fit"
-"""In which of the vehicle models that fit the published data the limits are."""
+OF_OWN_FIT = "with the study's own parameter set"
+"""In which parameter set of the vehicle model the limits hold."""
 LEAST_METRES = 0.05
 """A smaller distance by which a vehicle brakes earlier or later is not mentioned [m]."""
 
@@ -78,9 +78,9 @@ def compare_counts(counts: Mapping[str, int], a: str) -> Difference:
     """The settings that are unsafe in one system only."""
     only_a = counts["only_a_unsafe"]
     only_b = counts["only_b_unsafe"]
-    unsafe_in_a = number_of(only_a + counts["both"], "setting")
-    safe_in_a = number_of(only_b + counts["neither"], "setting")
-    better = [f"avoids {only_a} of {unsafe_in_a} unsafe in {a}"] if only_a else []
+    unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that"
+    safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that"
+    better = [f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}"] if only_a else []
     worse = [f"is unsafe in {only_b} of {safe_in_a} safe in {a}"] if only_b else []
     return Difference(better, worse)
 
@@ -100,7 +100,7 @@ def compare_values(quantity: str, p: float, a12: float) -> Difference:
 def limits_of_both(
     evaluators: Sequence[Evaluator], criteria: Sequence[Unsafe], limits: Mapping[str, Limit]
 ) -> pd.DataFrame:
-    """The table of limits alone with the study's own fit, rounded as `tolerance` rounds them,
+    """The table of limits alone with the study's own set, rounded as `tolerance` rounds them,
     within the user's limits; no interval where the original is unsafe.
     """
     # Limits of each characteristic alone, in both.
@@ -118,7 +118,9 @@ def limits_of_both(
         ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
         rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
     return tabulate(
-        f"Limits of each alone {OF_OWN_FIT}, rounded to the safe side", LIMIT_COLUMNS, rows
+        f"Limits of each characteristic alone {OF_OWN_FIT}, rounded to the safe side",
+        LIMIT_COLUMNS,
+        rows,
     )
 
 
@@ -162,15 +164,17 @@ def _moved_limits(
         for number in numbers[:MAX_LIMITS_NAMED]
     ]
     if len(numbers) > MAX_LIMITS_NAMED:
-        texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
-    return [f"has limits {OF_OWN_FIT} that {verb}: {join_phrases(texts)}"] if texts else []
+        texts.append(f"and {len(numbers) - MAX_LIMITS_NAMED} more")
+    return (
+        [f"has limits of one characteristic alone that {verb}: {'; '.join(texts)}"] if texts else []
+    )
 
 
 def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
-    """A limit in B, and in A in brackets, such as `sensorRange from 19.1 (15) m`."""
-    ends = (("from", row["a_low"], row["b_low"]), ("to", row["a_high"], row["b_high"]))
-    moved = " ".join(f"{word} {b:g} ({a:g})" for word, a, b in ends if a != b)
-    return f"{item.name} {moved}{item.suffix}"
+    """A limit in B, and in A, such as `sensorRange at least 19.1 instead of 15 m`."""
+    ends = (("at least", row["a_low"], row["b_low"]), ("at most", row["a_high"], row["b_high"]))
+    moved = (f"{word} {b:g} instead of {a:g}{item.suffix}" for word, a, b in ends if a != b)
+    return f"{item.name} {join_phrases(moved)}"
 
 
 def compare_originals(
@@ -195,26 +199,27 @@ def compare_originals(
     parts = list[Difference]()
     if in_a != in_b:
         phrase = (
-            f"is {'unsafe' if in_b else 'safe'} with the original vehicle, which is not so in {a}"
+            f"is {'unsafe' if in_b else 'safe'} already with the original vehicle, where {a} is"
+            f" {'safe' if in_b else 'unsafe'}"
         )
         parts.append(Difference.of(phrase, is_better=in_a))
     if braking["a_needless_braking"] != braking["b_needless_braking"]:
         before = braking["a_needless_braking"]
         after = braking["b_needless_braking"]
         phrase = (
-            f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes ({before} in"
-            f" {a})"
+            f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes, where {a}"
+            f" does so in {before}"
         )
         parts.append(Difference.of(phrase, is_better=after < before))
     if points and points["a_points"] != points["b_points"]:
-        phrase = f"earns {points['b_points']:.4g} points ({points['a_points']:.4g} in {a})"
+        phrase = f"earns {points['b_points']:.4g} points, where {a} earns {points['a_points']:.4g}"
         parts.append(Difference.of(phrase, is_better=points["b_points"] > points["a_points"]))
     onsets = ((metres["metres_earlier"], "earlier"), (metres["metres_later"], "later"))
     phrases = [
         f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES
     ]
     if phrases:
-        parts.append(Difference(facts=[f"brakes {join_phrases(phrases)}"]))
+        parts.append(Difference(facts=[f"begins to brake {join_phrases(phrases)}"]))
     return numbers, Difference.joined(parts)
 
 
@@ -245,10 +250,10 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
         return ()
     speed, point = max(new, key=lambda pair: pair[0])
     where = where_in_words(systems[1].points, point, point.scenario, {})
-    more = f" ({number_of(len(new), 'such point')})" if len(in_b) > 1 else ""
+    more = f" (the fastest of {len(new)} such test cases)" if len(new) > 1 else ""
     a, b = titles
     collision = f"its original vehicle collides at {speed:.2f} m/s{where}"
-    return (f"Do not release {b}: {collision}, where that of {a} does not{more}",)
+    return (f"Do not release {b}: {collision}, where that of {a} does not collide{more}",)
 
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:

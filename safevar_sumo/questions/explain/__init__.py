@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
-SOLUTIONS, DRAWN = "different solutions of the search", "vehicles drawn from the whole domain"
+SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
 """What the settings are of which some are unsafe."""
 
 
@@ -103,10 +103,10 @@ def explain(
     fits: Annotated[int, Range(0, 1000)] = 20,
     quick: bool = False,
 ) -> Answer:
-    """Explain failures: which changes cause them, how small a change is enough, and who would have
-    avoided them.
+    """Explain failures: which changes are necessary, how small they may be, and whether another
+    driver would have avoided the collision in the same vehicle.
 
-    Of a study without results, failures among settings drawn from its whole domain are explained.
+    Of a study without results, failures among vehicles sampled over its whole domain are explained.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def explain(
         more, a random sample is analysed.
     fits
         Number of parameter sets of the vehicle model (those of [spread]) with which each conclusion
-        is drawn again; 0 leaves this out.
+        is checked again; 0 leaves this out.
     quick
         A rough answer within seconds: the study's own parameter set alone, and causes of few
         failures.
@@ -242,26 +242,29 @@ def _verdict(
     contact = evaluator.system.contact
     runs = population.evaluations
     number = np.count_nonzero(unsafe.of(runs))
-    counts = f"Of {len(runs)} {kind}, {number} are unsafe ({unsafe.description})."
+    counts = f"Of {len(runs):,} {kind}, {number:,} {unsafe.they_in_words}. {unsafe.remark}".strip()
 
     # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
         demand = f" {unsafe.smaller_demand}".rstrip()
-        return f"The original itself {words}: no change is needed.{demand} {counts}"
+        return f"The original vehicle itself {words}: no change is necessary.{demand} {counts}"
 
     # Without a cause, how the worst setting and the original end.
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
         ends = [
             f"The {who} {ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)}."
-            for who, run in (("worst", nearest), ("original", population.original))
+            for who, run in (("worst vehicle", nearest), ("original vehicle", population.original))
             if len(run)
         ]
         return " ".join([counts, *ends])
     leading = causes.iloc[0]
     if not leading["changes"]:
-        return f"The original itself is unsafe in this encounter: no change is needed. {counts}"
+        return (
+            "The original vehicle itself is unsafe in this encounter: no change is necessary."
+            f" {counts}"
+        )
     # The vehicle at the boundary with the values as they are printed, with which it is unsafe.
     members = evaluator.characteristics
     boundary = {**leading["boundary"], **leading.get("encounter", {})}
@@ -289,24 +292,21 @@ def _verdict(
     ]
     if sets:
         holding = f"{leading['fits_holding']} of {sets}"
-        sentences.append(f"It holds in {holding} parameter sets of the vehicle model.")
+        sentences.append(f"The cause holds in {holding} parameter sets of the vehicle model.")
     return " ".join([*filter(None, sentences), counts])
 
 
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     """What a competent driver, and full braking, would have avoided."""
     shares = avoided_shares(verdicts)
-    titles = {
-        LETTER: "a competent driver would have avoided {}",
-        FULL: "full braking at the first possible moment {}",
-    }
+    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
     phrases = [
-        title.format(share_in_words(shares[name]))
+        f"{title} would have avoided {share_in_words(shares[name])}"
         for name, title in titles.items()
         if name in shares
     ]
     number = number_of(len(verdicts), "collision")
-    return f"Of {number} in the same vehicle, {join_phrases(phrases)}." if phrases else ""
+    return f"Of {number}, in the same vehicle {join_phrases(phrases)}." if phrases else ""
 
 
 def draw_needed(answer: Answer) -> Figure:
@@ -323,12 +323,12 @@ def draw_needed(answer: Answer) -> Figure:
     # Bars over each other, the most necessary characteristic first.
     frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
-    figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and needed", 1, 1, size)
+    figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and necessary", 1, 1, size)
     names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
         ("changed", "changed", GREY, 0.8),
         ("in_some", "in some minimal cause", SKY_BLUE, 0.5),
-        ("needed", "needed: in every minimal cause", BLUE, 0.24),
+        ("needed", "necessary: in every minimal cause", BLUE, 0.24),
     ):
         axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
     axis.set_xlim(0, 100)

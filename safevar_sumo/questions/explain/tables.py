@@ -38,19 +38,22 @@ MAX_DISTINCT = 10
 CAUSE_COLUMNS: Columns = {
     "solution": "handle of the failure",
     "changes": Column(
-        "", "a smallest set of its changes that is unsafe by itself", ".5g", is_shown=False
+        "",
+        "a smallest set of the failure's changes that is unsafe by itself",
+        ".5g",
+        is_shown=False,
     ),
     "encounter": Column("", "the encounter, in which the original vehicle is safe", ".5g"),
     "boundary": Column(
-        "", "the values if all these changes are scaled back as far as they stay unsafe", ".5g"
+        "", "the values if these changes are made as small as they can be and still unsafe", ".5g"
     ),
     "single_boundary": Column(
-        "", "of each, the value if this change alone is scaled back", ".5g", is_shown=False
+        "", "for each change, the value if this change alone is made smaller", ".5g", is_shown=False
     ),
     "fraction": Column(
         "-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False
     ),
-    "end": Column("", "what lies just below the boundary", is_shown=False),
+    "end": Column("", "what happens just below the boundary", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
     "elsewhere": "whether these changes are unsafe in the original encounter, too",
     "outcome": Column("", "outcome with these changes only", is_shown=False),
@@ -58,7 +61,7 @@ CAUSE_COLUMNS: Columns = {
         "m", "safety degree with these changes only; -m/s on a collision", is_shown=False
     ),
     "robust_share": Column(
-        "-", "share of the neighbours of these changes that are unsafe, too", ".2f"
+        "-", "share of vehicles with slightly different values that are unsafe, too", ".2f"
     ),
     "fits_holding": "number of parameter sets with which these changes are a cause, too",
     "avoided_by": Column(
@@ -68,15 +71,17 @@ CAUSE_COLUMNS: Columns = {
 OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns of a study that searches its scenario."""
 SOLUTION_COLUMNS: Columns = {
-    "solution": "handle",
-    "reason": "why it is explained",
+    "solution": "handle of the failure",
+    "reason": "why this failure was chosen",
     "outcome": Column("", "outcome", is_shown=False),
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
     "changed": "number of changes",
     "largest_change": Column(
-        "-", "largest change, as a share of the original value", is_shown=False
+        "-", "its largest change, as a share of the original value", is_shown=False
     ),
-    "robust_share": Column("-", "share of its neighbours that are unsafe, too", ".2f"),
+    "robust_share": Column(
+        "-", "share of vehicles with slightly different values that are unsafe, too", ".2f"
+    ),
     "ends": Column(
         "", "how the original vehicle and this one end, where this one is worst", is_shown=False
     ),
@@ -84,17 +89,16 @@ SOLUTION_COLUMNS: Columns = {
         "", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False
     ),
     "avoided_by": (
-        "weakest reference driver who avoids it, in the same vehicle; nobody: unavoidable"
+        "weakest reference driver who avoids it in the same vehicle; nobody: unavoidable"
     ),
 }
 CHARACTERISTIC_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
     "changed": Column("-", "share of the failures that change it", ".2f"),
     **with_interval(
-        "needed",
-        Column("-", "share of the failures of which every minimal cause contains it", ".2f"),
+        "needed", Column("-", "share of the failures for which it is in every minimal cause", ".2f")
     ),
-    "in_some": Column("-", "share of the failures of which some minimal cause contains it", ".2f"),
+    "in_some": Column("-", "share of the failures for which it is in some minimal cause", ".2f"),
 }
 """The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else
 the share itself.
@@ -188,7 +192,7 @@ def causes_table(
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
     omitted = () if study.scenario.search else OF_ENCOUNTER
     columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
-    return tabulate("Minimal causes, all else as in the original", columns, frame)
+    return tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
 
 
 def statistics_tables(
@@ -200,7 +204,7 @@ def statistics_tables(
     of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
     return {
         "characteristics": tabulate(
-            f"Changed and needed, in {number_of(failures, 'failure')}",
+            f"Changed and necessary, in {number_of(failures, 'failure')}",
             {**CHARACTERISTIC_COLUMNS, "needed_in_fits": in_fits},
             needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
         ),

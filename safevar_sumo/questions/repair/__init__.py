@@ -1,10 +1,10 @@
-"""Which smallest change of the driving system survives the wear that the user promises, and what
-does it cost?
+"""Which smallest change of the driving system keeps all vehicles safe within a required range of
+wear, and what does it cost?
 
-The first counterexamples are corners and Sobol points of the promise, without vehicles that no
-driving system survives. The smallest changes that survive them (`smallest`) are attacked and proved
-(`attack`); what breaks one is a new counterexample (`survivors`). Today's driving system is the
-change of no parameter.
+The first counterexamples are corners and Sobol points of the range, without vehicles that no
+driving system keeps safe. The smallest changes that survive them (`smallest`) are falsified and
+validated (`validation`); what breaks a change is a new counterexample (`survivors`). Today's
+driving system is the change of no parameter.
 """
 
 from __future__ import annotations
@@ -65,27 +65,38 @@ REPAIRS = {
     "change": Column("", "what changes, in words"),
     "changed": Column("-", "number of parameters that change", is_shown=False),
     "fits": Column(
-        "-", "number of fits of the vehicle with which it was attacked and holds", is_shown=False
+        "-", "number of parameter sets of the vehicle model in which it holds", is_shown=False
     ),
     "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
     "metres_earlier": Column(
-        "m", "how much earlier a new vehicle brakes, at most over all points", ".2f"
+        "m", "how much earlier a new vehicle brakes, at most over all test cases", ".2f"
     ),
     "metres_earlier_mean": Column(
-        "m", "how much earlier it brakes on average over all points", ".2f", is_shown=False
+        "m", "how much earlier it brakes on average over all test cases", ".2f", is_shown=False
     ),
     "seconds_earlier": Column(
-        "s", "how much earlier it brakes where that is most metres", ".2f", is_shown=False
+        "s",
+        "how much earlier it brakes in the test case with the most metres",
+        ".2f",
+        is_shown=False,
     ),
-    "most_at": Column("", "the point where that is", is_shown=False),
-    "largest_deceleration": Column("m/s^2", "its largest deceleration", ".1f"),
-    "needless_braking": Column("-", "number of benign scenes in which it brakes"),
-    "needless_braking_today": Column("-", "number of benign scenes in which it brakes today"),
+    "most_at": Column("", "the test case with the most metres", is_shown=False),
+    "largest_deceleration": Column("m/s^2", "largest deceleration of a new vehicle", ".1f"),
+    "needless_braking": Column(
+        "-", "number of benign scenes in which the changed driving system brakes"
+    ),
+    "needless_braking_today": Column(
+        "-", "number of benign scenes in which the driving system of today brakes"
+    ),
     "benign_scenes": Column("-", "number of scenes in which nobody needs to brake"),
-    "proof_samples": Column("-", "number of worn vehicles drawn after the parameters were chosen"),
-    "proof_failures": Column("-", "number of them that are unsafe"),
+    "proof_samples": Column(
+        "-", "number of worn vehicles sampled after the parameters were chosen"
+    ),
+    "proof_failures": Column("-", "number of these vehicles that are unsafe"),
     "at_most": Column(
-        "-", f"share of unsafe vehicles at most, with {100 * CONFIDENCE:g} % confidence", ".2g"
+        "-",
+        f"upper bound of the share of unsafe vehicles, with {100 * CONFIDENCE:g} % confidence",
+        ".2g",
     ),
 }
 
@@ -117,19 +128,19 @@ def repair(
     out: Annotated[str | None, "FILE.toml"] = None,
     quick: bool = False,
 ) -> Answer:
-    """Find the smallest change of the driving system that survives promised wear, and its price.
+    """Find the smallest change of the driving system that keeps worn vehicles safe, and its price.
 
-    Failures of results within the promise are survived, too.
+    Failures of results that lie within the required range must be safe, too.
 
     Parameters
     ----------
     promise
-        Wear that is promised, such as "treadDepth >= 3"; may be repeated. Characteristics that no
-        promise names stay as in the original; "all" promises the whole domain. By default the
-        study's [repair.promise], else its [limits].
+        Wear up to which vehicles have to be safe (the required range), such as "treadDepth >= 3";
+        may be repeated. Characteristics that are not named stay as in the original; "all" means the
+        whole domain. By default the study's [repair.promise], else its [limits].
     margin
-        Distance to keep from a collision [m], between bumpers; by default the model's error that
-        the study states, else 0.3 m.
+        Clearance that every vehicle must keep [m], between bumpers; by default the model's error
+        that the study states, else 0.3 m.
     unsafe
         What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac >
         6".
@@ -137,9 +148,9 @@ def repair(
         Parameter of the driving system that may change; may be repeated. By default those under
         [repair], else those that come with a shipped driving system.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) in
-        which a repair holds: the margin with the study's own, no collision with any other; by
-        default all, 0 for the study's own alone.
+        Number of parameter sets of the vehicle model (those of [spread]) in which a repair holds:
+        the margin with the study's own, no collision with any other; by default all, 0 for the
+        study's own alone.
     out
         Study file to write with the first repair; it extends the study.
     quick
@@ -183,7 +194,7 @@ def repair(
     first = _first_vehicles(problem, subject)
     if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
-        text = f"{study.name!r}: the new vehicle {kept} in no encounter that was tried"
+        text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
         raise InputError(
             study.source, text, "a smaller --margin, or other domains under [scenario.search]"
         )
@@ -278,30 +289,36 @@ def _answer_of(
         "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": len(models.members),
     }
-    demand = f"with {unsafe.keep:g} m left" if unsafe.keep else f"without {unsafe.description}"
-    wear = f"({problem.promise.in_words}) {demand}"
+    wear = problem.promise.in_words
+    safe = f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
+    demand = "" if unsafe.keep else f" Counted as unsafe: {unsafe.description}."
     if kept_today:
-        where = " wherever any driving system can" if not_repairable else ""
+        where = " that any driving system can keep safe" if not_repairable else ""
         degree = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
         ending = unsafe.value_in_words(worst) if unsafe.bound else degree
         verdict = (
-            f"The driving system of today keeps this promise {wear}{where}: the worst vehicle tried"
-            f" {ending}, and {_proof_in_words(survivors)}."
+            "No repair is necessary: with the driving system of today all tested vehicles"
+            f"{where} {safe} within the required range ({wear}). The worst of them {ending}."
+            f" {_proof_in_words(survivors)}"
         )
     elif repairs:
-        verdict = f"{_repair_in_words(repairs[0], wear)}, and {_proof_in_words(survivors)}."
+        verdict = f"{_repair_in_words(repairs[0], wear, safe)} {_proof_in_words(survivors)}"
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
-        verdict = f"No change of one or two of {names} was found that survives this wear {wear}."
+        verdict = (
+            f"No change of one or two of {names} was found with which all vehicles within the"
+            f" required range ({wear}) {safe}."
+        )
+    verdict += demand
     verdict += _fits_in_words(models, survivors)
     if not_repairable:
         fewest = sorted(not_repairable, key=len)
         parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
         more = len(fewest) - SHOWN_LIMITS
-        others = f" (or {more} more, not_repairable)" if more > 0 else ""
+        others = f" ({more} more are in the numbers, not_repairable)" if more > 0 else ""
         verdict += (
-            f" No driving system survives {parts}{others}: that needs another part, not a"
-            " parameter."
+            f" Even full braking at the first possible moment fails with {parts}{others}: that"
+            " needs another part, not another parameter."
         )
     return Answer(
         question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables
@@ -348,29 +365,30 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) ->
     }
 
 
-def _repair_in_words(repair: JsonObject, wear: str) -> str:
+def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
     """A repair and its price on a new vehicle."""
-    number = "One change survives" if repair["changed"] == 1 else "Two changes survive"
+    number = "one change" if repair["changed"] == 1 else "two changes"
     metres = repair["metres_earlier"]
     earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
-    needless = "in an unknown share of benign scenes, of which the study has none"
+    needless = "Needless braking was not measured: the study has no benign scenes."
     if repair["benign_scenes"]:
         needless = (
-            f"in {repair['needless_braking']} of {repair['benign_scenes']} benign scenes "
-            f"({repair['needless_braking_today']} today)"
+            f"It brakes needlessly in {repair['needless_braking']} of {repair['benign_scenes']}"
+            f" benign scenes ({repair['needless_braking_today']} today)."
         )
     return (
-        f"{number} this wear {wear}: {repair['change']}. A new vehicle {earlier} and needlessly"
-        f" {needless}"
+        f"With {number} of the driving system, all tested vehicles within the required range"
+        f" ({wear}) {safe}: {repair['change']}. The price: a new vehicle {earlier}. {needless}"
     )
 
 
 def _proof_in_words(survivors: Survivors) -> str:
-    """The proof of the first change."""
+    """The validation of the first change, in a sentence."""
     _, proof = survivors.changes[0]
     return (
-        f"of {proof.samples:,} fresh worn vehicles {proof.failures} are unsafe (at most "
-        f"{100 * proof.at_most:.2g} %, with {100 * CONFIDENCE:g} % confidence)"
+        f"Of {proof.samples:,} worn vehicles that were sampled afterwards"
+        f" {proof.failures or 'none'} {'is' if proof.failures < 2 else 'are'} unsafe: with"
+        f" {100 * CONFIDENCE:g} % confidence at most {100 * proof.at_most:.2g} % are."
     )
 
 

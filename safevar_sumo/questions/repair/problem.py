@@ -212,7 +212,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
     """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with
-    one `fit` of the vehicle. `budget` is the number of simulations of an attack over all fits.
+    one parameter set of the vehicle model, number `fit`. `budget` is the number of simulations of
+    a falsification over all parameter sets.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
     """

@@ -39,8 +39,8 @@ times as many, and so on.
 
 
 class Failure(NamedTuple):
-    """A setting, shape (n,), with which a change failed, the number of the problem, of one fit, and
-    the point; none without a matrix.
+    """A setting, shape (n,), with which a change failed, the number of the problem, of one
+    parameter set, and the point; none without a matrix.
     """
 
     setting: FloatArray
@@ -49,8 +49,8 @@ class Failure(NamedTuple):
 
 
 class Search:
-    """Searches the smallest changes that survive the settings of problems, one for each fit of the
-    vehicle, shape (L, n), worst first.
+    """Searches the smallest changes that survive the settings of problems, one for each parameter
+    set of the     vehicle, shape (L, n), worst first.
 
     Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a
     size at which there was none, is a lower bound for ever.
@@ -67,7 +67,7 @@ class Search:
 
     @property
     def settings(self) -> FloatArray:
-        """The settings that count with the study's own fit."""
+        """The settings that count with the study's own parameter set."""
         return self.settings_of[0]
 
     def add(self, problem: int, settings: FloatArray) -> None:

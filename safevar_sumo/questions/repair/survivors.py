@@ -1,5 +1,5 @@
 """Search, attack and prove in turns: the smallest changes that survive everything, and in which
-fits of the vehicle.
+parameter sets of the vehicle model.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from safevar_sumo.records import FloatArray
 MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
 JOINING_VEHICLES = 64
-"""Number of the worst known vehicles that a change must survive with a fit in which it failed."""
+"""Number of the worst known vehicles that a change must survive in a parameter set in which it
+failed.
+"""
 
 
 class Survivors(NamedTuple):
     """The smallest changes that survive everything, each with its proof; none if no change does.
 
-    They hold in `fits` fits, and not in those with the numbers `broken`.
+    They hold in `fits` parameter sets, and not in those with the numbers `broken`.
     """
 
     changes: list[tuple[FloatArray, Proof]]
@@ -31,8 +33,8 @@ class Survivors(NamedTuple):
 
 
 def find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
-    """The smallest changes that survive in all fits; where none does, those of the study's own fit,
-    and the fits in which an attack breaks one of them.
+    """The smallest changes that survive in all parameter sets; where none does, those of the
+    study's own set, and the sets in which a falsification breaks one of them.
     """
     changes = _survivors_in(problems, vehicles)
     if changes or len(problems) == 1:
@@ -79,7 +81,7 @@ def _survivors_in(
 
 
 def _worst_with_fit(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
-    """The worst of known vehicles, shape (L, n), that count with another fit."""
+    """The worst of known vehicles, shape (L, n), that count with another parameter set."""
     worst = vehicles[:JOINING_VEHICLES]
     promised = worst[problem.holds(worst)]
     return promised[problem.repairable(promised)]

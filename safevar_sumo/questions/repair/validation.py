@@ -14,7 +14,8 @@ from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
 KNOWN = 256
-"""Number of the worst known settings with which an attack begins; with each other fit an eighth."""
+"""Number of the worst known settings with which a falsification begins; with each other
+parameter set an eighth."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
 SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = (
@@ -23,7 +24,7 @@ SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = (
     "proof on fresh wear",
 )
 Failures = dict[int, FloatArray]
-"""Failures by the number of the problem, of one fit, in which they are, shape (M, n)."""
+"""Failures by the number of the problem, of one parameter set, in which they are, shape (M, n)."""
 
 
 def find_failures(
@@ -45,10 +46,10 @@ def find_failures(
 def prove_change(
     problems: Sequence[RepairProblem], change: FloatArray, number: int, attempt: int
 ) -> tuple[Proof, Failures]:
-    """Draw fresh wear for a change: its proof with the study's own fit, and the unsafe settings;
+    """Draw fresh wear for a change: its proof with the study's own set, and the unsafe settings;
     only without them the change is proved.
 
-    As many settings again each meet one of the other fits, at random. `number` counts the attacks,
+    As many settings again each meet one of the other sets, at random. `number` counts the searches,
     for the random numbers, and `attempt` the proofs that failed before.
     """
     own = problems[0]

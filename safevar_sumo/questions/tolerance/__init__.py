@@ -62,37 +62,38 @@ def tolerance(
     together: bool = False,
     quick: bool = False,
 ) -> Answer:
-    """Find how far each characteristic may go: alone, and all together.
+    """Find how far each characteristic may change: alone, and all at the same time.
 
-    The limits hold in every fit of the vehicle, within a scope that is stated. The limits together
-    hold none of the unsafe solutions of results. In a study that searches its scenario they hold in
-    all encounters in which the original vehicle is safe.
+    The limits hold in every parameter set of the vehicle model, within a scope that is stated. No
+    unsafe solution of results lies within the joint limits. In a study that searches its scenario
+    they hold in all encounters in which the original vehicle is safe.
 
     Parameters
     ----------
     limits
         A limit in the characteristic's unit, such as "treadDepth >= 3", beside those of [limits] in
-        the study; may be repeated. All others get the largest box that is safe then; exit code 3 if
-        a limit is not kept or the original itself is unsafe.
+        the study; may be repeated. All others get the largest operating range that is safe then;
+        exit code 3 if a limit does not hold or the original itself is unsafe.
     characteristics
         Only these characteristics, separated by commas; all others keep their values. By default
         all.
     margin
-        Distance to keep from a collision with the study's own fit [m], between bumpers; by default
-        the model's error that the study states, else 0.3 m, and 0.1 m in a study that searches its
-        scenario, whose originals keep more.
+        Clearance that every vehicle must keep with the study's own parameter set [m], between
+        bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m in a
+        study that searches its scenario, whose originals keep more.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     fits
-        Number of vehicle models that fit the published data about as well (sets of [spread]) in
-        which the limits hold, by default all; 0 for the study's own alone.
+        Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
+        by default all; 0 for the study's own alone.
     attack
-        Number of simulations that search for a counterexample to the limits together, over all
-        fits, at least 1,000; 0 leaves this search out, and then no limit is called kept. With fewer
-        than by default the answer is rough.
+        Number of simulations that search for a counterexample to the joint limits, over all
+        parameter sets, at least 1,000; 0 leaves this search out, and then no limit is called kept.
+        With fewer than by default the answer is rough.
     by
         A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits
-        alone that hold up to each, and up to which value the specified limits hold.
+        of each characteristic alone that hold up to each of these values, and the value up to which
+        the specified limits hold.
     together
         Joint limits, which hold all at the same time; they are always sought without `by`, and
         never beside it.

@@ -1,5 +1,5 @@
-"""Limits of each characteristic alone that hold in all fits, between the points of a matrix and in
-all encounters.
+"""Limits of each characteristic alone that hold in all parameter sets, between the points of a
+matrix and in all encounters.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import Characteristic
 
 VALUES = 17
-"""Number of values of what is safe alone in the study's own fit that are simulated in each model.
+"""Number of values of what is safe alone in the study's own parameter set that are simulated in
+each model.
 """
 FALSIFICATIONS, FALSIFICATION_SHARE, GENERATIONS = 20, 0.1, 5
 """Largest number of attacks on a limit, in a study that searches its scenario; the share of
 `--attack` of each, though never less than `LEAST_SIMULATIONS`, and its number of generations, the
 first at the limit itself.
 """
-ALONE_STAGE = "limits alone with each fit"
+ALONE_STAGE = "limits alone with each parameter set"
 Beyond = tuple[FloatArray, Model] | None
 """A setting just beyond a limit, and the model in which it is unsafe; None where nothing is known
 to be.
@@ -56,7 +57,7 @@ class AloneLimit(NamedTuple):
 
     @property
     def of_own_fit(self) -> Interval | None:
-        """What is safe in the scan with the study's own fit, rounded inwards."""
+        """What is safe in the scan with the study's own set, rounded inwards."""
         return (
             None if self.scan.safe is None else self.characteristic.rounded_inwards(self.scan.safe)
         )
@@ -101,7 +102,7 @@ class _Ends:
 
 class AloneSearch:
     """The search for limits alone that hold in all models, each at some `values`, from scans with
-    the study's own fit, the first model.
+    the study's own parameter set, the first model.
     """
 
     def __init__(

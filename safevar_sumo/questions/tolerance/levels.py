@@ -38,7 +38,7 @@ from safevar_sumo.study import Limit
 
 SEARCHED_VALUES, VALUES_OF_FITS = 51, 5
 """Numbers of values, over what is safe up to the value below, at which a characteristic is scanned
-in many encounters: with the study's own fit, and with each.
+in many encounters: with the study's own parameter set, and with each.
 """
 POINT_SETS = 3
 """Number of sets of points between those of a matrix: limits alone are found at the first, and
@@ -56,7 +56,7 @@ class Level(NamedTuple):
         The limits of each characteristic alone; None where the original itself is unsafe, or safe
         in no encounter.
     models
-        The fits in which they hold.
+        The parameter sets in which they hold.
     search
         The search for the limits alone; None without such limits.
     failures
@@ -210,7 +210,7 @@ class LevelSearch:
         return Level(value, alone, models, search, found.failures, found)
 
     def models(self, low: float | None, high: float) -> Models | None:
-        """The fits between two values; None if no test of a matrix drives there."""
+        """The parameter sets between two values; None if no test of a matrix drives there."""
         study = study_between(self.evaluator.study, self.by, low, high, at_end=self.budget > 0)
         is_empty = study.matrix is not None and not study.matrix.tests
         if is_empty and study.matrix != self.evaluator.study.matrix:

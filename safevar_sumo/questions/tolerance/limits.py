@@ -1,4 +1,4 @@
-"""The limits of a study: of each characteristic alone, and of all together."""
+"""The limits of a study: of each characteristic alone, and joint limits."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ INTERVALS: Columns = {
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",
     "low": Column(
         "",
-        "first simulated value that is so, all others as in the original, with the study's own fit",
+        "first simulated value that is so, all others as in the original, with the study's own set",
         ".6g",
     ),
     "high": Column("", "last one", ".6g"),
@@ -65,13 +65,13 @@ INTERVALS: Columns = {
     "degree_high": Column("m", "safety degree at the last value; in -m/s on a collision", ".2f"),
 }
 FITS: Columns = {
-    "fit": Column("-", "number of the fit among the sets of [spread]; 0 is the study's own", "d"),
+    "fit": Column("-", "number of the parameter set in [spread]; 0 is the study's own", "d"),
     "specified": (
-        "whether the specified limits hold with it; left out: the original is unsafe or keeps too"
+        "whether the specified limits hold in it; left out: the original is unsafe or keeps too"
         " little"
     ),
     "corners": Column(
-        "", "what the worst corner of the limits together keeps [m], or has of a metric", ".2f"
+        "", "clearance of the worst corner of the joint limits [m], or its value of a metric", ".2f"
     ),
 }
 POINTS: Columns = {
@@ -84,14 +84,14 @@ OF_BOX = (
     *("box", "samples", "failures", "at_most", "not_simulated"),
     *("fits", "fits_tried", "attacked", "least_attacked"),
 )
-"""Numbers about the limits together."""
+"""Numbers about joint limits."""
 MAX_REFUTED = 4
 """Largest number of searches for joint limits, each without what refuted the one before."""
 NEAREST: Columns = {
     **CHARACTERISTIC,
     "limit": Column("", "the specified value", ".10g"),
     "nearest": Column(
-        "", "the nearest value with which limits together exist, the others as specified", ".10g"
+        "", "the nearest value with which joint limits exist, the others as specified", ".10g"
     ),
 }
 
@@ -245,11 +245,15 @@ def _tables(
     limits.attrs["bars"] = bars_of(
         limits, [(one.characteristic.lower, one.characteristic.upper) for one in scans]
     )
-    intervals = tabulate("Each alone, all others as in the original", INTERVALS, _intervals(scans))
+    intervals = tabulate(
+        "Where each characteristic alone is safe, all others as in the original",
+        INTERVALS,
+        _intervals(scans),
+    )
     tables = {"limits": limits, "intervals": intervals}
     if moved := uncertainty_rows(found.alone):
         tables["uncertainty"] = tabulate(
-            "Limits alone: with one fit and with all", UNCERTAINTY, moved
+            "Limits alone: with one parameter set and with all", UNCERTAINTY, moved
         )
     tried = len(found.models.members) + len(found.models.left_out)
     if found.together is not None and tried > 1:
@@ -313,7 +317,7 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
 
 
 def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
-    """A row of `FITS` for each fit."""
+    """A row of `FITS` for each parameter set."""
     states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
     states |= dict.fromkeys(models.left_out, "left out")
     return [

@@ -32,28 +32,35 @@ LIMITS: Columns = {
     **{
         f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g", head=head)
         for name, meaning, head in (
-            ("alone", "that is safe with all others as in the original, with every fit", ALONE),
-            ("together", "that is safe with all others within theirs, with every fit", ""),
+            (
+                "alone",
+                "that is safe with all others as in the original, in every parameter set",
+                ALONE,
+            ),
+            ("together", "that is safe with all others within theirs, in every parameter set", ""),
             ("specified", "that the user's limit allows", ""),
         )
         for end in ("low", "high")
     },
-    "kept": "whether the car is safe within the specified limits with every fit; empty without one",
+    "kept": (
+        "whether every vehicle within the specified limits is safe in every parameter set; empty"
+        " without a specified limit"
+    ),
     "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
     "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
-    "sentence": "for a maintenance manual; all of these may be obeyed together",
+    "sentence": "sentence for a maintenance manual; all these limits hold at the same time",
 }
 UNCERTAINTY: Columns = {
     **CHARACTERISTIC,
     **{
         f"{name}_{end}": Column("", f"{end}est value that is safe alone {meaning}", ".10g")
         for name, meaning in (
-            ("own_fit", "at the points of the scan with the study's own fit"),
+            ("own_fit", "at the points of the scan with the study's own parameter set"),
             (
                 "alone",
                 (
-                    "with every fit, also between points, in all encounters that were met, and"
-                    " under the attack"
+                    "in every parameter set, also between points, in all encounters that were met,"
+                    " and in the search for counterexamples"
                 ),
             ),
         )
@@ -154,7 +161,7 @@ def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
 
 
 def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None) -> bool:
-    """Whether a limit is safe alone, and with all specified limits in every fit."""
+    """Whether a limit is safe alone, and with all specified limits in every parameter set."""
     return (
         alone.safe is not None
         and not _outside(alone, specified)[0]

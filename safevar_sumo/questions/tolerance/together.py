@@ -1,5 +1,5 @@
-"""Limits that may be used together: a box that holds in all fits, under attack, and of which no
-limit can move out.
+"""Joint limits: a box that holds in all parameter sets, under falsification, and of which no limit
+can move out.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class LimitsTogether(NamedTuple):
     proof, falsification
         Of the box.
     least
-        The least that the falsification found [m]: over all fits, and with the study's own.
+        The least that the falsification found [m]: over all parameter sets, and with the study's
+        own.
     between, between_left_out
         Numbers of points between those of the study's matrix that the falsification met, and of
         those that do not count.
@@ -118,7 +119,7 @@ def broken_specification(specified: Box, models: Sequence[Model]) -> dict[int, F
     )
     settings = np.unique(settings, axis=0)
     models = [model for model in models if not _keeps_its_margin(specified, model)]
-    judges = judges_of(models, "specified limits with each fit")
+    judges = judges_of(models, "specified limits with each parameter set")
     # Every setting meets each model once.
     known = [settings] * len(models)
     total = len(models) * len(settings)
@@ -155,9 +156,9 @@ def find_limits_together(
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone.
     Causes of what is unsafe, as few changes as possible, are further corners, and the box is sought
-    anew until no search finds anything. Then all corners with each fit, a search for
-    counterexamples with `budget` simulations over all fits, and settings drawn at random test it.
-    What they find becomes part of what later boxes must survive, in that fit; after `EXPLORED`
+    anew until no search finds anything. Then all corners with each parameter set, a search for
+    counterexamples with `budget` simulations over all sets, and settings drawn at random test it.
+    What they find becomes part of what later boxes must survive, in that set; after `EXPLORED`
     boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can
     go, at most `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box
     is confirmed by further searches for counterexamples; with `is_quick` no limit moves out and

@@ -28,7 +28,7 @@ WIDER_STAGE = "attack in the wider scope"
 WIDER: Columns = {
     "study": "the wider study",
     "scope": Column("", "what it covers", is_shown=False),
-    "kept": "whether the limits above hold there with every fit",
+    "kept": "whether the limits above hold there in every parameter set",
     "verdict": "what a search for counterexamples found there",
     "fails_at": Column("", "the vehicle that fails first, and its encounter", is_shown=False),
 }

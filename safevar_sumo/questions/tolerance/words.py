@@ -1,5 +1,5 @@
-"""The verdict on limits in words: the decision, how sure it is, in how many fits, and in which
-scope.
+"""The verdict on limits in words: the decision, how sure it is, in how many parameter sets, and in
+which scope.
 """
 
 from __future__ import annotations
