@@ -162,8 +162,8 @@ def study(
     if unsafe is not None and (status or dry_run):
         raise InputError(
             "unsafe",
-            f"beside --{'status' if status else 'dry-run'}, which judges no vehicle",
-            "the option with a search, or without it",
+            f"beside --{'status' if status else 'dry-run'}, which simulates no search",
+            "one of the two options",
         )
     if status:
         return summarise(load(directory))

@@ -138,7 +138,10 @@ class Option(NamedTuple):
         if self.is_repeated:
             if isinstance(value, Mapping):
                 value = [f"{name}={inner}" for name, inner in value.items()]
-            return (value,) if isinstance(value, str) else tuple(value)
+            values = (value,) if isinstance(value, str) else tuple(value)
+            if twice := next((text for text in values if values.count(text) > 1), None):
+                raise InputError(self.name, f"{twice!r} is given twice", "each value once")
+            return values
         if value is None or self.kind is bool or self.metavar == CRITERION:
             return value
         if self.kind not in (int, float):

@@ -333,7 +333,7 @@ def _verdict(
     if weather.water or weather.road_friction != 1:
         road = (
             " Not comparable with an official rating: Euro NCAP tests on a dry road, and here the"
-            f" weather is {weather.name!r} by day and {darken(weather).name!r} by night."
+            f" weather is {weather.name!r}, and {darken(weather).name!r} in the tests by night."
         )
 
     # Without a variant, what the original earns.

@@ -73,6 +73,9 @@ def study_path(study: str) -> Path:
     """
     if study in study_names():
         return STUDIES / f"{study}.toml"
+    if os.path.isdir(study):
+        legal = "the name of a study, or the path of its file (TOML)"
+        raise InputError("study", f"{study!r} is a directory", legal)
     if os.path.exists(study):
         return Path(study)
     problem = f"there is no study or file {study!r}"

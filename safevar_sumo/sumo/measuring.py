@@ -93,8 +93,10 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
             for text, name in zip(study.search.objectives, names, strict=True)
             if name == twice
         ]
-        problem = f"search.objectives: {' and '.join(written)} are the same objective"
-        raise InputError("", problem, one_of([*shipped]))
+        problem = f"{' and '.join(written)} are the same objective"
+        if len(set(written)) == 1:
+            problem = f"{written[0]} is given {'twice' if len(written) == 2 else 'several times'}"
+        raise InputError("", f"search.objectives: {problem}", "each objective once")
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
 

@@ -207,9 +207,8 @@ class Vehicle:
         """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
         raise InputError(
             type(self).__name__,
-            "has no method at_speed(prepared, speed), and the traffic puts it onto the road in"
-            " motion",
-            "a vehicle with that method, or traffic that departs with speed 0",
+            "has no method at_speed(prepared, speed), and the simulation begins with it in motion",
+            "a vehicle with that method, or a scenario and traffic that let it start with speed 0",
         )
 
     def at_start(self, prepared: Prepared, speed: FloatArray) -> State:

@@ -290,7 +290,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
-    unit = "line of settings"
+    unit = "line"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
@@ -335,8 +335,9 @@ def _test_in_words(tested: _PairedTest, quantity: str, titles: Sequence[str]) ->
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {quantity} over {tested.pairs} has p = {tested.p:.2g}; with a"
-        f" probability of {tested.a12:.2f} (A12), the value of {titles[0]} is the larger one."
+        f"A signed-rank test of the {quantity} over {tested.pairs} of settings has p ="
+        f" {tested.p:.2g}; with a probability of {tested.a12:.2f} (A12), the value of {titles[0]}"
+        " is the larger one."
     )
 
 

@@ -78,8 +78,8 @@ def compare_counts(counts: Mapping[str, int], a: str) -> Difference:
     """The settings that are unsafe in one system only."""
     only_a = counts["only_a_unsafe"]
     only_b = counts["only_b_unsafe"]
-    unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that"
-    safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that"
+    unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that are"
+    safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that are"
     better = [f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}"] if only_a else []
     worse = [f"is unsafe in {only_b} of {safe_in_a} safe in {a}"] if only_b else []
     return Difference(better, worse)
@@ -164,9 +164,11 @@ def _moved_limits(
         for number in numbers[:MAX_LIMITS_NAMED]
     ]
     if len(numbers) > MAX_LIMITS_NAMED:
-        texts.append(f"and {len(numbers) - MAX_LIMITS_NAMED} more")
+        texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
     return (
-        [f"has limits of one characteristic alone that {verb}: {'; '.join(texts)}"] if texts else []
+        [f"has limits of one characteristic alone that {verb} ({join_phrases(texts)})"]
+        if texts
+        else []
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import about, check_name
+from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
@@ -77,6 +77,8 @@ def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int
     chosen = [name.strip() for text in characteristics for name in text.split(",")]
     for name in chosen:
         check_name("characteristics", f"there is no characteristic {name!r}", name, names)
+        if chosen.count(name) > 1:
+            raise InputError("characteristics", f"{name} is given twice", "each name once")
     return [column for column, name in enumerate(names) if not chosen or name in chosen]
 
 

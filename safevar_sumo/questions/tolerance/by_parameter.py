@@ -47,8 +47,8 @@ class Parameter(NamedTuple):
         Raises
         ------
         InputError
-            If the study is rated, or does not vary this parameter, or a value is no number or
-            outside what it covers.
+            If the study is rated, or does not vary this parameter, or a value is no number, given
+            twice, or outside what it covers.
         """
         if is_rated(study):
             legal = "a study that is not rated"
@@ -71,7 +71,9 @@ class Parameter(NamedTuple):
             )
             raise InputError("by", f"study {study.name!r} does not vary {name!r}", legal)
         check_name("by", f"study {study.name!r} does not vary {name!r}", name, known)
-        values = tuple(sorted({_number(value, text) for value in listed.split(",")}))
+        values = tuple(sorted(_number(value, text) for value in listed.split(",")))
+        if len(set(values)) < len(values):
+            raise InputError("by", f"{text!r} has a value twice", "each value once")
         if name in study.scenario.search:
             domain = study.scenario.search[name]
             if values[0] <= domain.lower or values[-1] > domain.upper:
