@@ -314,7 +314,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
         f"The search found {number_of(len(solutions), 'different solution')};"
-        f" {len(failures) or 'none'} of them {case.unsafe.they_in_words}."
+        f" of them {case.unsafe.number_in_words(len(failures))}."
     )
     remarks = filter(None, [case.unsafe.remark])
     counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
@@ -348,10 +348,11 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
         for item in case.characteristics
         if by_name[item.name] != item.original
     ]
-    listed = f"{number_of(len(texts), 'change')}, listed in the second table"
+    listed = f"; its {number_of(len(texts), 'change')} are listed in the second table"
     if len(texts) <= MAX_LISTED:
-        listed = ", ".join(texts) or "no change at all"
-    return f"{counts} The one with the fewest changes {ending}: {listed}.", rows
+        listed = f" with {number_of(len(texts), 'change')}: {', '.join(texts)}" if texts else ""
+    fewest_in_words = "The unsafe solution with the fewest changes"
+    return f"{counts} {fewest_in_words} {ending}{listed}.", rows
 
 
 def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:

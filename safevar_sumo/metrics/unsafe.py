@@ -137,12 +137,14 @@ class Unsafe:
         share = ", half of the original's" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
-    @property
-    def they_in_words(self) -> str:
-        """What unsafe vehicles do: `collide`, `are unsafe (drac > 6, or a collision)`."""
+    def number_in_words(self, number: int) -> str:
+        """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
+        collision)`.
+        """
+        counted = f"{number:,}" if number else "none"
         if self.is_collision and not self.keep:
-            return "collide"
-        return f"are unsafe ({self.description})"
+            return f"{counted} {'collide' if number > 1 else 'collides'}"
+        return f"{counted} {'are' if number > 1 else 'is'} unsafe ({self.description})"
 
     @property
     def remark(self) -> str:
@@ -227,9 +229,9 @@ class Unsafe:
         return robustness + (self.keep if self.below is None else self.below)
 
     def value_in_words(self, value: float) -> str:
-        """What a safe vehicle has: `keeps 0.31 m`, `has drac 5.9`."""
+        """What a safe vehicle has: `keeps 0.31 m of clearance`, `has drac 5.9`."""
         return (
-            f"keeps {value:.2f} m"
+            f"keeps {value:.2f} m of clearance"
             if self.bound is None
             else f"has {self.bound.measure} {value:.3g}"
         )

@@ -149,12 +149,12 @@ def where_in_words(
 
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
-    """A failure at a safety degree, such as `the car hits a pedestrian with 12 km/h`."""
+    """A failure at a safety degree, such as `the car hits a pedestrian at 12 km/h`."""
     if unsafe.is_of_points or (unsafe.bound is not None and not collided):
         return f"the car {unsafe.in_words}"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-        impact = "" if impact_speed < 1 else f" with {impact_speed:.2g} km/h"
+        impact = "" if impact_speed < 1 else f" at {impact_speed:.2g} km/h"
         return f"the car hits {scenario.obstacle()}{impact}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
     return (

@@ -208,7 +208,7 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     share = f"{percentage(failures / total)} %"
     if not study.variation:
         vehicles = f"{total:,} vehicles that were sampled uniformly over the whole domain"
-        return f"Of {vehicles}, {failures:,} {criterion.they_in_words}: {share}"
+        return f"Of {vehicles}, {criterion.number_in_words(failures)}: {share}"
 
     # Distributions other than the uniform one.
     variation = [
@@ -219,9 +219,7 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
     vehicles = f"Of {total:,} vehicles that vary as the study says ({manner})"
-    return (
-        f"{vehicles}, {failures:,} {criterion.they_in_words}. So the probability is about {share}"
-    )
+    return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"
 
 
 def sobol_indices(

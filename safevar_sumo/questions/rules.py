@@ -120,7 +120,7 @@ def rules(
         else "sampled uniformly over the whole domain"
     )
     verdict = (
-        f"Of {total:,} vehicles {drawn}, {failures:,} {criterion.they_in_words}:"
+        f"Of {total:,} vehicles {drawn}, {criterion.number_in_words(failures)}:"
         f" {percentage(failures / total)} % (95 % confidence interval"
         f" {percentage(low)} to {percentage(high)} %).{remark}"
         f"{_rule_in_words(table, failures / total)}"
@@ -188,8 +188,8 @@ def _boxes(
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
         return _find_boxes(settings, is_unsafe, characteristics), ""
     remark = (
-        f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles (--samples N"
-        " samples more)."
+        f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles: ask for more"
+        " with --samples."
     )
     return [], remark
 

@@ -25,7 +25,7 @@ OUTCOME_VERBS = {
 
 
 def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 0.0) -> str:
-    """How a run ended, such as `collides at 3.21 m/s` or `stops, safety degree 0.87 m`.
+    """How a run ended, such as `collides at 3.21 m/s` or `stops with a safety degree of 0.87 m`.
 
     The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.
     """
@@ -36,7 +36,7 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
         return verb
     if outcome == Outcome.COLLISION:
         return f"{verb} at {abs(safety_degree):.2f} m/s"
-    return f"{verb}, safety degree {distance_in_words(safety_degree, contact)}"
+    return f"{verb} with a safety degree of {distance_in_words(safety_degree, contact)}"
 
 
 def change_texts(
@@ -146,24 +146,18 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     if not study.scenario.search:
         return []
     names = join_phrases(study.scenario.search)
-    number = "those" if left_out is None else f"{left_out:,}"
-    left_out_in_words = f"left out: {number} in which the original is not safe"
-    return [
-        f"Each vehicle drives in an encounter of its own ({names}); {left_out_in_words}.",
-        *demanded_in_words(study),
-    ]
+    own = f"Each vehicle drives in its own encounter ({names})."
+    left = [] if left_out is None else [f"{number_of(left_out, 'encounter')} left out."]
+    return [own, *demanded_in_words(study), *left]
 
 
 def demanded_in_words(study: Study) -> list[str]:
     """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
     other study.
     """
-    margin = f"at least {study.scenario.margin:g} m, scenario.margin, between bodies"
-    return (
-        [f"The original is safe in an encounter where it keeps {margin}."]
-        if study.scenario.search
-        else []
-    )
+    margin = f"at least {study.scenario.margin:g} m of clearance (scenario.margin)"
+    sentence = f"Only encounters count in which the original vehicle keeps {margin}."
+    return [sentence] if study.scenario.search else []
 
 
 def constraints_in_words(study: Study) -> list[str]:
@@ -174,5 +168,7 @@ def constraints_in_words(study: Study) -> list[str]:
         for constraint in study.constraints
     )
     return (
-        [f"Only settings that satisfy the study's constraints: {conditions}."] if conditions else []
+        [f"Only vehicles that satisfy the study's constraints count: {conditions}."]
+        if conditions
+        else []
     )

@@ -418,10 +418,18 @@ def _sweep(
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     where = " in the original encounter" if study.scenario.search else ""
+    points = len(system.matrix)
+    worst = f", in the worst of {points} test cases" if points > 1 else ""
     original = (
         f"The original vehicle{where}"
-        f" {ending_in_words(evaluations.outcome[0], evaluations.f_safe[0], system.contact)}."
+        f" {ending_in_words(evaluations.outcome[0], evaluations.f_safe[0], system.contact)}{worst}."
     )
+    if len(names) == 1 and _rises_again(frame, names[0], characteristics):
+        remarks.append(
+            "The safety degree does not fall steadily along this sweep: the driving system decides"
+            " once per frame, and may brake a weaker vehicle harder. Do not extrapolate from two"
+            " values."
+        )
     verb = "collide" if collisions > 1 else "collides"
     counts = f"Of {number_of(len(frame), 'setting')}, {collisions or 'none'} {verb}."
     return Answer(
@@ -431,6 +439,19 @@ def _sweep(
         numbers={"driven": not no_verdict, "settings": len(frame), "collisions": collisions},
         tables={"sweep": tabulate(study.title, columns, frame), "remarks": _remark_table(remarks)},
     )
+
+
+def _rises_again(frame: pd.DataFrame, name: str, characteristics: CharacteristicSet) -> bool:
+    """Whether the safety degree rises and falls with the distance from the original value, on one
+    of its sides.
+    """
+    original = characteristics.original[characteristics.names.index(name)]
+    for side in (frame[frame[name] <= original], frame[frame[name] >= original]):
+        degrees = side.sort_values(name)[SAFETY_DEGREE].dropna()
+        steps = np.sign(np.diff(degrees))
+        if (steps > 0).any() and (steps < 0).any():
+            return True
+    return False
 
 
 def _remark_table(remarks: list[str]) -> pd.DataFrame:

@@ -241,8 +241,8 @@ def _verdict(
     unsafe = population.unsafe
     contact = evaluator.system.contact
     runs = population.evaluations
-    number = np.count_nonzero(unsafe.of(runs))
-    counts = f"Of {len(runs):,} {kind}, {number:,} {unsafe.they_in_words}. {unsafe.remark}".strip()
+    number = int(np.count_nonzero(unsafe.of(runs)))
+    counts = f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
 
     # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
@@ -284,10 +284,11 @@ def _verdict(
         text = limit_text(item, value) if printed else item.text(value) + item.suffix
         limits.append(f"{item.short_name} {side} {text}")
     encounter = encounter_in_words(members, values, are_printed=bool(printed))
-    where = f"{encounter}, where the original is safe," if encounter else ""
+    where = " in an encounter in which the original vehicle is safe" if encounter else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
     sentences = [
-        f"With {join_phrases(limits)}{where} the vehicle {verb}.",
+        f"With {join_phrases(limits)} the vehicle {verb}{where}.",
+        f"The encounter has {encounter.partition(' with ')[2]}." if encounter else "",
         robustness_in_words(leading["robust_share"]),
     ]
     if sets:
@@ -301,12 +302,14 @@ def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     shares = avoided_shares(verdicts)
     titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
     phrases = [
-        f"{title} would have avoided {share_in_words(shares[name])}"
+        f"{title} would have avoided {share_in_words(shares[name])} of them"
         for name, title in titles.items()
         if name in shares
     ]
+    if not phrases:
+        return ""
     number = number_of(len(verdicts), "collision")
-    return f"Of {number}, in the same vehicle {join_phrases(phrases)}." if phrases else ""
+    return f"Other drivers of the same vehicle in {number}: {join_phrases(phrases)}."
 
 
 def draw_needed(answer: Answer) -> Figure:

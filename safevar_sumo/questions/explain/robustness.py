@@ -98,7 +98,8 @@ def robustness_in_words(share: float) -> str:
     """
     if np.isnan(share):
         return ""
-    phrase = f"{100 * share:.0f} % of vehicles with slightly different values are unsafe, too"
+    which = "all" if share == 1 else f"{100 * share:.0f} % of"
+    phrase = f"{which} vehicles with slightly different values are unsafe, too"
     if share >= MIN_ROBUST_SHARE:
         return f"The cause does not depend on exact values: {phrase}."
     return f"The cause depends on exact values: only {phrase}."

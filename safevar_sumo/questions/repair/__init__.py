@@ -367,7 +367,9 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) ->
 
 def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
     """A repair and its price on a new vehicle."""
-    number = "one change" if repair["changed"] == 1 else "two changes"
+    found = "change of the driving system that was"
+    if repair["changed"] > 1:
+        found = "changes of the driving system that were"
     metres = repair["metres_earlier"]
     earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
     needless = "Needless braking was not measured: the study has no benign scenes."
@@ -377,8 +379,8 @@ def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
             f" benign scenes ({repair['needless_braking_today']} today)."
         )
     return (
-        f"With {number} of the driving system, all tested vehicles within the required range"
-        f" ({wear}) {safe}: {repair['change']}. The price: a new vehicle {earlier}. {needless}"
+        f"The smallest {found} found: {repair['change']}. Then all tested vehicles within the required range ({wear}) {safe}. The price: a new vehicle"
+        f" {earlier}. {needless}"
     )
 
 

@@ -303,8 +303,8 @@ def _sentences(
         )
     else:
         yield (
-            f"{where}, each alone, all others as in the original:"
-            f" {'; '.join(_allowed(search, frame))}."
+            f"{where}, with all others as in the original, each characteristic may change as far as"
+            f" this: {'; '.join(_allowed(search, frame))}."
         )
     yield _original_in_words(search)
     if contacts is not None:
@@ -333,9 +333,10 @@ def _original_in_words(search: LevelSearch) -> str:
     keeps, safe = search.original
     margin = study.scenario.margin if search.is_searched else search.unsafe.keep
     if keeps == by.values[-1]:
-        return f"The original vehicle keeps {margin:g} m up to {by.text(keeps)}."
+        return f"The original vehicle keeps {margin:g} m of clearance up to {by.text(keeps)}."
     touches = "" if safe == keeps else f" and touches nobody up to {_text(by, safe)}"
-    return f"The original vehicle itself keeps {margin:g} m only up to {_text(by, keeps)}{touches}."
+    kept = f"{margin:g} m of clearance only up to {_text(by, keeps)}"
+    return f"The original vehicle itself keeps {kept}{touches}."
 
 
 def _tested_sentences(search: LevelSearch) -> Iterator[str]:
@@ -376,7 +377,7 @@ def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
         whole = rows.loc[is_whole, f"by_{by.name}"].max()
         text = f"{item.name} {item.lower if is_low else item.upper:.10g}{item.suffix}"
         yield (
-            f"{text} not up to {by.text(by.values[0])}"
+            f"{text} not even up to {by.text(by.values[0])}"
             if np.isnan(whole)
             else f"{text} up to {by.text(whole)}"
         )

@@ -137,16 +137,16 @@ def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
 
 
 def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
-    """What would do in place of the specified limits."""
+    """Which values would hold in place of the specified limits."""
     would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
     if would_do:
         values = " or ".join(
             f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do
         )
         others = ", the other specified limits as they are" if len(nearest) > 1 else ""
-        yield f"What would do: {values}{others}."
+        yield f"A limit that would hold instead: {values}{others}."
     elif nearest:
-        yield "No value of any one of the specified limits would do."
+        yield "No other value of a single specified limit would hold."
 
 
 def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Iterator[str]:
