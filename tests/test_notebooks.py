@@ -62,7 +62,7 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
     assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
     assert results == results[:1] * len(SHOWN)
-    assert "of them have " in "".join(texts["answers"])
+    assert "of the unsafe vehicles have " in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
 
 
@@ -159,8 +159,8 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     printed = "".join(_texts(notebook))
     for result in (
         "joint limits hold at the same time",
-        "a vehicle is unsafe with a probability of",
-        "of them have ",
+        "So the probability is about",
+        "of the unsafe vehicles have ",
     ):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]

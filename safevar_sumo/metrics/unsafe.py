@@ -156,12 +156,11 @@ class Unsafe:
             " collisions alone."
         )
 
-    @property
-    def smaller_demand(self) -> str:
-        """What to do where the original does not meet the criterion; "" if a collision alone is
-        unsafe.
+    def smaller_demand(self, original: Evaluations) -> str:
+        """What to do where the original does not meet the criterion; "" if it collides, and a
+        collision is what counts.
         """
-        if self.is_collision and not self.keep:
+        if self.is_collision and (not self.keep or original.collided[0]):
             return ""
         option = "--margin" if self.is_collision else "--unsafe"
         return f"Ask again with a weaker criterion ({option})."

@@ -97,8 +97,8 @@ def join_phrases(phrases: Iterable[str]) -> str:
 
 
 def number_of(count: int, noun: str) -> str:
-    """A number with its noun: `1 change`, `2 changes`."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+    """A number with its noun: `1 change`, `2,000 changes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 MAX_POINTS_NAMED = 6

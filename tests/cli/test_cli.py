@@ -158,7 +158,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     )
     assert "original" in result.stdout
     assert "The original vehicle stops, with a safety degree of 2.01 m" in result.stdout
-    assert "less safe than the original" in result.stdout
+    assert "the changed vehicle is less safe" in result.stdout
     reset = (
         "dragCoeff = 0.301 differs from the original by less than the filter threshold and was"
         " reset to 0.3"

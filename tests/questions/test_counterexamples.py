@@ -284,7 +284,9 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
     evaluator = Evaluator(study, InlinePool(), verified=0)
     answer = tolerance.compute(study, evaluator, margin=30)
     assert evaluator.simulated <= 2
-    assert answer.verdict.startswith("The original itself stops")
+    assert answer.verdict.startswith(
+        "The original vehicle itself keeps 0.88 m of clearance, less than 30"
+    )
     assert answer.numbers["kept"] is False
 
 
@@ -315,4 +317,4 @@ def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> No
     ]
     runs = drive_and_score(system.at(named[0]), system.characteristics.original[np.newaxis])
     assert -runs.f_safe[0] == pytest.approx(float(said[1]), abs=0.005)
-    assert "with the study's own fit" in answer.tables["limits"].attrs["title"]
+    assert "with the study's own parameter set" in answer.tables["limits"].attrs["title"]

@@ -136,12 +136,12 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
         rf"^With .* the vehicle collides\. The cause d.* exact values: .*{share} are unsafe, too\.",
         verdict,
     )
-    assert f"It holds in {leading['fits_holding']} of {FITS} parameter sets" in verdict
+    assert f"The cause holds in {leading['fits_holding']} of {FITS} parameter sets" in verdict
     assert leading["solution"] not in verdict
     numbers = explained.numbers
     assert (
-        f"Of {numbers['settings']} different solutions of the search, {numbers['failures']} are"
-        " unsafe" in verdict
+        f"Of {numbers['settings']} different solutions of the search,"
+        f" {numbers['failures']} collide." in verdict
     )
     drivers = explained.tables["drivers"].set_index("driver")["avoided"]
     assert (
@@ -380,10 +380,10 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
     )
     degree = f"{answer.numbers['original_degree']:.3g}"
     said = (
-        f"The original itself has safety degree {degree} m, below 99 m: no change is needed. Demand"
-        " less, with"
+        f"The original vehicle itself has a safety degree of {degree} m, below 99 m: no change is"
+        " necessary. Ask again with a weaker criterion"
     )
-    assert answer.verdict.startswith(f"{said} --unsafe. Of 4 vehicles")
+    assert answer.verdict.startswith(f"{said} (--unsafe). Of 4 vehicles")
     assert [
         len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")
     ] == [0, 0, 0]

@@ -42,16 +42,17 @@ evaluations = 80
 runs = 1
 """
 LEFT_OUT = (
-    r"in an encounter of its own \(distance\); left out: {} in which the original is not safe"
+    r"in its own encounter \(distance\)\. Only encounters count in which the original vehicle keeps"
+    r" at least 0\.4 m of clearance \(scenario\.margin\)\. {} encounters? left out\."
 )
 DEMANDED = (
-    r"The original is safe in an encounter where it keeps at least 0\.4 m, scenario\.margin,"
-    r" between bodies\."
+    r"Only encounters count in which the original vehicle keeps at least 0\.4 m of clearance"
+    r" \(scenario\.margin\)\."
 )
 COUNTED = LEFT_OUT.format(r"[\d,]+")
-CAUSE = "in an encounter with .* where the original is safe, the vehicle collides"
+CAUSE = "collides in an encounter in which the original vehicle is safe. The encounter has"
 QUESTIONS = {
-    "risk tiny.toml --samples 300": f"{COUNTED}. {DEMANDED}",
+    "risk tiny.toml --samples 300": f"{DEMANDED}.*left out",
     "risk results --samples 300": COUNTED,
     "rules tiny.toml --samples 300": COUNTED,
     "explain tiny.toml --limit 500 --top 2 --fits 0": f"{CAUSE}.* {COUNTED}",
@@ -177,7 +178,7 @@ def test_limits_together_are_not_wider_than_those_alone() -> None:
     answer = json_of(
         "tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius"
     )
-    assert re.search(LEFT_OUT.format("those"), answer["tested"])
+    assert re.search(DEMANDED, answer["tested"])
     rows: list[dict[str, Any]] = answer["tables"]["limits"]["rows"]
     assert any(one["alone_low"] > 30 for one in rows)
     for one in rows:

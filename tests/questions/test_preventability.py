@@ -121,8 +121,8 @@ def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None
     many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
     assert (
         _avoided_in_words(many)
-        == "Of 1000 collisions in the same vehicle, a competent driver would have avoided nearly"
-        " all and full braking at the first possible moment all."
+        == "In the same vehicle, a competent driver would have avoided nearly all of 1,000"
+        " collisions, and full braking at the first possible moment all."
     )
     assert _avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
 
@@ -233,7 +233,8 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     assert at.name in unsafe_points
     original = drive_and_score(system.at(at), original_of(system)).f_safe[0]
     assert (
-        endings == f"At {at.name}: the original stops, safety degree {original:.2f} m; this one"
+        endings == f"At {at.name}: the original stops with a safety degree of"
+        f" {original:.2f} m; this one"
         " collides at "
         f"{-drive_and_score(system, weak).f_safe[0]:.2f} m/s."
     )

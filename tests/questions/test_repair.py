@@ -347,7 +347,8 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
     assert (
-        f"has a safety degree of {words}, and of 5 fresh worn vehicles 0 are unsafe" in kept.verdict
+        f"The worst of them has a safety degree of {words}. Of 5 worn vehicles that were sampled"
+        " afterwards none is unsafe" in kept.verdict
     )
     table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.

@@ -90,7 +90,7 @@ def test_first_order_indices_of_correlated_characteristics() -> None:
         {"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04
     )
     assert frame["degree_total"].isna().all()
-    assert "(a normal, b normal and c normal), a vehicle is unsafe" in answer.verdict
+    assert "vary as the study says (a normal, b normal and c normal), " in answer.verdict
 
 
 def drawn(**variation: dict[str, Any]) -> FloatArray:
@@ -135,7 +135,8 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert row.density_low <= row.density <= row.density_high
     assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(0.09, abs=0.005)
     assert (
-        "of them have a above 7 N m and b below 3 N m; of all vehicles like that" in answer.verdict
+        "of the unsafe vehicles have a above 7 N m and b below 3 N m. Of all vehicles in this"
+        " region" in answer.verdict
     )
 
 
@@ -166,15 +167,18 @@ def test_the_verdict_says_which_shares_are_unsure() -> None:
     }
     frame = pd.DataFrame({"characteristic": ["a"], **values})
     words = deciding_in_words(frame, 120)
-    assert "a has the largest share of the safety degree's variance, 0.60 (0.50 to 0.70)." in words
+    assert (
+        "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %)." in words
+    )
     assert words.endswith(
-        "Shares of whether the vehicle is unsafe are unsure: intervals of up to 3.27."
+        "The shares for whether the vehicle is unsafe are uncertain: their intervals are up to 327"
+        " percentage points wide."
     )
     unknown = frame.assign(
         **dict.fromkeys([name for name in values if name.startswith("unsafe")], np.nan)
     )
-    assert "Too few vehicles of the design are unsafe" in deciding_in_words(unknown, 1)
-    assert "Too few" not in deciding_in_words(unknown, 0)
+    assert "that needs 100 unsafe and as many safe vehicles" in deciding_in_words(unknown, 1)
+    assert "unknown" not in deciding_in_words(unknown, 0)
     assert deciding_in_words(frame.iloc[:0], 0) == ""
 
 
@@ -184,14 +188,16 @@ def test_nothing_everything_and_too_little() -> None:
     assert (row.rule, row.density, row.coverage) == ("everywhere", 1.0, 1.0)
     few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.tables["rules"].empty
-    assert "--samples N draws more" in few.verdict
+    assert "ask for more with --samples" in few.verdict
 
 
 def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
     answer = rules_of(lambda settings: np.sin(1e6 * settings[:, 0]) > 0.7, n=2, samples=400)
     table = answer.tables["rules"]
     share = answer.numbers["failures"] / answer.numbers["samples"]
-    assert (" of them have " in answer.verdict) == (table["density_low"] > share).any()
+    assert (" of the unsafe vehicles have " in answer.verdict) == (
+        table["density_low"] > share
+    ).any()
 
 
 @pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])

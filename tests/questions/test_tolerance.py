@@ -234,7 +234,7 @@ def test_limits_that_other_fits_move_are_uncertain() -> None:
         (
             "a <= 6.812",
             (
-                "Do not release: a 6.812 N m: the car hits a crossing pedestrian with 3.6 km/h"
+                "Do not release: a 6.812 N m: the car hits a crossing pedestrian at 3.6 km/h"
                 " (outside by 0.312 N m)"
             ),
         ),
@@ -258,7 +258,7 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
     assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
 
 
-def test_a_refusal_says_what_would_do() -> None:
+def test_a_refusal_says_which_limits_would_hold() -> None:
     answer = answer_of(
         2,
         lambda rows: rows[:, 0] + rows[:, 1] > 15,
@@ -272,8 +272,8 @@ def test_a_refusal_says_what_would_do() -> None:
     ]
     assert answer.numbers["kept"] is False
     assert re.search(
-        r"What would do: a [67][.\d]* N m or b [56][.\d]* N m, the other specified limits as"
-        r" they are",
+        r"A limit that would hold instead: a [67][.\d]* N m or b [56][.\d]* N m, the other"
+        r" specified limits as they are",
         answer.verdict,
     )
 
@@ -397,9 +397,14 @@ def test_gaps_are_between_bumpers() -> None:
 def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
     for limits in ((), ("a <= 6",)):
         answer = answer_of(2, nowhere, unsafe="below=8.5", limits=limits)
-        refusal = "he original itself has safety degree 8 m, below 8.5 m: no limit can be kept"
+        refusal = (
+            "he original vehicle itself has a safety degree of 8 m, below 8.5 m: no limit can be"
+            " kept"
+        )
         assert answer.failures == (f"t{refusal}",), "a limit is not blamed"
-        assert answer.verdict.startswith(f"T{refusal}. Demand less, with --unsafe.")
+        assert answer.verdict.startswith(
+            f"T{refusal}. Ask again with a weaker criterion (--unsafe)."
+        )
         assert answer.numbers["kept"] is False
         assert answer.tables["limits"]["kept"].tolist() == (
             [False, None] if limits else [None, None]

@@ -258,15 +258,15 @@ def test_a_point_is_lost_to_six_decimals() -> None:
     unsafe = Unsafe.default({"rating_points": 34.899405, "safety_degree": -14.2}, FRAME["outcome"])
     rated = FRAME.head(2).assign(rating_points=[33.899405, 33.899406])
     assert unsafe.rows(rated).tolist() == [True, False]
-    assert (str(unsafe), unsafe.in_words) == ("points=33.899405", "keeps at most 33.8994 points")
+    assert (str(unsafe), unsafe.in_words) == ("points=33.899405", "earns at most 33.8994 points")
 
 
 def test_a_criterion_in_words_is_rounded_but_its_text_is_exact() -> None:
     half = Unsafe.default({"safety_degree": 1.694206}, FRAME["outcome"].head(0))
     assert (str(half), half.description, half.in_words) == (
         "below=0.847103",
-        "safety degree below 0.847 m (half of the original's, a screening limit)",
-        "SD is below 0.847",
+        "safety degree below 0.847 m, half of the original's",
+        "has a safety degree below 0.847",
     )
     assert half == Unsafe(0.847103)
     assert [

@@ -247,7 +247,7 @@ def _verdict(
     # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
-        demand = f" {unsafe.smaller_demand}".rstrip()
+        demand = f" {unsafe.smaller_demand(population.original)}".rstrip()
         return f"The original vehicle itself {words}: no change is necessary.{demand} {counts}"
 
     # Without a cause, how the worst setting and the original end.
@@ -301,15 +301,17 @@ def _avoided_in_words(verdicts: pd.DataFrame) -> str:
     """What a competent driver, and full braking, would have avoided."""
     shares = avoided_shares(verdicts)
     titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
-    phrases = [
-        f"{title} would have avoided {share_in_words(shares[name])} of them"
-        for name, title in titles.items()
-        if name in shares
-    ]
-    if not phrases:
-        return ""
     number = number_of(len(verdicts), "collision")
-    return f"Other drivers of the same vehicle in {number}: {join_phrases(phrases)}."
+    avoided = [
+        (title, share_in_words(shares[name])) for name, title in titles.items() if name in shares
+    ]
+    if not avoided:
+        return ""
+    (first, share_of_first), *others = avoided
+    and_others = "".join(f", and {title} {share}" for title, share in others)
+    return (
+        f"In the same vehicle, {first} would have avoided {share_of_first} of {number}{and_others}."
+    )
 
 
 def draw_needed(answer: Answer) -> Figure:

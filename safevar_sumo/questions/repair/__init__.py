@@ -379,7 +379,8 @@ def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
             f" benign scenes ({repair['needless_braking_today']} today)."
         )
     return (
-        f"The smallest {found} found: {repair['change']}. Then all tested vehicles within the required range ({wear}) {safe}. The price: a new vehicle"
+        f"The smallest {found} found: {repair['change']}. Then all tested vehicles within the"
+        f" required range ({wear}) {safe}. The price: a new vehicle"
         f" {earlier}. {needless}"
     )
 

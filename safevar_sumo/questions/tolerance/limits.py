@@ -196,14 +196,15 @@ def answer_limits(asked: Asked) -> Answer:
     if rows.broken and together is not None and not asked.is_quick:
         nearest = nearest_limits(models, asked.limits)
     wider = wider_rows(asked, together) if found.is_safe else []
-    refusal = ""
+    refusal = demand = ""
     if not found.is_safe:
         breach = asked.unsafe.breach_in_words(asked.original)
-        refusal = f"the original itself {breach}: no limit can be kept"
+        refusal = f"the original vehicle itself {breach}: no limit can be kept"
+        demand = f"{refusal}. {asked.unsafe.smaller_demand(asked.original)}".strip()
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
     is_kept = None if not failures and not asked.may_keep else not failures
     sentences = verdict_sentences(
-        *(models, found.alone, together, asked, rows.broken), *(nearest, wider, refusal, contacts)
+        *(models, found.alone, together, asked, rows.broken), *(nearest, wider, demand, contacts)
     )
     tested = tested_sentences(models, together, asked.budget, contacts)
     return Answer(

@@ -78,7 +78,7 @@ def verdict_sentences(
     unsafe = models.own.unsafe
     study = models.own.evaluator.study
     if refusal:
-        yield f"{refusal[:1].upper()}{refusal[1:]}. {unsafe.smaller_demand}".strip()
+        yield f"{refusal[:1].upper()}{refusal[1:]}"
         return
 
     # The decision, and how sure it is.
@@ -103,6 +103,8 @@ def verdict_sentences(
         yield f"{names[0]} can make the vehicle unsafe on its own."
     else:
         yield "No single characteristic makes the vehicle unsafe on its own."
+    if unsafe.remark:
+        yield unsafe.remark
     yield f"Scope: {scope_of(study, between=asked.may_keep)}."
 
 
