@@ -26,7 +26,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
@@ -417,13 +417,6 @@ def _sweep(
         )
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
-    where = " in the original encounter" if study.scenario.search else ""
-    points = len(system.matrix)
-    worst = f", in the worst of {points} test cases" if points > 1 else ""
-    original = (
-        f"The original vehicle{where}"
-        f" {ending_in_words(evaluations.outcome[0], evaluations.f_safe[0], system.contact)}{worst}."
-    )
     if len(names) == 1 and _rises_again(frame, names[0], characteristics):
         remarks.append(
             "The safety degree does not fall steadily along this sweep: the driving system decides"
@@ -435,10 +428,19 @@ def _sweep(
     return Answer(
         question="simulate",
         study=study,
-        verdict=f"{no_verdict} {counts} {original}".strip(),
+        verdict=f"{no_verdict} {counts} {_original_in_words(system, evaluations)}".strip(),
         numbers={"driven": not no_verdict, "settings": len(frame), "collisions": collisions},
         tables={"sweep": tabulate(study.title, columns, frame), "remarks": _remark_table(remarks)},
     )
+
+
+def _original_in_words(system: System, evaluations: Evaluations) -> str:
+    """How the original vehicle ends, the first of a sweep's evaluations."""
+    where = " in the original encounter" if len(system.characteristics.scenario) else ""
+    ending = ending_in_words(evaluations.outcome[0], evaluations.f_safe[0], system.contact)
+    points = len(system.matrix)
+    worst = f", in the worst of {points} test cases" if points > 1 else ""
+    return f"The original vehicle{where} {ending}{worst}."
 
 
 def _rises_again(frame: pd.DataFrame, name: str, characteristics: CharacteristicSet) -> bool:

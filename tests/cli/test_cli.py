@@ -20,6 +20,7 @@ import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
 
+import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, command_function, commands, run_command_line
 from safevar_sumo.questions.answer import contents_of
@@ -152,6 +153,34 @@ def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]
     assert result == pytest.approx(values)
 
 
+@pytest.mark.slow
+def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
+    """Every number stands once, and the test case of the least degree is named."""
+    lead, _, _ = simulate("wear").stdout.partition("\n┏")
+    points = json.loads(simulate("wear", "--json").stdout)["tables"]["points"]["rows"]
+    worst = min(points, key=lambda row: row["safety_degree"])
+    least = f"{worst['safety_degree']:.2f} m, the least of {len(points)} test cases"
+    assert f"{least} ({worst['point']}). The original vehicle fails none" in lead
+    assert "simulated" not in simulate("wear").stdout
+
+
+@pytest.mark.slow
+def test_why_a_heavier_car_looks_safer_is_said_from_its_pedals_and_its_frames() -> None:
+    """At 10 km/h a heavy car slows down less at first, and its driving system brakes fully."""
+    heavy = sv.simulate("wear", {"payload": 300})
+    original = heavy.original
+    assert heavy.metrics["safety_degree"] > original.metrics["safety_degree"]
+    brakes = [one.trace["brake [-]"].max() for one in (original, heavy)]
+    said = f"with up to {100 * brakes[1]:.0f} instead of {100 * brakes[0]:.0f} % of the pedal"
+    assert brakes[1] > brakes[0]
+    assert said in simulate("wear", "--set", "payload=300").stdout.replace("\n", " ")
+    assert "does not fall steadily" in simulate("wear", "--set", "payload=75..525:10").stdout
+    lighter = simulate("rain", "--set", "dampRateZeroT_CE=2.5").stdout.replace("\n", " ")
+    assert "arrives more slowly" in lighter
+    assert "harder" not in lighter
+    assert "looks" not in simulate("wear", "--set", "payload=120").stdout
+
+
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     result = simulate(
         "rain", "--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301"
@@ -172,8 +201,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert (stop["outcome"], stop["gap"]) == ("stopped", pytest.approx(stop["safety_degree"] - 4.7))
     lead = simulate("native", "--set", "decel=8").stdout
     gap = stop["gap"]
-    assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): less safe" in lead
-    assert f"gap {gap:.2f} against " in lead
+    assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): the changed vehicle" in lead
     remark = sweep["tables"]["remarks"]["rows"][-1]["remark"]
     assert "from centre to centre: bodies touch at 4.70 m" in remark
 

@@ -118,6 +118,9 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     assert r"a < b \& 1 \%" in latex
     assert r"c\_d" in latex
     assert r"\caption{Parts \& ages}" in latex
+    assert "\\noindent" not in latex, "nothing was tested"
+    tested = replace(ANSWER, tested="1,228 vehicles; 5 % failed.").render("latex")
+    assert "How this was tested: 1,228 vehicles; 5 \\% failed." in tested
     text = ANSWER.render("csv", "parts")
     assert pd.read_csv(io.StringIO(text))["length"][0] == 1.234
 

@@ -72,6 +72,15 @@ FITS = 3
         (("rain", "--by", "speed=20"), ("study 'rain' does not vary 'speed'", "[scenario.search]")),
         (("wear", "--by", "speed=fast"), ("'fast' is no number", "NAME=V1,V2,...")),
         (("wear", "--by", "speed"), ("'speed'", "NAME=V1,V2,...")),
+        (("wear", "--by", "speed=20,20.0"), ("has a value twice", "each value once")),
+        (
+            ("wear", "--characteristics", "payload,payload"),
+            ("payload is given twice", "each name once"),
+        ),
+        (
+            ("wear", "--limits", "payload <= 200", "--limits", "payload <= 200"),
+            ("'payload <= 200' is given twice", "each value once"),
+        ),
         (
             ("wear", "--by", "speed=20", "--unsafe", "drac > 6"),
             ("beside --unsafe 'drac > 6'", "keep the margin"),

@@ -432,10 +432,11 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
         )
     )
     answer = answer_questions([case])
-    few = "too few runs of NSGA-II, RS for a test (8 are needed)"
+    few = "NSGA-II, RS: too few runs for a test (8 are necessary)"
     over_runs = answer.only("rq1-runs").tables["remarks"]["remark"]
-    assert "too few runs for 8 of 8 tests of RQ1 (11 are needed after the correction)" in "".join(
-        over_runs
+    assert (
+        "8 of 8 tests of RQ1 cannot be significant, because there are too few runs (11 are"
+        in "".join(over_runs)
     )
     for name, stands_out in (("rq1", False), ("rq2", True)):
         table, remarks = answer.only(name).tables.values()

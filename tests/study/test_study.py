@@ -98,6 +98,8 @@ MISTAKES = [
         "vehicle.characteristics.dampRateFullT: original = 0",
     ),
     ('extends = "nothing"', "nothing"),
+    ('extends = "."', "extends = '.': '.' is a directory"),
+    ('extends = "sun"\n[search]\nobjectives = ["f_safe", "f_safe"]', "'f_safe' is given twice"),
     ("[variation.mass]\ndistribution = 'uniform'\nlower = 9999", "variation.mass.lower = 9999"),
     (
         "[vehicle.characteristics.masss]\noriginal = 9",

@@ -125,7 +125,6 @@ def compare(
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     is_rating = all(is_rated(side.study) for side in evaluators)
-    quantity = "rating" if is_rating else "safety degree"
     tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
@@ -137,7 +136,7 @@ def compare(
         compare_counts(counts, titles[0]),
         compare_limits(limits_table, evaluator.characteristics.vehicle.members),
         difference,
-        compare_values(quantity, tested.p, tested.a12),
+        compare_values(tested.quantity, tested.p, tested.a12),
     )
     difference = Difference.joined(differences)
     numbers: JsonObject = {
@@ -159,7 +158,7 @@ def compare(
         question="compare",
         study=study,
         verdict=" ".join(sentences),
-        tested=_test_in_words(tested, quantity, titles),
+        tested=_test_in_words(tested, titles),
         numbers=numbers,
         tables={"limits": limits_table, "settings": _settings_table(common, settings)},
         failures=refusals,
@@ -273,11 +272,12 @@ def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFram
 
 
 class _PairedTest(NamedTuple):
-    """The p-value and A12 of a test in pairs, and what the pairs are."""
+    """The p-value and A12 of a test in pairs, what the pairs are, and of which quantity."""
 
     p: float
     a12: float
     pairs: str
+    quantity: str
 
 
 def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
@@ -297,7 +297,8 @@ def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
             pairs = means
             unit = "run"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
-    return _PairedTest(p, a12, number_of(len(pairs), unit))
+    quantity = "rating" if metric == RATING_POINTS.name else "safety degree"
+    return _PairedTest(p, a12, number_of(len(pairs), unit), quantity)
 
 
 def _verdict(
@@ -331,11 +332,11 @@ def _verdict(
         yield unsafe.remark
 
 
-def _test_in_words(tested: _PairedTest, quantity: str, titles: Sequence[str]) -> str:
+def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {quantity} over {tested.pairs} of settings has p ="
+        f"A signed-rank test of the {tested.quantity} over {tested.pairs} of settings has p ="
         f" {tested.p:.2g}; with a probability of {tested.a12:.2f} (A12), the value of {titles[0]}"
         " is the larger one."
     )

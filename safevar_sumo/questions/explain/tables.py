@@ -204,7 +204,7 @@ def statistics_tables(
     of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
     return {
         "characteristics": tabulate(
-            f"Changed and necessary, in {number_of(failures, 'failure')}",
+            f"Characteristics changed, and necessary, in {number_of(failures, 'failure')}",
             {**CHARACTERISTIC_COLUMNS, "needed_in_fits": in_fits},
             needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
         ),

@@ -289,10 +289,31 @@ def _answer_of(
         "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": len(models.members),
     }
+    verdict = _verdict(
+        problem, models, survivors, worst=worst, repairs=repairs, not_repairable=not_repairable
+    )
+    return Answer(
+        question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables
+    )
+
+
+def _verdict(
+    problem: RepairProblem,
+    models: Models,
+    survivors: Survivors,
+    *,
+    worst: float,
+    repairs: list[JsonObject],
+    not_repairable: list[dict[str, float]],
+) -> str:
+    """Whether a repair is necessary, the smallest that was found, its price and its validation, and
+    what no driving system survives.
+    """
+    unsafe = problem.unsafe
     wear = problem.promise.in_words
     safe = f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
     demand = "" if unsafe.keep else f" Counted as unsafe: {unsafe.description}."
-    if kept_today:
+    if survivors.changes and not repairs:  # the driving system of today survives
         where = " that any driving system can keep safe" if not_repairable else ""
         degree = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
         ending = unsafe.value_in_words(worst) if unsafe.bound else degree
@@ -320,9 +341,7 @@ def _answer_of(
             f" Even full braking at the first possible moment fails with {parts}{others}: that"
             " needs another part, not another parameter."
         )
-    return Answer(
-        question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables
-    )
+    return verdict
 
 
 def _fits_in_words(models: Models, survivors: Survivors) -> str:

@@ -273,7 +273,7 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         names = ", ".join(map(case.title_of, with_few_runs))
         needed = fewest_runs(table.upper(), alpha)
         yield (
-            f"too few runs of {names} for a test ({needed} are needed): no p-value of pooled"
+            f"{names}: too few runs for a test ({needed} are necessary), so no p-value of pooled"
             " solutions is significant."
         )
     for metric in case.scoring.metrics:
@@ -303,7 +303,7 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         )
     elif len(case.evaluations):
         yield (
-            "settings that a run simulates, mean:"
+            "settings that a run simulates on average:"
             f" {describe_evaluations(case, count_evaluations(case))}."
         )
 
@@ -317,8 +317,8 @@ def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> It
     if few:
         needed = fewest_runs(rq, alpha, len(tests))
         yield (
-            f"too few runs for {few} of {tests_in_words} of {rq} ({needed} are needed after the"
-            " correction)."
+            f"{few} of {tests_in_words} of {rq} cannot be significant, because there are too few"
+            f" runs ({needed} are necessary after Holm's correction)."
         )
     if len(tests):
         yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."

@@ -269,7 +269,7 @@ def _sentence(
     )
     if not keep:
         return (
-            f"{name}: anything from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope:"
+            f"{name}: any value from {item.lower:.10g} to {item.upper:.10g}{item.suffix}. Scope:"
             f" {scope}."
         )
     beyond = ""

@@ -18,7 +18,7 @@ from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.words import join_phrases, number_of, share_in_words
+from safevar_sumo.questions.words import join_phrases, number_of, percentage, share_in_words
 from safevar_sumo.study import unit_text
 
 USUAL_BUDGET = 5000
@@ -255,8 +255,8 @@ def _sampled_in_words(together: LimitsTogether) -> str:
 
 def _bound_in_words(proof: Proof) -> str:
     return (
-        f"With {100 * CONFIDENCE:.0f} % confidence at most {100 * proof.at_most:.2f} % of uniformly"
-        " sampled vehicles within the limits are unsafe."
+        f"With {100 * CONFIDENCE:.0f} % confidence at most {percentage(proof.at_most)} % of"
+        " uniformly sampled vehicles within the limits are unsafe."
     )
 
 
