@@ -103,7 +103,7 @@ def degree_note(contact: float) -> str:
     [m].
     """
     from_centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
-    return f"SD: least distance in m{from_centres}, or minus the collision's speed in m/s."
+    return f"Safety degree: least distance in m{from_centres}, or minus the collision speed in m/s."
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:

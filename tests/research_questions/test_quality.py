@@ -414,10 +414,10 @@ def test_the_tests_of_each_question_are_corrected_as_a_family() -> None:
             )
             text = " ".join(remarks["remark"])
             assert (
-                f"p is corrected by Holm's method for the {tests} tests of {name[:3].upper()}, a"
-                " family." in text
+                f"Holm's method corrects the p-values of the {tests} tests of {name[:3].upper()}"
+                in text
             )
-            assert ("are needed after the correction" in text) is not is_enough
+            assert ("are necessary after Holm's correction" in text) is not is_enough
 
 
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:

@@ -57,7 +57,7 @@ from safevar_sumo.questions.pairs import (
 )
 from safevar_sumo.questions.research_questions.statistics import fewest_runs
 from safevar_sumo.questions.subject import study_in
-from safevar_sumo.questions.words import counted_in_words, join_phrases, number_of
+from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
 
@@ -290,15 +290,15 @@ def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
-    unit = "line"
+    unit = "lines of settings"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
-            unit = "run"
+            unit = "runs"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
     quantity = "rating" if metric == RATING_POINTS.name else "safety degree"
-    return _PairedTest(p, a12, number_of(len(pairs), unit), quantity)
+    return _PairedTest(p, a12, f"{len(pairs)} {unit}", quantity)
 
 
 def _verdict(
@@ -336,7 +336,7 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {tested.quantity} over {tested.pairs} of settings has p ="
+        f"A signed-rank test of the {tested.quantity} over {tested.pairs} has p ="
         f" {tested.p:.2g}; with a probability of {tested.a12:.2f} (A12), the value of {titles[0]}"
         " is the larger one."
     )

@@ -321,4 +321,4 @@ def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> It
             f" runs ({needed} are necessary after Holm's correction)."
         )
     if len(tests):
-        yield f"p is corrected by Holm's method for the {tests_in_words} of {rq}, a family."
+        yield f"Holm's method corrects the p-values of the {tests_in_words} of {rq} together."
