@@ -160,9 +160,9 @@ def describe_rules(case: Case) -> str:
     if not len(others):
         return ""
     return (
-        "algorithms return solutions by different rules: those of"
-        f" {', '.join(map(case.title_of, others))} are not all settings that nothing in the run"
-        " dominates. Means over solutions depend on the rule; rq2-common applies one rule to all."
+        "the algorithms choose their solutions by different rules. Those of"
+        f" {', '.join(map(case.title_of, others))} are not all non-dominated settings of a run, so"
+        " means over solutions depend on the rule. The table rq2-common applies one rule to all."
     )
 
 
