@@ -26,7 +26,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
