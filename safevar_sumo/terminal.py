@@ -175,13 +175,13 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
 
     def show(phase: str, done: int, total: int) -> None:
         nonlocal line
-        line = f"{phase}: {done} of {total}, " if total else f"{phase}: {done}"
+        line = f"{phase}: {done} of {total}" if total else f"{phase}: {done}"
         pace.update(phase, done, total)
         bar.update(task, description=phase, completed=done, total=total or None)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, f"{line}{pace.render()}")
+            print_text(console, ", ".join(filter(None, (line, str(pace.render())))))
 
     text = TextColumn("{task.description}", markup=False)
     columns = (text, BarColumn(bar_width=None), _Count(), pace)

@@ -235,7 +235,7 @@ def journal_progress(
         repeated, expected = map(sum, zip(*counts.values(), strict=True)) if counts else (0, 0)
         phase = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
         if counts:
-            phase = f"{study.name}: verifying in SUMO: {repeated} of {expected}; all"
+            phase = f"{study.name}: verifying in SUMO, {repeated} of {expected}"
         left = max(expected, SAFE_SIMULATIONS if verifies else 0)
         progress(phase, asked + repeated, len(keys) * study.search.evaluations + left)
 

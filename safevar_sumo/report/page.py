@@ -131,37 +131,31 @@ def report(
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
     if paper and point is not None:
-        raise InputError(
-            "point", "the research questions are about whole studies", "no `paper`, or no `point`"
-        )
+        problem = "the research questions are about whole studies"
+        raise InputError("point", problem, "no `paper`, or no `point`")
 
     # The questions: to each of the results alone, and to all together.
-    paths = [
-        Path(check_text("results", getattr(source, "directory", source))) for source in results
-    ]
+    sources = [getattr(source, "directory", source) for source in results]
+    paths = [Path(check_text("results", source)) for source in sources]
     cases = load_cases(paths)
-    usual_joint = ["compare"] if len(cases) == 2 else []
-    joint = [text for text in ask or usual_joint if parse_question(text)[0].others]
+    joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
-    answer_question = answer_to if ask else answer_or_reason
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     with keep_simulations(fresh=fresh):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
     asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
-    if quick:
-        asked = [quick_questions(texts) for texts in asked]
-    numbers = count(1)
-    total = sum(map(len, asked)) + len(joint)
+    asked = [quick_questions(texts) if quick else texts for texts in asked]
+    numbers, total = count(1), sum(map(len, asked)) + len(joint)
 
     def next_answer(text: str, chosen: slice) -> Answer:
         """The next answer, about these of the results."""
         question = with_criterion(text, unsafe)
         subjects = by_criterion if has_criterion(question, unsafe) else at_point
-        show_part = partial(
-            show_within, show, f"question {next(numbers)} of {total}, {question.split()[0]}"
-        )
-        return answer_question(question, subjects[chosen], paths[chosen], point, jobs, show_part)
+        name = f"question {next(numbers)} of {total}, {question.split()[0]}"
+        show_part = partial(show_within, show, name)
+        answer = answer_to if ask else answer_or_reason
+        return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
     # The answers, in the order of the page.
     with open_progress(progress) as show, keep_simulations(fresh=fresh):
@@ -185,6 +179,14 @@ def report(
         page = make_page(studies, shared, pictures, show)
     write_whole(out, page)
     return out
+
+
+def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
+    """The questions about all results together: of those asked, else of two results their
+    comparison.
+    """
+    usual = ["compare"] if results == 2 else []
+    return [text for text in ask or usual if parse_question(text)[0].others]
 
 
 def _later_changes(

@@ -36,6 +36,8 @@ SPREAD_POINTS = 16
 """Number of points of a matrix, spread over all, at which settings are verified; and one of each
 test that has none of them.
 """
+RATED_POINTS = 8
+"""That number of a rating's points."""
 SAFE_POINTS = 6
 """Number of points that a sample's safe simulations fill first, or one of each test."""
 FIRST_OTHERS = 8
@@ -129,8 +131,12 @@ class Sample(NamedTuple):
 
 
 def spread_points(system: System) -> list[int]:
-    """Numbers of some points of a system: evenly spread over all, and one of every test."""
+    """Numbers of some points of a system: evenly spread over all, and one of every test; of a
+    rating, whose points take SUMO long, fewer and not of every test.
+    """
     points = system.points
+    if system.rater is not None:
+        return [int(k) for k in np.linspace(0, len(points) - 1, min(RATED_POINTS, len(points)))]
     tests = [dict(point.parameters).get("test") for point in points]
     evenly = {
         *np.linspace(0, len(points) - 1, min(SPREAD_POINTS, len(points))).astype(int).tolist()

@@ -262,7 +262,7 @@ def test_progress_counts_what_sumo_repeats_and_leaves_time_for_it(
     files[1].write_text("0 160")
     progress([])
     assert [(done, total) for _, done, total in shown[1:]] == [(120, 500), (120, 515)]
-    assert "verifying in SUMO: 120 of 315" in shown[-1][0]
+    assert "verifying in SUMO, 120 of 315" in shown[-1][0]
 
 
 ROOT = Path(__file__).parents[2]

@@ -154,9 +154,7 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
         [46, 40]
     ]
     note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it ended early)."
-    assert f"made-up: settings that a run simulates, mean: {note}" in [
-        *answer.tables["remarks"]["remark"]
-    ]
+    assert any(note in remark for remark in answer.tables["remarks"]["remark"])
     assert "46" in answer.only("evaluations").render("text")
     imported = answer_questions([made_up(*rows, has_runs=False)])
     assert imported.tables["rq2"]["evaluations"].isna().all()

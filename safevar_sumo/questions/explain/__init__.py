@@ -4,6 +4,7 @@ failure robust, and would a reference driver have avoided it?
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -166,9 +167,7 @@ def explain(
         "distinct_causes": distinct_table(evaluator, of_sample),
     }
     numbers = {
-        **_counts(population, subject),
-        "analysed": len(sample),
-        "explained": len(solutions),
+        **_counts(population, subject, len(sample), len(solutions)),
         **_collision_numbers(study, verdicts, collisions),
         "fits": len(holding),
         "unsafe_in_fits": ranges.get(("unsafe", "")),
@@ -177,8 +176,7 @@ def explain(
     sentences = [
         _verdict(evaluator, population, kind, len(holding), tables["causes"]),
         _avoided_in_words(verdicts),
-        *(counted_in_words(study, len(population.left_out)) if kind == DRAWN else []),
-        *constraints_in_words(study),
+        *_counted(study, population, kind),
     ]
     return Answer(
         question="explain",
@@ -190,6 +188,13 @@ def explain(
     )
 
 
+def _counted(study: Study, population: Population, kind: str) -> Iterator[str]:
+    """Which of the settings count, in sentences."""
+    if kind == DRAWN:
+        yield from counted_in_words(study, len(population.left_out))
+    yield from constraints_in_words(study)
+
+
 def _has_causes(population: Population, study: Study) -> bool:
     """Whether changes can be causes: of an unsafe original none is, but in another encounter it may
     be safe.
@@ -197,9 +202,12 @@ def _has_causes(population: Population, study: Study) -> bool:
     return bool(study.scenario.search or not population.unsafe.of(population.original)[0])
 
 
-def _counts(population: Population, subject: Study | Case) -> JsonObject:
-    """The numbers of settings, how the original vehicle ends, and the number of collisions that the
-    search simulated but its objectives leave out of the solutions.
+def _counts(
+    population: Population, subject: Study | Case, analysed: int, explained: int
+) -> JsonObject:
+    """The numbers of settings, and of failures that were analysed and are explained; how the
+    original vehicle ends, and the number of collisions that the search simulated but its objectives
+    leave out of the solutions.
     """
     runs = population.evaluations
     original = population.original
@@ -214,6 +222,8 @@ def _counts(population: Population, subject: Study | Case) -> JsonObject:
         "left_out": left_out,
         "original_outcome": str(original.outcome[0]),
         "original_degree": float(original.f_safe[0]),
+        "analysed": analysed,
+        "explained": explained,
     }
 
 
