@@ -19,7 +19,7 @@ FAILURE = (
     f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set maxBrakeTorque=1200"
 )
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
-SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1520"
+SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1840"
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
@@ -36,8 +36,8 @@ COMMANDS = {
     "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
     "report.png": (
-        f"{PROGRAM} study autoware_july --runs 1 --evaluations 100 --out july --quiet && "
-        f"{PROGRAM} report july --ask 'tolerance --fits 0' --out page.html && "
+        f"{PROGRAM} study autoware_july --runs 1 --evaluations 100 --quiet && "
+        f"{PROGRAM} report results/autoware_july --ask 'tolerance --fits 0' --out page.html && "
         f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null"
     ),
 }

@@ -107,7 +107,9 @@ def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
 
 
 def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
-    """A limit: `at least 3 mm`. An end of the domain is none, unless both are."""
+    """A limit: `at least 3 mm`. An end of the domain is none, unless both are; a part whose
+    original is at one end has a limit on the other side all the same.
+    """
     # A part without a limit or without room, on either side, stays as it was.
     domain = (item.lower, item.upper)
     low, high = (None, None) if row is None else (row["together_low"], row["together_high"])
@@ -119,6 +121,10 @@ def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     unit = " of the original vehicle's" if is_share else item.suffix
     sides = zip(("at least", "at most"), (low, high), domain, strict=True)
     ends = [f"{word} {end:.10g}{unit}" for word, end, last in sides if end != last]
+    if not ends and item.original == item.upper:
+        return f"at least {item.lower:.10g}{unit}, the smallest tested value"
+    if not ends and item.original == item.lower:
+        return f"at most {item.upper:.10g}{unit}, the greatest tested value"
     return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
 
 
@@ -127,15 +133,16 @@ def _domain_in_words(item: Characteristic) -> str:
 
 
 def _tests_in_words(phrase: str) -> str:
-    """A phrase of a scope, with what happens in Euro NCAP's tests: `an adult crosses from the far
-    side (CPFA) at 10 to 40 km/h`.
+    """A phrase of a scope as what happens in Euro NCAP's tests: `an adult crosses from the far
+    side, at 10 to 40 km/h`.
     """
     # The phrase has the scenario, the names of its tests in brackets, and their speeds.
     tests, _, speeds = phrase.partition(" (")[2].partition(")")
     names = re.split(", | and ", tests)
     if not TESTS.keys() >= set(names):
         return phrase
-    return f"{join_phrases(f'{TESTS[name].words} ({name})' for name in names)}{speeds}"
+    words = join_phrases(TESTS[name].words for name in names)
+    return words + speeds.replace(" at ", ", at ")
 
 
 def _own_limit(by_value: Answer) -> JsonObject:

@@ -27,7 +27,7 @@ LIMITS = [
     ("treadDepth", 3.0, 8.0, "at least 3 mm"),
     ("brakeTorque", 0.85, 1.0, "at least 0.85 of the original vehicle's"),
     ("brakeResponse", 0.05, 0.132, "at most 0.132 s"),
-    ("payload", 75.0, 525.0, "any tested value: 75 to 525 kg"),
+    ("payload", 75.0, 525.0, "at most 525 kg, the greatest tested value"),
     ("payloadCentre", 1.3, 2.0, "at least 1.3 m and at most 2 m"),
     ("sensorRange", 80.0, 80.0, "at least 80 m"),
     ("sensorLatency", 0.05, 0.05, "0.05 s, as in the original vehicle"),
@@ -52,6 +52,7 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
         ),
         "box": True,
         "contacts_left_out": None,
+        "fits": 1,
     }
     return Answer(
         question="tolerance",
@@ -84,23 +85,44 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         blank = f"________{item.suffix}"
         assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "Simulated vehicleworn (A car with two axles",
-        "; study wear",
-        "Driving systemaeb (Holds its speed; brakes in part, then fully,",
-        "Tests and speedsan adult crosses from the far side (CPFA) and a child crosses from the"
-        " near side, hidden by parked cars (CPNCO) at 10 to 40 km/h;"
+        "This sheet is about a simulated vehicle: no real vehicle was tested.",
+        "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
+        "The driving system must stay off as long as a value is missing.",
+        "Tests and speedsan adult crosses from the far side and a child crosses from the"
+        " near side, hidden by parked cars, at 10 to 40 km/h;"
         "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
         "Road and lightroad wet, by day",
         "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these",
-        "Versionslibsumo 1.28",
-        "Values outside the tested ranges: tread depth 1.6 to 8 mm; relative brake torque 0.5 to 1",
-        "sensors 15 to 80 m. Every other part was as in the original vehicle.",
         "Vehicle checked: licence plate VIN odometer km",
         "The signature does not cover a part without a value. Date: Name and signature:",
-        f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
     ):
         assert words in sheet
     assert not re.search("21,?234|confidence|0.30? %", sheet), "no statistics"
+    engineer = sheet.partition("For the manufacturer's engineer")[2]
+    for words in (
+        "Simulated vehicleworn (A car with two axles",
+        "; study wear",
+        "Driving systemaeb (Holds its speed; brakes in part, then fully,",
+        "Scopecrossing (CPFA and CPNCO) at 10 to 40 km/h;",
+        "Tested rangestread depth 1.6 to 8 mm; relative brake torque 0.5 to 1; brake",
+        "sensors 15 to 80 m.",
+        "Versionslibsumo 1.28",
+        f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
+    ):
+        assert words in engineer
+
+
+def test_a_limit_has_one_side_if_the_original_is_at_an_end_of_the_domain() -> None:
+    sheet = sheet_with(
+        answer_of(rows=[("treadDepth", 1.6, 8.0, ""), ("payloadCentre", 1.2, 3.2, "")])
+    )
+    assert "at least 1.6 mm, the smallest tested value" in sheet
+    assert "any tested value: 1.2 to 3.2 m" in sheet
+
+
+def test_a_clearance_is_claimed_only_with_one_parameter_set_and_a_margin() -> None:
+    for numbers in ({"fits": 12}, {"margin": 0.0}):
+        assert "within them avoids a collision in the" in sheet_with(answer_of(**numbers))
 
 
 @pytest.mark.parametrize(
