@@ -85,7 +85,7 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         blank = f"________{item.suffix}"
         assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "This sheet is about a simulated vehicle: no real vehicle was tested.",
+        "This sheet is about a simulated vehicle: no real one was tested.",
         "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
         "The driving system must stay off as long as a value is missing.",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
