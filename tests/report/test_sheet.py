@@ -100,8 +100,7 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         "Driving systemaeb (Holds its speed; brakes in part, then fully,",
         "Scopecrossing (CPFA and CPNCO) at 10 to 40 km/h;",
         "Tested rangestread depth 1.6 to 8 mm; relative brake torque 0.5 to 1; brake",
-        "sensors 15 to 80 m.",
-        "Versionslibsumo 1.28",
+        "sensors 15 to 80 mVersionslibsumo 1.28",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
     ):
         assert words in sheet
