@@ -19,7 +19,7 @@ FAILURE = (
     f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set maxBrakeTorque=1200"
 )
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
-SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1790"
+SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1772"
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
