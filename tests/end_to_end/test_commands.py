@@ -143,7 +143,7 @@ def test_torn_runs_are_continued(copied: Path, whole: Path) -> None:
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
     assert output.startswith("About ")
-    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations_per_second", " s "):
+    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations_per_second", "seconds"):
         assert word in output
     assert not Path("results").exists()
 

@@ -91,7 +91,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
 
 def test_a_point_fails_by_the_criterion_of_its_study(in_tmp: Path) -> None:
     """The limits page: 62 % of the brake torque keep 6.43 m/s^2, 61 % do not."""
-    for share, told in ("0.61", "Fails at 1 of 1 points: type 0"), ("0.62", "Fails at 0 of 1"):
+    for share, told in ("0.61", "fails 1 of 1 test cases: type 0"), ("0.62", "fails no test case"):
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
 
 
