@@ -152,8 +152,8 @@ class Unsafe:
         if not self.is_half:
             return ""
         return (
-            "No vehicle collided, so a screening limit decides; --unsafe collision counts"
-            " collisions alone."
+            "No vehicle collided, so this limit stands in for a collision. To count only"
+            " collisions, ask with --unsafe collision."
         )
 
     def smaller_demand(self, original: Evaluations) -> str:

@@ -323,7 +323,7 @@ def _verdict(
 
     # What else differs, what was not measured, and what counts as unsafe.
     if facts:
-        yield f"With the original vehicle, {b} {facts}."
+        yield f"In the original vehicle, the driving system of {b} {facts}."
     if not is_measured:
         yield "Needless braking was not measured: no benign scenes are known for this scenario."
     if not unsafe.is_collision or unsafe.keep:

@@ -209,7 +209,7 @@ def statistics_tables(
             needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
         ),
         "drivers": tabulate(
-            f"Other drivers in the same vehicle, in {number_of(collisions, 'collision')}",
+            f"Other drivers in the same vehicle: {number_of(collisions, 'collision')} again",
             {**DRIVER_COLUMNS, "share_in_fits": in_fits},
             drivers.assign(share_in_fits=pd.Series(of_drivers, dtype=object)),
         ),

@@ -247,9 +247,7 @@ def _tables(
         limits, [(one.characteristic.lower, one.characteristic.upper) for one in scans]
     )
     intervals = tabulate(
-        "Where each characteristic alone is safe, all others as in the original",
-        INTERVALS,
-        _intervals(scans),
+        "Safe values of each characteristic if it alone changes", INTERVALS, _intervals(scans)
     )
     tables = {"limits": limits, "intervals": intervals}
     if moved := uncertainty_rows(found.alone):
