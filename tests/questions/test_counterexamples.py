@@ -135,7 +135,7 @@ def test_the_originals_own_limit_is_a_number_and_is_said_early(
     assert rough.numbers["up_to"] <= keeps_up_to <= safe_up_to
     second = rough.verdict.split(". ")[2]
     assert second.startswith(
-        f"The original vehicle itself keeps 0.3 m only up to {keeps_up_to:g} km/h"
+        f"The original vehicle itself keeps 0.3 m of clearance only up to {keeps_up_to:g} km/h"
     )
     beyond = next(
         row for row in rough.to_dict()["tables"]["limits"]["rows"] if row["by_speed"] == 60

@@ -318,6 +318,6 @@ def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() 
     replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)
     assert replays
     assert all("in its encounter: collides" in one for one in replays)
-    assert "Each vehicle drives in an encounter of its own (distance)" in page
+    assert "Each vehicle drives in its own encounter (distance)" in page
     run("evidence", "results", "--out", "pack.zip", *ask)
     assert json_of("verify", "pack.zip")["numbers"]["differs"] == 0

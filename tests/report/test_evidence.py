@@ -282,7 +282,7 @@ def test_a_solution_that_was_removed_and_files_that_nobody_named_are_found(
 @pytest.mark.slow
 def test_what_is_missing_torn_or_too_much_is_damage(bare: Path, tmp_path: Path) -> None:
     texts = texts_of(bare)
-    nan = re.sub(rb": \d+", b": NaN", texts["1-slippery/answers.json"], count=1)
+    nan = re.sub(rb'": \d+', b'": NaN', texts["1-slippery/answers.json"], count=1)
     for name, content, message in (
         ("1-slippery/risk.json", b"{}", "risk.json belongs to no claim"),
         ("2-other/manifest.json", b"{}", "2-other/manifest.json belongs to no study"),

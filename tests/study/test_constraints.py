@@ -107,9 +107,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         "risk bound.toml --samples 200",
     ):
         said = run(*question.split(), "--unsafe", "below=2.5").stdout
-        assert "satisfy the study's constraints: mass - maxBrakeTorque at least 700 kg" in said, (
-            question
-        )
+        words = " ".join(said.split())
+        assert "satisfy the study's constraints" in words, question
+        assert "mass - maxBrakeTorque at least 700 kg" in words, question
 
 
 def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> None:
