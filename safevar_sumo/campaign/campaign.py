@@ -35,6 +35,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Progress
+from safevar_sumo.vehicles import region_of
 
 BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of all runs of a share fill, at most."""
@@ -293,7 +294,15 @@ def measure_verification(task: Task, pool: Pool) -> float:
 
 
 def _random_settings(study: Study, *shape: int) -> FloatArray:
-    """Settings of a study, drawn uniformly, in an array of this shape and their values."""
-    characteristics = system_of(study).characteristics
+    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
+    region = region_of(study)
+    characteristics = region.characteristics
     rng = np.random.default_rng(study.search.seed)
-    return rng.uniform(characteristics.lower, characteristics.upper, (*shape, len(characteristics)))
+
+    def draw(count: int) -> FloatArray:
+        return rng.uniform(
+            characteristics.lower, characteristics.upper, (count, len(characteristics))
+        )
+
+    drawn = region.draw_feasible(draw, math.prod(shape))
+    return np.resize(drawn, (*shape, len(characteristics)))

@@ -148,6 +148,12 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     assert not Path("results").exists()
 
 
+@pytest.mark.slow
+def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
+    """Half of its domain has encounters that cannot be driven."""
+    assert "seconds" in run("study", "alks_joint_cut_out", "--dry-run").stdout
+
+
 def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
     Path("my_ads.py").write_text(
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
