@@ -88,9 +88,10 @@ class Cache:
 
     def get(self, key: bytes) -> bytes | None:
         """The content of an entry; None if there is none, or it has been altered."""
-        if self._entries is None or not self._is_read:
+        entries = self._entries  # which another thread may end
+        if entries is None or not self._is_read:
             return None
-        entry = self._guarded(self._entries.get, None, key)
+        entry = self._guarded(entries.get, None, key)
         if not isinstance(entry, bytes):
             return None
         content = entry[DIGEST_SIZE:]
@@ -98,8 +99,9 @@ class Cache:
 
     def put(self, key: bytes, content: bytes) -> None:
         """Keep an entry."""
-        if self._entries is not None:
-            self._guarded(self._entries.set, None, key, _digest(key, content) + content)
+        entries = self._entries
+        if entries is not None:
+            self._guarded(entries.set, None, key, _digest(key, content) + content)
 
     def extent(self) -> tuple[int, int]:
         """How many entries there are, and their size on disk [bytes]."""

@@ -419,8 +419,8 @@ def _sweep(
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     if len(names) == 1 and _rises_again(frame, names[0], characteristics):
         remarks.append(
-            "The safety degree does not fall steadily along this sweep: it rises again although"
-            " the vehicle gets weaker. The driving system decides only once per frame, so a weaker"
+            "The safety degree does not fall steadily along this sweep: it rises again further"
+            " from the original value. The driving system decides only once per frame, so a weaker"
             " vehicle may get a harder or an earlier brake command. Do not extrapolate from two"
             " values."
         )
