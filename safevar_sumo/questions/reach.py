@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.questions.boundary import Failing, last_safe_values
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.falsify import Falsification, Judge, falsify
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, Falsification, Judge, falsify
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic
 
@@ -90,9 +90,18 @@ def reach(
                 [(last, failure)] = last_safe_values([group], partial(_are_unsafe, judges[judge]))
                 failures.append((judge, failure[np.newaxis]))
                 value = rounded_towards(start, last, item)
-        # The limits with this value, and the failures within them.
-        found = falsify_limits(_with_end(box, end, value), judges, budget, (*seed, number + 1), end)
-        new = found.failures
+        # The failures within the limits with this value: first with the judges that failed last.
+        limits = _with_end(box, end, value)
+        stream = (*seed, number + 1)
+        first = sorted(new)
+        new = {}
+        if len(first) < len(judges) and first:
+            of_first = [judges[judge] for judge in first]
+            found = falsify_limits(limits, of_first, min(budget, LEAST_SIMULATIONS), stream, end)
+            new = {first[judge]: rows for judge, rows in found.failures.items()}
+        if not new:
+            found = falsify_limits(limits, judges, budget, stream, end)
+            new = found.failures
         if not new:
             return Reach(value, found, failures)
         if value == start:

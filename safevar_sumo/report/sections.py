@@ -224,8 +224,10 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         text = f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"
         rows.append(("Parameter sets", text))
     if numbers.get("attacked") and numbers.get("at_most") is not None:
+        at_some = numbers.get("attacked_at_worst_points") or 0
+        where = f" at all points, and {at_some:,} at the worst points" if at_some else ""
         text = (
-            f"{numbers['attacked']:,} simulations that search for a counterexample; at most"
+            f"{numbers['attacked']:,} simulations{where} that search for a counterexample; at most"
             f" {100 * numbers['at_most']:.2f} % of uniformly sampled vehicles within the limits are"
             " unsafe"
         )

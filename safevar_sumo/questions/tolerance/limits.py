@@ -82,7 +82,7 @@ POINTS: Columns = {
 }
 OF_BOX = (
     *("box", "samples", "failures", "at_most", "not_simulated"),
-    *("fits", "fits_tried", "attacked", "least_attacked"),
+    *("fits", "fits_tried", "attacked", "attacked_at_worst_points", "least_attacked"),
 )
 """Numbers about joint limits."""
 MAX_REFUTED = 4

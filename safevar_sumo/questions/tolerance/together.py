@@ -57,8 +57,9 @@ class LimitsTogether(NamedTuple):
         Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
     box
         The limits as printed; None if none were found.
-    proof, falsification
-        Of the box.
+    proof, falsification, at_all_points
+        Of the box; the last is the number of simulations of the falsification that met all points
+        of a matrix.
     least
         The least that the falsification found [m]: over all parameter sets, and with the study's
         own.
@@ -83,6 +84,7 @@ class LimitsTogether(NamedTuple):
     box: Box | None = None
     proof: Proof | None = None
     falsification: Falsification | None = None
+    at_all_points: int = 0
     least: tuple[float, float] = (np.nan, np.nan)
     between: int = 0
     between_left_out: int = 0
@@ -102,7 +104,10 @@ class LimitsTogether(NamedTuple):
             "at_most": None if proof is None else proof.at_most,
             "not_simulated": None if proof is None else proof.not_simulated,
             "fits": len(self.members),
-            "attacked": None if found is None else found.simulated,
+            "attacked": None if found is None else self.at_all_points,
+            "attacked_at_worst_points": (
+                None if found is None else found.simulated - self.at_all_points
+            ),
             "least_attacked": None if found is None else self.least[0],
             "boxes": int(self.box is not None),
         }
@@ -156,14 +161,14 @@ def find_limits_together(
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone.
     Causes of what is unsafe, as few changes as possible, are further corners, and the box is sought
-    anew until no search finds anything. Then all corners with each parameter set, a search for
-    counterexamples with `budget` simulations over all sets, and settings drawn at random test it.
-    What they find becomes part of what later boxes must survive, in that set; after `EXPLORED`
-    boxes, failures are only cut off. Of a box that passes, each limit moves out as far as it can
-    go, at most `MAX_GROWTHS` times, and what fails then is cut off until a box passes. The last box
-    is confirmed by further searches for counterexamples; with `is_quick` no limit moves out and
-    nothing is confirmed. After `MAX_BOXES` boxes or
-    `MAX_SIMULATIONS` simulations the largest that passed is confirmed, or none is found.
+    anew until no search finds anything. Then some corners, and a search for counterexamples with
+    `budget` simulations over all parameter sets, test it. What they find becomes part of what later
+    boxes must survive, in that set; after `EXPLORED` boxes, failures are only cut off. Of a box
+    that passes, each limit moves out as far as it can go, at most `MAX_GROWTHS` times, and what
+    fails then is cut off until a box passes. The last box has to pass further searches for
+    counterexamples, all corners with each parameter set, and settings drawn at random; with
+    `is_quick` no limit moves out, and the corners alone are tested. After `MAX_BOXES` boxes or
+    `MAX_SIMULATIONS` simulations the largest that passed is the last, or none is found.
     """
     search, nothing = _open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
@@ -176,14 +181,16 @@ def find_limits_together(
             break
         simulated = sum(model.evaluator.simulated for model in nothing.members)
         is_over = number == MAX_BOXES or simulated > MAX_SIMULATIONS
-        # A box that is no larger than the one that passed ends the search, if further
-        # falsifications confirm that one.
+        # A box that is no larger than the one that passed ends the search, if that one passes all
+        # other tests.
         passed = boxes.passed
         is_last = passed is not None and (is_over or boxes.is_no_larger(box))
         if passed and is_last:
-            validation = validator.confirm(passed, number)
+            validation = validator.complete(passed, number)
         else:
             validation = validator.validate(box, number)
+            if is_quick and not validation.failures:
+                validation = validator.complete(validation, number)
         if validation.failures:
             boxes.refuse(validation)
             if is_over and boxes.passed is None:
@@ -333,6 +340,7 @@ def _result(
         box=box if _has_room(search, box) else None,
         proof=validation.proof,
         falsification=validation.falsification,
+        at_all_points=validation.at_all_points,
         least=(least[0], least[1]),
         between=sum(points) - (len(own_tests.tests) if own_tests else 0),
         between_left_out=validation.left_out,

@@ -12,7 +12,8 @@ import numpy as np
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify
-from safevar_sumo.questions.models import Model, judges_of, with_points_between
+from safevar_sumo.questions.models import Model, with_points_between
+from safevar_sumo.questions.narrowing import NarrowedJudge
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
@@ -28,6 +29,8 @@ CONFIRMATIONS, STARTS = 3, 256
 """Number of further falsifications of a box that is to be printed, and of settings with which each
 begins.
 """
+FIRST_SHARE = 0.5
+"""Share of a falsification that first meets only the models in which earlier boxes failed."""
 VALIDATION_STAGE = "validation of joint limits"
 
 
@@ -50,6 +53,9 @@ class Validation(NamedTuple):
         The models that the falsification met, with points between those of the study's matrix.
     left_out
         Number of such points that do not count.
+    at_all_points
+        Number of simulations of the falsification that met all points; the others met those that
+        were worst for some vehicle.
     """
 
     box: Box
@@ -59,6 +65,7 @@ class Validation(NamedTuple):
     falsification: Falsification | None = None
     proof: Proof | None = None
     left_out: int = 0
+    at_all_points: int = 0
 
 
 class Validator:
@@ -78,28 +85,44 @@ class Validator:
         self._proofs = 0
         """Number of upper bounds so far."""
         self._failing = {0}
-        """Numbers of the models in which corners of earlier boxes failed: these come first."""
+        """Numbers of the models in which earlier boxes failed: these come first."""
 
     def validate(self, box: Box, attempt: int) -> Validation:
-        """Validate a box in all models: the first part that finds failures is the last."""
-        corners = box.corners(self.seed, attempt)
-        some = Stream.FIRST_CORNERS.generator(self.seed, attempt).permutation(corners[:MAX_CORNERS])
-        total = len(self.models) * min(len(corners), MAX_CORNERS) + self.budget
-        total += proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
-        with self.evaluator.stage(VALIDATION_STAGE, total):
-            # Some corners, in the models in which corners failed before.
-            tested = self._test_corners(some[:FIRST_CORNERS], self._failing)
+        """Test some corners of a box where earlier ones failed, and falsify it in all models."""
+        corners = self._corners(box, attempt)[:FIRST_CORNERS]
+        with self.evaluator.stage(VALIDATION_STAGE, len(corners) + self.budget):
+            tested = self._test_corners(corners, self._failing)
             if tested.failures:
                 return Validation(box, tested.failures)
-            # A search for counterexamples, from the worst of them.
-            validation = self._falsify(box, some[:FIRST_CORNERS], tested.robustness, attempt)
-            if validation.failures:
-                return validation
-            # All corners in all models; of a study that searches its scenario there are more.
-            tested = self._test_corners(corners[:MAX_CORNERS], range(len(self.models)))
-            more = self._test_corners(corners[MAX_CORNERS:], [0])
-            if failures := [*tested.failures, *more.failures]:
-                return validation._replace(failures=failures)
+            return self._falsify(box, corners, tested.robustness, attempt)
+
+    def complete(self, validation: Validation, attempt: int) -> Validation:
+        """Test a box that is to be printed with all that it has to pass beside `validate`; the
+        first part that finds failures is the last.
+        """
+        box = validation.box
+        corners = self._corners(box, attempt)
+        first = corners[:MAX_CORNERS]
+        total = len(self.models) * len(first) + CONFIRMATIONS * self.budget
+        total += proof_size(self._proofs + 1, MAX_UNSAFE_SHARE)
+        with self.evaluator.stage(VALIDATION_STAGE, total):
+            # All corners where earlier boxes failed.
+            failing = {*self._failing}
+            tested = self._test_corners(first, failing)
+            # Further searches for counterexamples.
+            if not tested.failures and not self.is_quick:
+                validation = self._confirm(validation, attempt)
+                if validation.failures:
+                    return validation
+            # All corners in all other models; of a study that searches its scenario there are more.
+            if not tested.failures:
+                others = {*range(len(self.models))} - failing
+                tested = tested.joined(self._test_corners(first, others))
+            if not tested.failures:
+                more = self._test_corners(corners[MAX_CORNERS:], [0])
+                tested = tested._replace(failures=more.failures)
+            if tested.failures:
+                return validation._replace(failures=tested.failures)
             least = {
                 model.fit: model.unsafe.value(float(tested.robustness[number].min(initial=np.inf)))
                 for number, model in enumerate(self.models)
@@ -109,6 +132,12 @@ class Validator:
                 return validation
             # Sampled vehicles, for the upper bound.
             return self._prove(validation, attempt)
+
+    def _corners(self, box: Box, attempt: int) -> FloatArray:
+        """The corners of a box; the first `MAX_CORNERS` in random order."""
+        corners = box.corners(self.seed, attempt)
+        rng = Stream.FIRST_CORNERS.generator(self.seed, attempt)
+        return np.concatenate([rng.permutation(corners[:MAX_CORNERS]), corners[MAX_CORNERS:]])
 
     def _test_corners(self, corners: FloatArray, numbers: Iterable[int]) -> _Corners:
         """Test corners in some models, by their numbers; those in which one fails are the first
@@ -126,7 +155,9 @@ class Validator:
     def _falsify(
         self, box: Box, corners: FloatArray, robustness: Mapping[int, FloatArray], attempt: int
     ) -> Validation:
-        """Falsify a box in all models, beginning at its worst corners in each, or in the first."""
+        """Falsify a box, beginning at its worst corners in each model, or in the first: at first in
+        the models in which earlier boxes failed, then in all.
+        """
         if not self.budget:
             return Validation(box, models=self.models)
         models, left_out = self._denser(attempt)
@@ -135,33 +166,64 @@ class Validator:
         }
         worst = [
             corners[orders.get(number, orders[0])[: KNOWN if number == 0 else KNOWN // 8]]
-            for number in range(len(self.models))
+            for number in range(len(models))
         ]
         rng = Stream.JOINT_LIMITS.generator(self.seed, attempt)
-        found = falsify(box, judges_of(models, VALIDATION_STAGE), worst, self.budget, rng)
-        failures = failures_in(models, found.failures)
-        return Validation(box, failures, models=models, falsification=found, left_out=left_out)
+        return self._search(Validation(box, models=models, left_out=left_out), worst, rng)
 
-    def confirm(self, validation: Validation, attempt: int) -> Validation:
-        """Falsify a box that passed its validation `CONFIRMATIONS` times more, each time with other
-        settings and points between those of a matrix.
+    def _search(
+        self, validation: Validation, starts: Sequence[FloatArray], rng: np.random.Generator
+    ) -> Validation:
+        """Search a box for counterexamples, from settings for each model: at first in the models in
+        which earlier boxes failed, then in all.
         """
-        found = validation.falsification
-        if found is None:
+        everywhere = [*range(len(starts))]
+        first = sorted(self._failing)
+        left = self.budget
+        if len(first) < len(everywhere):
+            left = self.budget - round(FIRST_SHARE * self.budget)
+            validation = self._search_in(first, validation, starts, self.budget - left, rng)
+        if not validation.failures:
+            validation = self._search_in(everywhere, validation, starts, left, rng)
+        return validation
+
+    def _search_in(
+        self,
+        numbers: Sequence[int],
+        validation: Validation,
+        starts: Sequence[FloatArray],
+        budget: int,
+        rng: np.random.Generator,
+    ) -> Validation:
+        """Search a box for counterexamples in some of a validation's models, by their numbers."""
+        models = validation.models
+        judges = [NarrowedJudge(models[number], VALIDATION_STAGE) for number in numbers]
+        known = [starts[number] for number in numbers]
+        found = falsify(validation.box, judges, known, budget, rng)
+        found = found._replace(judges=np.array(numbers, dtype=np.intp)[found.judges])
+        self._failing |= {*found.failures}
+        earlier = validation.falsification
+        return validation._replace(
+            failures=failures_in(models, found.failures),
+            falsification=found if earlier is None else earlier.merged(found),
+            at_all_points=validation.at_all_points + sum(each.at_all_points for each in judges),
+        )
+
+    def _confirm(self, validation: Validation, attempt: int) -> Validation:
+        """Falsify a box `CONFIRMATIONS` times more, each time with other settings and points
+        between those of a matrix.
+        """
+        if not self.budget:
             return validation
-        failures = list[Failures]()
-        with self.evaluator.stage(VALIDATION_STAGE, CONFIRMATIONS * self.budget):
-            for number in range(CONFIRMATIONS):
-                rng = Stream.VALIDATION.generator(self.seed, attempt, number)
-                models, _ = self._denser(attempt + number)
-                starts = [validation.box.with_ends(STARTS // len(models), rng) for _ in models]
-                judges = judges_of(models, VALIDATION_STAGE)
-                another = falsify(validation.box, judges, starts, self.budget, rng)
-                found = found.merged(another)
-                failures = failures_in(models, another.failures)
-                if failures:
-                    break
-        return validation._replace(falsification=found, failures=failures)
+        for number in range(CONFIRMATIONS):
+            rng = Stream.VALIDATION.generator(self.seed, attempt, number)
+            models, _ = self._denser(attempt + number)
+            starts = [validation.box.with_ends(STARTS // len(models), rng) for _ in models]
+            found = self._search(validation._replace(models=models), starts, rng)
+            validation = found._replace(models=validation.models)
+            if validation.failures:
+                break
+        return validation
 
     def _denser(self, attempt: int) -> tuple[list[Model], int]:
         """The models with points between those of a matrix, too, and the number of these that do
@@ -194,6 +256,10 @@ class _Corners(NamedTuple):
 
     robustness: Mapping[int, FloatArray]
     failures: list[Failures]
+
+    def joined(self, other: _Corners) -> _Corners:
+        """The same corners in the models of both."""
+        return _Corners({**self.robustness, **other.robustness}, self.failures + other.failures)
 
 
 def failures_in(models: Sequence[Model], found: Mapping[int, FloatArray]) -> list[Failures]:

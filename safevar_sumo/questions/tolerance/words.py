@@ -220,7 +220,13 @@ def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
     """
     if together.falsification is None or not budget:
         return "no search for a counterexample"
-    simulated = f"{together.falsification.simulated:,} simulations that search for a counterexample"
+    number = together.falsification.simulated
+    simulated = f"{number:,} simulations that search for a counterexample"
+    if together.at_all_points < number:
+        simulated += (
+            f", {together.at_all_points:,} of them at all points and the others at those that"
+            " were the worst for some vehicle"
+        )
     least, own = together.least
     unsafe = together.members[0].unsafe
     if not abs(least) < float("inf"):
