@@ -147,11 +147,11 @@ def drive_and_score(
             ]
         )
 
-    # A variant and the original take turns, in the same encounter.
+    # The original meets the encounter of each variant, too.
     vehicles = settings
-    if takes_pairs:  # a variant and the original take turns: they share scenes
+    if takes_pairs:
         originals = system.characteristics.with_original_vehicle(settings)
-        vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
+        vehicles, variants, original_of = _beside(system, settings, originals)
 
     # At all points, or at the only one.
     if system.matrix:
@@ -162,8 +162,26 @@ def drive_and_score(
         return found
 
     # The original's safety degree stands beside the variant's.
-    variants = found.take(np.arange(0, len(vehicles), 2))
-    return replace(variants, metrics={**variants.metrics, ORIGINAL_DEGREE: found.f_safe[1::2]})
+    of_variants = found.take(variants)
+    return replace(
+        of_variants, metrics={**of_variants.metrics, ORIGINAL_DEGREE: found.f_safe[original_of]}
+    )
+
+
+def _beside(
+    system: System, settings: FloatArray, originals: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Settings and the original vehicle in the encounter of each, both of shape (N, n), in one
+    array; the rows of each setting and of its original in it.
+    """
+    n = len(settings)
+    # Among bodies on tracks the original meets an encounter of several settings once.
+    if all(isinstance(point.scenario, TrackScenario) for point in system.points):
+        distinct, number = np.unique(originals, axis=0, return_inverse=True)
+        return np.concatenate([settings, distinct]), np.arange(n), n + np.ravel(number)
+    # In recorded scenes both take turns, as pairs share a scene.
+    vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
+    return vehicles, np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)
 
 
 def evaluate_matrix(
