@@ -173,7 +173,7 @@ def study(
     loaded, system = load_for_search(changed)
     if unsafe is not None:
         study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
-    for remark in dict.fromkeys([*system.remarks, *vehicle_remarks(system)]):
+    for remark in dict.fromkeys(system.remarks):
         warn(remark)
     keys = _select_runs(all_runs(loaded), only, shard)
     if not keys:
@@ -415,7 +415,7 @@ def summarise(results: Results) -> Answer:
         # The first remark on tests of which none can be significant says how many runs are needed.
         if few := " ".join(next(remarks_on_runs(name, tables[name]), "") for name in untested):
             remarks = tables["remarks"]
-            remarks.loc[len(remarks)] = ["all", f"{case.name}: {few}"]
+            remarks.loc[len(remarks)] = ["all", few]
     runs = study.search.runs * len(rows)
     return Answer(
         question="study",
@@ -434,4 +434,5 @@ def summarise(results: Results) -> Answer:
         },
         tables=tables,
         folded=tuple(untested),
+        tested=" ".join(vehicle_remarks(assemble(study))),
     )

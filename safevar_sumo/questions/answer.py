@@ -306,6 +306,8 @@ class Answer:
         remarks = shown.pop("remarks", None)
         if remarks is not None:
             about = remarks[~remarks["table"].isin(self.folded)] if "table" in remarks else remarks
+            if "table" in about:  # "all" would be read as a part of the remark
+                about = about.replace({"table": {"all": ""}})
             shown |= {} if about.empty else {"remarks": about}
         return {
             label: part

@@ -38,7 +38,7 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
 
 def scope_of(study: Study, *, between: bool = True) -> str:
     """What a claim about a study covers, as a phrase for a manual: `crossing (CPFA) at 10 to 40
-    km/h; road wet`.
+    km/h; weather wet (friction 0.71, water 1 mm), by day`.
 
     Without `between`, nothing was simulated between the values of a matrix, which are then listed.
     """
@@ -117,13 +117,15 @@ def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
 
 
 def _weather_in_words(weather: Weather) -> str:
-    """The road, the water on it, and the sight: `road wet (friction 0.71, water 1 mm), by day`."""
-    effects = [f"friction {weather.road_friction:g}"] if weather.road_friction != 1 else []
+    """The weather with its effects, and the light: `weather wet (friction 0.71, water 1 mm), by
+    day`, `weather clear (grip of a dry road), by day`.
+    """
+    is_dry = weather.road_friction == 1 and not weather.water
+    effects = ["grip of a dry road" if is_dry else f"friction {weather.road_friction:g}"]
     effects += [f"water {weather.water:g} mm"] if weather.water else []
     effects += [f"visibility {weather.visibility:g}"] if weather.visibility != 1 else []
     effects += (
         [f"recognition {weather.recognition_delay:g} s later"] if weather.recognition_delay else []
     )
     name = weather.name.replace("_", " ")
-    details = f" ({', '.join(effects)})" if effects else ""
-    return f"road {name}{details}, by {weather.light}"
+    return f"weather {name} ({', '.join(effects)}), by {weather.light}"

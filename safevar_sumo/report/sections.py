@@ -52,23 +52,25 @@ CHANGES, ENCOUNTER = "changes", "encounter"
 vehicle; and, in a study that searches its scenario, the column of their encounters.
 """
 NO_RESULT = {
-    Outcome.SIMULATOR_ERROR: "could not be simulated; no result contains them",
+    Outcome.SIMULATOR_ERROR: "could not be simulated, and no result contains them",
     Outcome.INVALID_TEST: (
-        "are invalid tests: they left the tolerance of the test's speed, the driving system acted"
-        " before the test allows it, or nothing happened; they are neither failures nor successes"
+        "are invalid tests, which are neither failures nor successes: the vehicle left the"
+        " tolerance of the test's speed, the driving system acted before the test allows it, or"
+        " nothing happened"
     ),
 }
 """Outcomes of settings about which nothing is known."""
 GENERAL_LIMITS = (
-    "A search that finds no failure proves nothing about the settings that it did not try.",
+    "A search that finds no failure proves nothing about the settings that it did not simulate.",
     (
-        "One vehicle in its lane: no steering beyond lane keeping, no separate wheels and axles, no"
-        " suspension, no wind, no sensor noise, no traffic beyond the scenario's own, unless the"
-        " study says otherwise."
+        "The simulation has one vehicle that keeps its lane. Unless the study says otherwise, it"
+        " has"
+        " no separate wheels and axles, no suspension, no wind, no sensor noise, and no"
+        " traffic beyond that of the scenario."
     ),
     (
-        "Driving system and vehicle are models: how far they agree with published data is told"
-        " where there is any."
+        "The driving system and the vehicle are models. Where published data exist, this section"
+        " says how far the models agree with them."
     ),
 )
 CHARACTERISTICS = {
@@ -77,7 +79,7 @@ CHARACTERISTICS = {
     "original": Column("as in column unit", "value of the original vehicle"),
     "lowest": Column("as in column unit", "lower end of its domain"),
     "highest": Column("as in column unit", "upper end of its domain"),
-    "threshold": Column("as in column unit", "changes below it are put back to the original"),
+    "threshold": Column("as in column unit", "a change smaller than this is undone"),
     "meaning": Column("", "what it is"),
 }
 AGREEMENT = {
@@ -96,18 +98,20 @@ SPREAD = {
         SAFETY_DEGREE,
         Column(
             "m or -m/s",
-            "here, with 90 % of sets and repeats, and the error on the rows of the fit",
+            "here; the interval has 90 % of parameter sets and repeats, and the model's error",
             ".2f",
         ),
     ),
-    "sets": Column("", "vehicle models that fit the published data about as well"),
-    "collisions": Column("", "sets with which it collides"),
+    "sets": Column(
+        "", "parameter sets of the vehicle model that agree with published data about as well"
+    ),
+    "collisions": Column("", "parameter sets in which it collides"),
 }
 PUBLISHED = {
     "metric": Column("", "safety metric of the original vehicle"),
     "published": Column("", "its published value"),
     "here": Column("", "its value here"),
-    "difference": Column("%", "of the published value", ".1f"),
+    "difference": Column("%", "here minus published, in per cent of the published value", ".1f"),
 }
 
 
@@ -221,13 +225,13 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
 
     # How the limits were tested.
     if numbers.get("fits_tried"):
-        text = f"the limits hold in {numbers['fits']} of {numbers['fits_tried']}"
+        text = f"the limits hold in {numbers['fits']} of {numbers['fits_tried']} that were tried"
         rows.append(("Parameter sets", text))
     if numbers.get("attacked") and numbers.get("at_most") is not None:
         at_some = numbers.get("attacked_at_worst_points") or 0
         where = f" at all points, and {at_some:,} at the worst points" if at_some else ""
         text = (
-            f"{numbers['attacked']:,} simulations{where} that search for a counterexample; at most"
+            f"{numbers['attacked']:,} simulations{where} searched for a counterexample; at most"
             f" {100 * numbers['at_most']:.2f} % of uniformly sampled vehicles within the limits are"
             " unsafe"
         )
@@ -239,7 +243,7 @@ def facts(study: ReportedStudy) -> list[tuple[str, str]]:
         rows.append(
             (
                 "Limits alone",
-                "one parameter set at scanned points, then all:"
+                "limits with the study's own parameter set, and with all sets:"
                 f" {_moved_limits(tables['uncertainty'])}",
             )
         )
@@ -277,20 +281,22 @@ def _conditions(study: ReportedStudy) -> str:
     points = study.system.matrix
     if study.point:
         return (
-            f"only at the point {study.point} of its matrix, at which all solutions are simulated"
+            f"only the test case {study.point} of its matrix, in which all solutions were simulated"
             " again"
         )
     if not points:
         no_effect = (
-            " (no effect on road and sensors; a driving system may have other parameters in it)"
+            " (it changes neither road nor sensors, but possibly parameters of the driving system)"
         )
         return (
             "weather:"
             f" {study.case.weather.name}{no_effect if equals_clear(study.case.weather) else ''}"
         )
     tests = Counter(f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points)
-    described = "; ".join(f"{test}: {number_of(count, 'point')}" for test, count in tests.items())
-    return f"every vehicle at all {len(points)} points of a matrix ({described})"
+    described = "; ".join(
+        f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()
+    )
+    return f"every vehicle drives all {len(points)} test cases of a matrix ({described})"
 
 
 def _search(study: ReportedStudy) -> str:
@@ -302,9 +308,10 @@ def _search(study: ReportedStudy) -> str:
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{case.title_of(name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (
-        f"Searched by {', '.join(names) or 'no finished run'} of at most {search.evaluations}"
-        f" simulations each, {len(case.evaluations)} different vehicles in all, from seed"
-        f" {search.seed}, with {versions}."
+        f"Search: {', '.join(names) or 'no finished run'}; each run has at most"
+        f" {search.evaluations} simulations. All runs together simulated"
+        f" {len(case.evaluations)} different vehicles. The seed is {search.seed}; the versions are"
+        f" {versions}."
     )
 
 
@@ -333,10 +340,10 @@ def trust(study: ReportedStudy) -> Answer:
         lowest = agreement["spearman"].min()
         highest = agreement["spearman"].max()
         verdict = (
-            f"Compared with {number_of(len(agreement), 'file')} of published simulations: the"
-            " safety degrees have a rank correlation of"
-            f" {lowest:.2f}{'' if lowest == highest else f' to {highest:.2f}'} with them. Nothing"
-            " was compared with a real car."
+            f"The safety degrees were compared with {number_of(len(agreement), 'file')} of"
+            f" published simulations. Their rank correlation is {lowest:.2f}"
+            f"{'' if lowest == highest else f' to {highest:.2f}'}. Nothing was compared with a"
+            " real car."
         )
 
     # What other parameter sets would give.

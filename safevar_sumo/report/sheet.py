@@ -14,6 +14,7 @@ from markupsafe import Markup
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import SENTENCE_END, Answer, Columns, tabulate
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.tables import columns_of, html_table
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import JsonObject
@@ -23,7 +24,7 @@ from safevar_sumo.study import unit_text
 from safevar_sumo.vehicles import VEHICLES, Characteristic
 
 PARTS: Columns = {
-    "part": "characteristic of the vehicle",
+    "item": "characteristic of the vehicle",
     "how to measure": "how a workshop measures it",
     "limit": "values that are allowed, all limits at the same time",
     "measured": "to be filled in: the value of the vehicle that is checked",
@@ -39,8 +40,8 @@ DIGITS = 16
 def sheet_of(study: ReportedStudy) -> JsonObject | None:
     """The sheet for the template; None if nobody asked for joint limits.
 
-    A sheet without joint limits that hold has no table; one whose limits are only rough, or that
-    other files and versions gave, has no line to sign.
+    A sheet without joint limits that hold has no table; one whose limits are only rough or for
+    screening, or that other files and versions gave, has no line to sign.
     """
     # The answer with joint limits, and the one with limits up to values of a parameter.
     of_limits = [answer for answer in study.answers if answer.question == "tolerance"]
@@ -54,13 +55,16 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     missing = _why_no_limits(limits)
     rows = () if missing else _parts(study, limits)
     *tests, road = numbers.get("scope", "").split("; ")
+    unsafe = Unsafe.parse(numbers.get("unsafe", "collision"))
+    is_screening = _is_relative(study.case, unsafe)
     wider = limits.tables.get("wider")
     varied = set(limits.table().get("characteristic", ()))
     return {
         "missing": missing,
-        "is_signed": not (missing or numbers["rough"] or study.later_changes),
-        "unsafe": Unsafe.parse(numbers.get("unsafe", "collision")),
-        "parts": Markup(html_table(tabulate("Parts and their limits", PARTS, rows))),
+        "is_screening": is_screening,
+        "is_signed": not (missing or numbers["rough"] or study.later_changes or is_screening),
+        "unsafe": unsafe,
+        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, rows))),
         "numbers": numbers,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
@@ -76,6 +80,14 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
             if item.name in varied
         ],
     }
+
+
+def _is_relative(case: Case, unsafe: Unsafe) -> bool:
+    """Whether a criterion compares vehicles with the original one: the default where nothing
+    collides, and in a rated study.
+    """
+    is_default = case.stated is None and not case.study.unsafe.criterion
+    return is_default and not unsafe.is_collision and unsafe == case.unsafe
 
 
 def _why_no_limits(limits: Answer) -> str:
@@ -107,10 +119,10 @@ def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
 
 
 def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
-    """A limit: `at least 3 mm`. An end of the domain is none, unless both are; a part whose
+    """A limit: `at least 3 mm`. An end of the domain is none, unless both are; an item whose
     original is at one end has a limit on the other side all the same.
     """
-    # A part without a limit or without room, on either side, stays as it was.
+    # An item without a limit or without room, on either side, stays as it was.
     domain = (item.lower, item.upper)
     low, high = (None, None) if row is None else (row["together_low"], row["together_high"])
     if low == high and low not in domain:

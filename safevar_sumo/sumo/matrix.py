@@ -114,9 +114,9 @@ def vehicle_remarks(system: System) -> list[str]:
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
     return [
-        f"the vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at"
+        f"The vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at"
         f" up to {max(speeds) / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the"
-        f" accelerator released, it loses {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h"
+        f" accelerator released, it loses {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h."
     ]
 
 

@@ -19,7 +19,7 @@ NAMES = {
     "wear brakeResponse": "brake actuator delay",
     "wear payloadCentre": "longitudinal position of the payload",
     "native decel": "maximum deceleration",
-    "sun dampRateZeroT_CE": "engine drag, closed throttle, clutch engaged",
+    "sun dampRateZeroT_CE": "engine drag (closed throttle, clutch engaged)",
 }
 OWN = """
 extends = "native"

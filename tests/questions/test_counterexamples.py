@@ -178,7 +178,7 @@ def test_without_a_search_for_counterexamples_no_speed_is_printed_and_nothing_is
 def test_every_sentence_of_a_limit_has_its_scope(rough: Answer) -> None:
     for sentence in rough.values("limits.sentence"):
         assert "Scope: crossing (CPNCO) at 10 to" in sentence
-        assert "road wet" in sentence
+        assert "weather wet" in sentence
 
 
 def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> None:

@@ -379,7 +379,7 @@ def test_no_limit_is_kept_where_the_original_is_unsafe_up_to_each_value() -> Non
     ("point", "scope"),
     [
         ("CPNA, speed 40, impact_location 25, wet", "crossing (CPNA) at 40 km/h, impact location"),
-        ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; road wet"),
+        ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; weather wet"),
     ],
 )
 def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:

@@ -26,6 +26,7 @@ from safevar_sumo.questions.tolerance import search
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
+from safevar_sumo.questions.tolerance.words import one_set_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
@@ -241,11 +242,7 @@ def test_limits_that_other_fits_move_are_uncertain() -> None:
         ("a <= 8", "Do not release: a 6.6 N m: the car hits"),
         (
             "a <= 6",
-            (
-                "All limits hold with one parameter set of the vehicle model: no vehicle that was"
-                " tested within them is"
-                " unsafe (collision)."
-            ),
+            ("All limits hold: no vehicle that was tested within them is unsafe (collision)."),
         ),
     ],
 )
@@ -272,8 +269,8 @@ def test_a_refusal_says_which_limits_would_hold() -> None:
     ]
     assert answer.numbers["kept"] is False
     assert re.search(
-        r"A limit that would hold instead: a [67][.\d]* N m or b [56][.\d]* N m, the other"
-        r" specified limits as they are",
+        r"A limit that would hold instead: a [67][.\d]* N m or b [56][.\d]* N m, if the other"
+        r" specified limits stay",
         answer.verdict,
     )
 
@@ -409,3 +406,15 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
         assert answer.tables["limits"]["kept"].tolist() == (
             [False, None] if limits else [None, None]
         )
+
+
+@pytest.mark.parametrize(
+    ("study", "left_out", "is_said"),
+    [("wear", (), True), ("native", (), False), ("wear", (3,), False)],
+)
+def test_a_verdict_says_that_other_parameter_sets_of_a_study_were_not_tried(
+    study: str, left_out: tuple[int, ...], is_said: bool
+) -> None:
+    model: Any = SimpleNamespace(evaluator=SimpleNamespace(study=load_study(study)))
+    assert [*one_set_in_words([model, model], left_out)] == []
+    assert ("not tried" in " ".join(one_set_in_words([model], left_out))) is is_said

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, tabulate
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.replay.animation import template_environment
@@ -48,7 +49,7 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
         "rough": False,
         "scope": (
             "crossing (CPFA and CPNCO) at 10 to 40 km/h; lead vehicle stopped at 50 km/h; stop"
-            " (full) at 80 km/h; road wet, by day"
+            " (full) at 80 km/h; weather wet (friction 0.71, water 1 mm), by day"
         ),
         "box": True,
         "contacts_left_out": None,
@@ -65,9 +66,16 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
     )
 
 
-def sheet_with(*answers: Answer, changes: tuple[str, ...] = ()) -> str:
+def sheet_with(
+    *answers: Answer,
+    changes: tuple[str, ...] = (),
+    unsafe: str = "collision",
+    stated: Unsafe | None = None,
+) -> str:
     """The words of the sheet; empty without a sheet."""
-    case = SimpleNamespace(characteristics=CHARACTERISTICS)
+    case = SimpleNamespace(
+        characteristics=CHARACTERISTICS, study=STUDY, stated=stated, unsafe=Unsafe.parse(unsafe)
+    )
     study: Any = SimpleNamespace(case=case, answers=answers, later_changes=changes)
     parts = {"name": "wear", "title": "A car", "anchor": "a", "versions": {"libsumo": "1.28"}}
     template = template_environment(TEMPLATE_FOLDER).get_template("sheet.html.j2")
@@ -85,16 +93,19 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         blank = f"________{item.suffix}"
         assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "This sheet is about a simulated vehicle: no real one was tested.",
+        "valid only for the vehicle and the driving system of the study wear, which the last block",
+        "no real vehicle was tested. The sheet does not apply to any other car.",
+        "do what the last column says, measure this item again and enter the new value.",
         "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
-        "The driving system must stay off as long as a value is missing.",
+        "The driving system must stay off as long as a value is missing or beyond its limit.",
+        "The workshop enters every value except those marked “operator”.",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
         " near side, hidden by parked cars, at 10 to 40 km/h;"
         "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
-        "Road and lightroad wet, by day",
+        "Weather and lightweather wet (friction 0.71, water 1 mm), by day",
         "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these",
         "Vehicle checked: licence plate VIN odometer km",
-        "The signature does not cover a part without a value. Date: Name and signature:",
+        "The signature does not cover an item without a value. Date: Name and signature:",
         "Simulated vehicleworn (A car with two axles",
         "; study wear",
         "Driving systemaeb (Holds its speed; brakes in part, then fully,",
@@ -138,6 +149,20 @@ def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
     assert f"Do not use this {reason}" in sheet
     assert "signature" not in sheet
     assert ("at least 3 mm" in sheet) is has_table
+
+
+def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None:
+    """The default where nothing collides is a share of the original's safety degree."""
+    screening = answer_of(unsafe="below=1.4")
+    sheet = sheet_with(screening, unsafe="below=1.4")
+    assert "Do not use this sheet: its limits are for screening." in sheet
+    assert "with the option --unsafe collision" in sheet
+    assert "signature" not in sheet
+    # A user's own limit, for the whole page or this question, is a decision.
+    own = sheet_with(screening, unsafe="below=1.4", stated=Unsafe(below=1.4))
+    for signed in (own, sheet_with(screening)):
+        assert "screening" not in signed
+        assert "Name and signature" in signed
 
 
 def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked() -> None:

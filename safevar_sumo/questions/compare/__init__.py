@@ -307,17 +307,17 @@ def _verdict(
     """Whether B is better: in something and worse in nothing, needless braking included."""
     # Only what is better without anything worse is better.
     a, b = titles
-    better, worse, facts = ("; it ".join(phrases) for phrases in difference)
+    better, worse, facts = (". It ".join(phrases) for phrases in difference)
     if worse and better:
         yield f"Neither {a} nor {b} is better in everything."
-        yield f"What is worse: {b} {worse}."
-        yield f"What is better: {b} {better}."
+        yield f"What is worse in {b}: it {worse}."
+        yield f"What is better in {b}: it {better}."
     elif worse:
-        yield f"{b} is worse than {a}: it {worse}."
+        yield f"{b} is worse than {a}. It {worse}."
     elif better and is_measured:
-        yield f"{b} is better than {a}: it {better}. Nothing that was measured is worse."
+        yield f"{b} is better than {a}. It {better}. Nothing that was measured is worse."
     elif better:
-        yield f"Not enough evidence that {b} is better than {a}, although it {better}."
+        yield f"There is not enough evidence that {b} is better than {a}, although it {better}."
     else:
         yield f"No difference between {a} and {b} was found."
 
@@ -327,7 +327,7 @@ def _verdict(
     if not is_measured:
         yield "Needless braking was not measured: no benign scenes are known for this scenario."
     if not unsafe.is_collision or unsafe.keep:
-        yield f"Counted as unsafe: {unsafe.description}."
+        yield f"Unsafe means: {unsafe.description}."
     if unsafe.remark:
         yield unsafe.remark
 
@@ -336,9 +336,9 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {tested.quantity} over {tested.pairs} has p ="
-        f" {tested.p:.2g}; with a probability of {tested.a12:.2f} (A12), the value of {titles[0]}"
-        " is the larger one."
+        f"A signed-rank test of the {tested.quantity} over {tested.pairs} gives p ="
+        f" {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"
+        f" {tested.a12:.2f} (A12)."
     )
 
 

@@ -166,7 +166,7 @@ def _moved_limits(
     if len(numbers) > MAX_LIMITS_NAMED:
         texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
     return (
-        [f"has limits of one characteristic alone that {verb} ({join_phrases(texts)})"]
+        [f"has limits of single characteristics that {verb} ({join_phrases(texts)})"]
         if texts
         else []
     )
@@ -201,8 +201,8 @@ def compare_originals(
     parts = list[Difference]()
     if in_a != in_b:
         phrase = (
-            f"is {'unsafe' if in_b else 'safe'} already with the original vehicle, where {a} is"
-            f" {'safe' if in_b else 'unsafe'}"
+            f"is {'unsafe' if in_b else 'safe'} even with the original vehicle, which is"
+            f" {'safe' if in_b else 'unsafe'} in {a}"
         )
         parts.append(Difference.of(phrase, is_better=in_a))
     if braking["a_needless_braking"] != braking["b_needless_braking"]:
@@ -252,7 +252,9 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
         return ()
     speed, point = max(new, key=lambda pair: pair[0])
     where = where_in_words(systems[1].points, point, point.scenario, {})
-    more = f" (the fastest of {len(new)} such test cases)" if len(new) > 1 else ""
+    more = (
+        f" ({len(new)} test cases are like this; this one is the fastest)" if len(new) > 1 else ""
+    )
     a, b = titles
     collision = f"its original vehicle collides at {speed:.2f} m/s{where}"
     return (f"Do not release {b}: {collision}, where that of {a} does not collide{more}",)

@@ -44,7 +44,7 @@ from safevar_sumo.questions.research_questions.tables import (
     TABLES,
     WEATHER,
 )
-from safevar_sumo.questions.words import demanded_in_words, number_of
+from safevar_sumo.questions.words import demanded_in_words, join_phrases, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
 
@@ -181,7 +181,9 @@ def answer_questions(
             else:
                 parts.append(part if name == WEATHER else part.assign(**{label: group[0].name}))
                 for case in group:
-                    remarks += [(name, note) for note in _remarks(name, case, part, choices.alpha)]
+                    of_case = f"{case.name}: " if len(cases) > 1 else ""
+                    notes = _remarks(name, case, part, choices.alpha)
+                    remarks += [(name, f"{of_case}{note}") for note in notes]
         shown = {**columns, label: columns[label]._replace(is_shown=len(cases) > 1)}
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
@@ -238,7 +240,10 @@ def _equal_solutions(case: Case) -> str:
     if not count:
         return ""
     of_all = f"{count} of {number_of(len(case.solutions), 'solution')}"
-    return f"{of_all} equal an earlier one of their run, and count here, as in the paper's method."
+    return (
+        f"{of_all} equal an earlier one of their run. They count here, because they count in the"
+        " paper's method."
+    )
 
 
 def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
@@ -255,11 +260,12 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
         remarks += filter(None, [describe_rules(case)])
     if table == "a12" and len(frame):
         remarks.append(
-            f"* is by p after Holm's correction for the {number_of(len(frame), 'test')} of RQ2."
+            "An asterisk means that the p-value is significant after Holm's correction for the"
+            f" {number_of(len(frame), 'test')} of RQ2."
         )
     if table == "combinations" and frame.empty:
-        remarks.append("no critical solution has exactly four characteristics changed.")
-    return (f"{case.name}: {remark}" for remark in remarks)
+        remarks.append("No critical solution changes exactly four characteristics.")
+    return (remark[:1].upper() + remark[1:] for remark in remarks)
 
 
 def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
@@ -273,16 +279,16 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         names = ", ".join(map(case.title_of, with_few_runs))
         needed = fewest_runs(table.upper(), alpha)
         yield (
-            f"{names}: too few runs for a test ({needed} are necessary), so no p-value of pooled"
-            " solutions is significant."
+            f"No p-value of pooled solutions is significant for {names}: a test needs at least"
+            f" {needed} runs of each algorithm."
         )
     for metric in case.scoring.metrics:
         values = solutions_for_metric(case.solutions, metric)[metric.name]
         undefined = int(values.isna().sum())
         if undefined:
             yield (
-                f"{metric.name} is undefined in {undefined} of {len(values)} solutions, which tests"
-                " omit."
+                f"{metric.name} is undefined in {undefined} of {len(values)} solutions. The tests"
+                " leave these out."
             )
     if table == "rq1":
         known = (
@@ -293,17 +299,17 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         ]
         if omitted:
             yield (
-                f"the original vehicle's {', '.join(omitted)} is undefined, so that no test"
-                " uses it."
+                f"No test uses {join_phrases(omitted)}, because the original vehicle has no such"
+                " value."
             )
     elif not case.has_runs:
         yield (
-            "igd, igd_plus and hypervolume need runs, which imported solutions do not have; nor is"
-            " their number of evaluations known."
+            "igd, igd_plus and hypervolume are missing, because they need runs, and imported"
+            " solutions belong to none. Their number of evaluations is not known either."
         )
     elif len(case.evaluations):
         yield (
-            "settings that a run simulates on average:"
+            "Number of settings that a run simulates on average:"
             f" {describe_evaluations(case, count_evaluations(case))}."
         )
 
@@ -316,9 +322,11 @@ def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> It
     few = len(tests) - int(tests["enough_runs"].sum())
     if few:
         needed = fewest_runs(rq, alpha, len(tests))
+        none = f"None of the {tests_in_words} of {rq} can"
+        some = f"{few} of {tests_in_words} of {rq} cannot"
         yield (
-            f"{few} of {tests_in_words} of {rq} cannot be significant, because there are too few"
-            f" runs ({needed} are necessary after Holm's correction)."
+            f"{none if few == len(tests) else some} be significant: after Holm's correction, a test"
+            f" needs at least {needed} runs of each algorithm."
         )
     if len(tests):
         yield f"Holm's method corrects the p-values of the {tests_in_words} of {rq} together."

@@ -27,6 +27,7 @@ from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE
 from safevar_sumo.questions.tolerance.words import (
     USUAL_BUDGET,
     contacts_in_words,
+    one_set_in_words,
     rough_in_words,
     tested_in_words,
     why_not_kept,
@@ -292,7 +293,7 @@ def _sentences(
     unsafe = search.unsafe
     points = search.evaluator.system.points
     names = dict.fromkeys(point.weather.name.replace("_", " ") for point in points)
-    where = f"{rough_in_words(search.budget)}On a {' or '.join(names)} road"
+    where = f"{rough_in_words(search.budget)}In the weather {' or '.join(names)}"
     if search.limits and search.budget:
         what = join_phrases(_limit_texts(search))
         yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."
@@ -303,8 +304,7 @@ def _sentences(
         )
     else:
         yield (
-            f"{where}, with all others as in the original, each characteristic may change as far as"
-            f" this: {'; '.join(_allowed(search, frame))}."
+            f"{where}, if all others stay as in the original: {'; '.join(_allowed(search, frame))}."
         )
     yield _original_in_words(search)
     if contacts is not None:
@@ -312,15 +312,15 @@ def _sentences(
     values = f"{join_phrases(f'{value:g}' for value in by.values)}{unit_text(by.unit)}"
     members, left_out = levels[-1].models
     tried = len(members) + len(left_out)
-    fits = f"in {len(members)} of {tried} parameter sets"
-    if tried == 1:
-        fits = "with one parameter set of the vehicle model"
+    fits = f" in {len(members)} of {tried} parameter sets of the vehicle model" if tried > 1 else ""
     counted = _of_counted(search, by.values[-1])
     of_counted = f"{counted}," if counted else ""
     hold = "hold" if search.budget else "were only scanned"
     yield (
-        f"Limits up to {values}{of_counted} {hold} {fits}: {tested_in_words(unsafe, len(members))}."
+        f"The limits up to {values}{of_counted} {hold}{fits}:"
+        f" {tested_in_words(unsafe, len(members))}."
     )
+    yield from one_set_in_words(members, left_out)
     unsafe_from = next((level.value for level in levels if level.alone is None), None)
     if unsafe_from is not None:
         yield f"Up to {by.text(unsafe_from)} no limit holds: {UNSAFE_ORIGINAL}."
@@ -377,9 +377,9 @@ def _allowed(search: LevelSearch, frame: pd.DataFrame) -> Iterator[str]:
         whole = rows.loc[is_whole, f"by_{by.name}"].max()
         text = f"{item.name} {item.lower if is_low else item.upper:.10g}{item.suffix}"
         yield (
-            f"{text} not even up to {by.text(by.values[0])}"
+            f"{text} is unsafe already up to {by.text(by.values[0])}"
             if np.isnan(whole)
-            else f"{text} up to {by.text(whole)}"
+            else f"{text} is safe up to {by.text(whole)}"
         )
 
 

@@ -4,14 +4,14 @@ which scope.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Models, fit_names
+from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
@@ -53,8 +53,8 @@ def contacts_in_words(evaluator: Evaluator, contacts: Contacts) -> Iterator[str]
         item = members.members[members.names.index(contacts.name)]
         margin = evaluator.study.scenario.margin
         yield (
-            f"Where the original touches nobody but keeps less than {margin:g} m, which does not"
-            " count, vehicles within these limits touch somebody:"
+            "Some encounters do not count, because the original touches nobody there but keeps less"
+            f" than {margin:g} m. In these, vehicles within the limits touch somebody:"
             f" {number_of(contacts.number, 'such contact')} found, the lowest at"
             f" {item.name.replace('_', ' ')}"
             f" {limit_text(item, round(contacts.lowest, item.digits + 1))}."
@@ -121,8 +121,8 @@ def tested_sentences(
         )
     if models.left_out:
         yield (
-            f"Left out: {fit_names(models.left_out)}, in which the original vehicle itself is"
-            " unsafe or keeps too little."
+            f"These parameter sets were left out, because the original vehicle itself is unsafe in"
+            f" them or keeps too little: {fit_names(models.left_out)}."
         )
     if together is not None and together.box is not None:
         yield validation_in_words(together, budget)
@@ -145,7 +145,7 @@ def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
         values = " or ".join(
             f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do
         )
-        others = ", the other specified limits as they are" if len(nearest) > 1 else ""
+        others = ", if the other specified limits stay" if len(nearest) > 1 else ""
         yield f"A limit that would hold instead: {values}{others}."
     elif nearest:
         yield "No other value of a single specified limit would hold."
@@ -169,22 +169,30 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
                 " none."
             )
         return
-    where = "with one parameter set of the vehicle model"
+    where = ""
     if len(models.members) > 1:
-        where = f"in {count} of {len(models.members)} parameter sets"
+        where = f" in {count} of {len(models.members)} parameter sets of the vehicle model"
     decision = "All joint limits hold at the same time"
     if asked.limits:
         decision = "The joint limits below hold" if together.broken else "All limits hold"
     if asked.is_quick and asked.budget:
         decision = "The joint limits below hold at their corners and in the short search"
     elif not asked.budget:
-        decision = (
-            "No search for counterexamples tested the joint limits below: they hold at their"
-            " corners"
-        )
-    yield f"{decision} {where}: {tested_in_words(unsafe, count)}."
+        decision = "The joint limits below were tested at their corners alone, and hold there"
+    yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
+    if not asked.is_quick:
+        yield from one_set_in_words(models.members, models.left_out)
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
+
+
+def one_set_in_words(members: Sequence[Model], left_out: Collection[int]) -> Iterator[str]:
+    """That limits hold in one parameter set alone though the study has others, in a sentence."""
+    if len(members) == 1 and not left_out and members[0].evaluator.study.spread:
+        yield (
+            "The limits were computed with one parameter set of the vehicle model; the study's other"
+            " sets were not tried."
+        )
 
 
 def tested_in_words(unsafe: Unsafe, fits: int) -> str:
