@@ -190,8 +190,8 @@ def one_set_in_words(members: Sequence[Model], left_out: Collection[int]) -> Ite
     """That limits hold in one parameter set alone though the study has others, in a sentence."""
     if len(members) == 1 and not left_out and members[0].evaluator.study.spread:
         yield (
-            "The limits were computed with one parameter set of the vehicle model; the study's other"
-            " sets were not tried."
+            "The limits were computed with one parameter set of the vehicle model; the study's"
+            " other sets were not tried."
         )
 
 
