@@ -93,12 +93,11 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         blank = f"________{item.suffix}"
         assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "valid only for the vehicle and the driving system of the study wear, which the last block",
-        "no real vehicle was tested. The sheet does not apply to any other car.",
+        "Valid only for the simulated vehicle of the study wear, named below: for no other car.",
         "do what the last column says, measure this item again and enter the new value.",
         "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
         "The driving system must stay off as long as a value is missing or beyond its limit.",
-        "The workshop enters every value except those marked “operator”.",
+        "The workshop enters every value except those marked “operator”,",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
         " near side, hidden by parked cars, at 10 to 40 km/h;"
         "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
