@@ -6,12 +6,12 @@ time left.
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from threading import Event, Thread
+from typing import Self
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
@@ -29,10 +29,21 @@ SETTLING_TIME = 2.0
 """Work before the time left is shown [s]: batches that end together make earlier estimates
 meaningless.
 """
-NUMBERED = re.compile(r"\b\d+ of \d+, ")
-"""The number of a phase among several, as in `2 of 5, boundaries`."""
 UNLIMITED_WIDTH = 1_000_000
 """Width in which no line is broken [characters]."""
+
+
+class Phase(str):
+    """The name of a phase of something larger, which knows what share of the whole is done; a text,
+    as users' functions take one.
+    """
+
+    share: float
+
+    def __new__(cls, name: str, share: float) -> Self:
+        phase = super().__new__(cls, name)
+        phase.share = share
+        return phase
 
 
 class WholeTable(Table):
@@ -109,22 +120,26 @@ def show_no_progress(phase: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
-def show_within(progress: Progress, whole: str, phase: str, done: int, total: int) -> None:
-    """Show a phase of something larger, which is named before it."""
-    progress(f"{whole}: {phase}", done, total)
+def show_within(
+    progress: Progress, whole: str, earlier: float, width: float, phase: str, done: int, total: int
+) -> None:
+    """Show a phase of something larger, which is named before it: it begins when a share `earlier`
+    of that is done, and is a share `width` of it.
+    """
+    share = share_done(phase, done, total) or 0.0
+    progress(Phase(f"{whole}: {phase}", earlier + width * share), done, total)
 
 
-class _Count(ProgressColumn):
-    """How much is done, and of what total."""
-
-    def render(self, task: Task) -> Text:
-        total = "" if task.total is None else f"/{task.total:.0f}"
-        return Text(f"{task.completed:.0f}{total}" if total or task.completed else "")
+def share_done(phase: str, done: int, total: int) -> float | None:
+    """The share that is done of the whole, or of a phase that is the whole; None if unknown."""
+    if isinstance(phase, Phase):
+        return phase.share
+    return done / total if total else None
 
 
 class _Pace(ProgressColumn):
     """The mean speed of the phase under way, and the time left at that speed: of a phase of several
-    it is that of the phase, and a phase that has ended has none.
+    or of a round it says so, and a phase that has ended has none.
     """
 
     def __init__(self) -> None:
@@ -137,7 +152,9 @@ class _Pace(ProgressColumn):
         """What was done when the phase began, such as by an earlier command, and the time [s]."""
 
     def update(self, phase: str, done: int, total: int) -> None:
-        self._of = " of this phase" if NUMBERED.search(phase) else ""
+        self._of = ""
+        if isinstance(phase, Phase):
+            self._of = " of this round" if ", round " in phase else " of this phase"
         is_new = self._begun is None or done == 0 or done < self._done or not self._total
         self._done = done
         self._total = total
@@ -177,17 +194,21 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         nonlocal line
         line = f"{phase}: {done} of {total}" if total else f"{phase}: {done}"
         pace.update(phase, done, total)
-        bar.update(task, description=phase, completed=done, total=total or None)
+        count = f"{done}/{total}" if total else f"{done}" if done else ""
+        share = share_done(phase, done, total)
+        whole = None if share is None else 1.0
+        bar.update(task, description=phase, completed=share or 0.0, total=whole, count=count)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
             print_text(console, ", ".join(filter(None, (line, str(pace.render())))))
 
     text = TextColumn("{task.description}", markup=False)
-    columns = (text, BarColumn(bar_width=None), _Count(), pace)
+    count = TextColumn("{task.fields[count]}", markup=False)
+    columns = (text, BarColumn(bar_width=None), count, pace)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(line, total=None)
+        task = bar.add_task(line, total=None, count="")
         lines.start()
         try:
             yield show

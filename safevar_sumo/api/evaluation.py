@@ -26,6 +26,8 @@ SETTINGS_FORMAT = (
     "a list of mappings such as [{'mass': 2500}], a pandas.DataFrame with a column for each"
     " characteristic that is changed, or an array of numbers, shape (M, n)"
 )
+SETTINGS = "settings"
+"""The phase of progress."""
 
 
 def evaluate(
@@ -116,7 +118,8 @@ def evaluate_with_workers(
     from safevar_sumo.questions.evaluator import open_evaluator
 
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        return evaluator.evaluate(settings, "settings", ignore_constraints=True)
+        evaluator.plan({SETTINGS: 1})
+        return evaluator.evaluate(settings, SETTINGS, ignore_constraints=True)
 
 
 def _read_settings(

@@ -4,27 +4,22 @@ domain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
-from typing import TypeVar
+from functools import cached_property
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import (
-    COMPILING,
-    ask_why_no_verdict,
-    compile_vehicle,
-    evaluate_all,
-)
+from safevar_sumo.campaign.questions import ask_why_no_verdict, compile_vehicle, evaluate_all
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
@@ -32,7 +27,6 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
 
-Found = TypeVar("Found")
 CRITERION_SETTINGS = 1024
 """Number of settings over the whole domain that decide the default criterion: a collision if any
 setting collides, else a safety degree.
@@ -43,84 +37,6 @@ ENCOUNTERS = 16
 """Number of encounters in which a vehicle is tried, in a study that searches its scenario."""
 CANDIDATES = 512
 """Number of encounters over its domain from which they are chosen."""
-
-
-class _Plan:
-    """Progress of a question whose stages come one after another, without a way back: what is not
-    planned, or belongs to an earlier stage, counts in the one under way, and no count falls.
-    """
-
-    def __init__(self, show: Progress, stages: Sequence[str]) -> None:
-        self._show = show
-        self._stages = stages
-        self._number = 0
-        """The number of the stage under way, from 1; 0 before the first."""
-        self._name = ""
-        self._part, self._done_in_part = "", 0
-        """The stage that is shown as a part of the one under way, and what is done in it."""
-        self._before = self._done = 0
-        """What was done before this part, and what is done in all."""
-
-    def show_part(self, part: str, done: int, total: int) -> None:
-        """Show the progress of a stage, as a part of the stage under way."""
-        if part == COMPILING:
-            self._show(part, done, total)
-            return
-        # The next planned stage, or one before the first, begins its own count.
-        number = self._stages.index(part) + 1 if part in self._stages else 0
-        if number > self._number or (not self._number and part != self._name):
-            self._number = number
-            self._name = part
-            self._before = self._done = 0
-        # A part that follows another one, or begins again, goes on where that one ended.
-        elif part != self._part or done < self._done_in_part:
-            self._before = self._done - done
-        self._part, self._done_in_part = part, done
-        self._done = self._before + done
-        words = f"{self._number} of {len(self._stages)}, " if self._number else ""
-        self._show(f"{words}{self._name}", self._done, self._before + total if total else 0)
-
-
-class _Stage:
-    """Progress of a stage over several calls: `earlier` settings are done, and about `total` are
-    expected.
-
-    A call shows a stage of its own; where that begins again, its count may go on.
-    """
-
-    def __init__(self, show: Progress, name: str, earlier: int, total: int | None) -> None:
-        self._show = show
-        self._name = name
-        self._total = None if total is None else earlier + total
-        self._before_call = earlier
-        self._call = ""
-        self._call_total = 0
-        self._done_at_first = 0
-        self.done = earlier
-        show(name, earlier, self._total or 0)
-
-    def show_part(self, call: str, done: int, total: int) -> None:
-        """Show the progress of a call; where its count falls, or its own stage is another, it is
-        the next call.
-        """
-        if call == COMPILING:
-            self._show(call, done, total)
-            return
-        done_in_call = self._done_at_first + self.done - self._before_call
-        if call != self._call or not done or done < done_in_call:
-            self._before_call = self.done
-            self._call = call
-            self._done_at_first = done
-            self._call_total = total
-        self.done = self._before_call + done - self._done_at_first
-        of_all_calls = self._before_call + total - self._done_at_first
-        self._show(
-            self._name, self.done, 0 if self._total is None else max(self._total, of_all_calls)
-        )
-
-    def expect(self, left: int) -> None:
-        """Expect so many settings after the call under way."""
-        self._total = self._before_call + self._call_total - self._done_at_first + left
 
 
 class Evaluator:
@@ -149,10 +65,8 @@ class Evaluator:
             self.region = region_of(study)
         self.characteristics = self.region.characteristics
         self._pool = pool
-        self.progress = self._told = progress
+        self.phases = Phases(progress)
         self._verified = verified
-        self._counts = dict[str, int]()
-        """Settings of each stage that has ended; where it begins again, its count goes on."""
         self.simulated = 0
         self.measure = ""
         self.undefined = list[tuple[int, int]]()
@@ -189,24 +103,17 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, *stages: str) -> None:
-        """Let progress number these stages of a question: `2 of 5, boundaries`."""
-        self.progress = _Plan(self._told, stages).show_part
+    def plan(self, usual_shares: Mapping[str, float], repeated: str = "") -> None:
+        """Plan the phases of a question, as `Phases.plan` says."""
+        self.phases.plan(usual_shares, repeated)
 
-    @contextmanager
-    def stage(self, name: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
+    def stage(
+        self, name: str, total: int | None = None
+    ) -> AbstractContextManager[Callable[[int], None]]:
         """Show all that is evaluated within the context, by evaluators of other studies, too, as
-        one stage of about `total` settings, None where that is open; the function that it yields
-        takes a better estimate of how many are left.
+        one phase, as `Phases.stage` says.
         """
-        show = self.progress
-        stage = _Stage(show, name, self._counts.get(name, 0), total)
-        self.progress = stage.show_part
-        try:
-            yield stage.expect
-        finally:
-            self.progress = show
-            self._counts[name] = stage.done
+        return self.phases.stage(name, total)
 
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters
@@ -225,12 +132,12 @@ class Evaluator:
             return Evaluations.none(len(self.characteristics), METRICS)
         done = 0
         total = len(np.unique(settings, axis=0))
-        self.progress(stage, done, total)
+        self.phases.show_part(stage, done, total)
 
         def show_more_done(increment: int) -> None:
             nonlocal done
             done += increment
-            self.progress(stage, done, total)
+            self.phases.show_part(stage, done, total)
 
         evaluations = evaluate_all(
             self.study,
@@ -254,7 +161,7 @@ class Evaluator:
         return self._without_unsafe_originals(evaluations)
 
     def _compile(self) -> None:
-        compile_vehicle(self.study, self._pool, self.progress)
+        compile_vehicle(self.study, self._pool, self.phases.show_part)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """Evaluations whose results are undefined where the original vehicle is not safe in the
@@ -445,44 +352,12 @@ class Evaluator:
         SUMO, too.
         """
         other = Evaluator(
-            study, self._pool, self._show, self._verified if verified is None else verified
+            study, self._pool, verified=self._verified if verified is None else verified
         )
+        other.phases = self.phases
         other.measure = self.measure
         other.undefined = self.undefined
         return other
-
-    def _show(self, stage: str, done: int, total: int) -> None:
-        """Show the progress of another evaluator as part of this one's."""
-        self.progress(stage, done, total)
-
-
-def side_by_side(
-    evaluators: Sequence[Evaluator], measure: Callable[[Evaluator], Found], stage: str = ""
-) -> list[Found]:
-    """What `measure` finds with each evaluator of one pool; as many at the same time as there are
-    workers. Progress is shown for `stage`, or by the evaluators if they have no company.
-    """
-    if len(evaluators) < 2:
-        return [measure(one) for one in evaluators]
-    pool = evaluators[0]._pool
-    show = evaluators[0].progress
-    done = 0
-
-    def measure_on(evaluator: Evaluator, part: Pool) -> Found:
-        nonlocal done
-        evaluator._pool = part
-        evaluator.progress = show_no_progress
-        try:
-            found = measure(evaluator)
-        finally:
-            evaluator._pool = pool
-            evaluator.progress = show
-        done += 1
-        show(stage, done, len(evaluators))
-        return found
-
-    show(stage, done, len(evaluators))
-    return pool.share_out([partial(measure_on, evaluator) for evaluator in evaluators])
 
 
 @contextmanager
@@ -501,9 +376,7 @@ def open_evaluator(
         If the study's models cannot be assembled.
     """
     if pool is not None:
-        evaluator = Evaluator(study, pool, progress)
-        evaluator.plan()
-        yield evaluator
+        yield Evaluator(study, pool, progress)
         return
     assemble(study)  # before workers start
     with open_pool(jobs) as new_pool, open_evaluator(study, new_pool, None, progress) as evaluator:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.case import Case
 
+CELLS_STAGE = "cells and robustness layers"
+"""The phase of progress."""
 DECIMALS = 9
 """Decimals of points and measured values; further decimals would hold only rounding errors."""
 POINTS = partial(Column, "", number_format=".2f")
@@ -112,6 +114,7 @@ def rating(
     """
     # The vehicles, in a study that is rated.
     study = evaluator.study
+    evaluator.plan({CELLS_STAGE: 1})
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
     if study.scenario.search:
@@ -126,9 +129,7 @@ def rating(
     # All cells of the protocol.
     rater = assemble(study).rater
     assert rater is not None
-    cells = evaluator.for_study(study).at_each_point(
-        np.stack([*settings.values()]), "cells and robustness layers"
-    )
+    cells = evaluator.for_study(study).at_each_point(np.stack([*settings.values()]), CELLS_STAGE)
     return rate(study, rater, settings, cells)
 
 

@@ -112,7 +112,7 @@ def risk(
     criterion = evaluator.choose_criterion(unsafe, subject)
     rng = np.random.default_rng(study.search.seed)
     batches = []
-    evaluator.plan(SAMPLING, SENSITIVITY)
+    evaluator.plan({SAMPLING: 1, SENSITIVITY: 2})
     with evaluator.stage(SAMPLING, samples):
         for start in range(0, samples, VEHICLES_PER_CALL):
             vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)

@@ -34,6 +34,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
+SAMPLED_STAGE = "vehicles sampled over the whole domain"
+"""The phase of progress."""
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""
 FOLDS = 5
@@ -85,11 +87,12 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
+    evaluator.plan({SAMPLED_STAGE: 1})
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
     vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
-    evaluations = evaluator.evaluate(vehicles, "settings over the whole domain")
+    evaluations = evaluator.evaluate(vehicles, SAMPLED_STAGE)
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
     training = evaluations.take(evaluations.valid & is_first_half)
     testing = evaluations.take(evaluations.valid & ~is_first_half)

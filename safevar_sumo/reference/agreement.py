@@ -39,6 +39,8 @@ COLUMNS: Columns = {
     "mean_absolute_error": Column("as in column unit", "mean of |here - reference|", ".3f"),
     "bias": Column("as in column unit", "mean of here - reference", ".3f"),
 }
+STAGE = "settings"
+"""The phase of progress."""
 SHIPPED_AGREEMENT = Path(__file__).with_name("agreement.csv")
 """Safety degrees of shipped studies and published files: what `validate STUDY FILE` answers."""
 SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
@@ -61,8 +63,9 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
     """
     # The reference's settings, simulated here.
     study = evaluator.study
+    evaluator.plan({STAGE: 1})
     data = read_reference(reference, evaluator.characteristics)
-    here = evaluator.evaluate(data.settings, "settings", ignore_constraints=True)
+    here = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
     if not here.valid.any():
         raise SimulationError(
             f"study {study.name!r} cannot be simulated with any row of {reference}"

@@ -150,9 +150,8 @@ def _pack_study(
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
-    packed = Packed(
-        described, files, study.origin.places, jobs, partial(show_within, progress, study.name)
-    )
+    show_part = partial(show_within, progress, study.name, 0.0, 1.0)
+    packed = Packed(described, files, study.origin.places, jobs, show_part)
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
 

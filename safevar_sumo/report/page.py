@@ -152,8 +152,9 @@ def report(
         """The next answer, about these of the results."""
         question = with_criterion(text, unsafe)
         subjects = by_criterion if has_criterion(question, unsafe) else at_point
-        name = f"question {next(numbers)} of {total}, {question.split()[0]}"
-        show_part = partial(show_within, show, name)
+        number = next(numbers)
+        name = f"question {number} of {total}, {question.split()[0]}"
+        show_part = partial(show_within, show, name, (number - 1) / total, 1 / total)
         answer = answer_to if ask else answer_or_reason
         return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 

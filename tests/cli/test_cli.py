@@ -27,7 +27,7 @@ from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import open_progress
+from safevar_sumo.terminal import Phase, open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, refused, run
 
@@ -372,3 +372,21 @@ def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None
     )
     sweep = ("simulate", "mine.toml", "--set", "mass=2100..2200:2")
     assert "mass = 2200 > 2150" in run(*sweep, "--fail-if", "sweep.mass > 2150", expect=3).stderr
+
+
+def test_the_bar_of_a_whole_shows_its_share_and_whose_time_is_left(clock: list[float]) -> None:
+    """Ten seconds ago 300 of a phase's 600 simulations were left, at 10 a second; half of the whole
+    is done.
+    """
+    out = StringIO()
+    console = Console(file=out, force_terminal=True, width=120, _environ={})
+    for name, of in (("2 of 2, test", "phase"), ("2 of 2, test, round 2", "round")):
+        with open_progress(True, console) as show:
+            for done in range(0, 400, 100):
+                show(Phase(name, 0.5), done, 600)
+                clock[0] += 10
+        text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue())
+        last = [line for line in text.splitlines() if name in line][-1].rstrip()
+        found = re.fullmatch(rf"{name} (━*)[╸╺](━*) 300/600 10/s, 0:00:20 left of this {of}", last)
+        assert found
+        assert abs(len(found[1]) - len(found[2])) <= 1

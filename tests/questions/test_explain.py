@@ -31,6 +31,7 @@ from safevar_sumo.questions.explain.causes import (
     find_minimal_causes,
     select_affordable_rows,
 )
+from safevar_sumo.questions.progress import Phases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -328,7 +329,7 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     shown = list[tuple[str, int, int]]()
     study = made_up_study(1)
     evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
-    evaluator.plan("first", "all calls")
+    evaluator.plan({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
     with evaluator.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
@@ -342,12 +343,14 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     assert counts == [(0, 4), (3, 4), (3, 5), (5, 5), (5, 0), (6, 0)]
 
 
-def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
-    """A test of 3 settings, a search, another test of 2: alone, and within a whole."""
+def test_a_stage_that_begins_again_counts_in_the_one_under_way() -> None:
+    """A test of 3 settings, a search, another test of 2, which counts in the search, as there is no
+    way back: alone, and within a whole.
+    """
     shown = list[tuple[str, int, int]]()
     evaluator = made_up_evaluator(1, nowhere)
-    evaluator.progress = lambda *values: (
-        shown.append(values) if values[0] in ("test", "search", "whole") else None
+    evaluator.phases = Phases(
+        lambda *values: shown.append(values) if values[0] in ("test", "search", "whole") else None
     )
 
     def test_twice() -> None:
@@ -362,8 +365,8 @@ def test_the_count_of_a_stage_that_begins_again_goes_on() -> None:
             ("test", 3, 3),
             ("search", 0, 0),
             ("search", 4, 0),
-            ("test", 3, 5),
-            ("test", 5, 5),
+            ("search", 4, 6),
+            ("search", 6, 6),
         ]
     ]
     shown.clear()

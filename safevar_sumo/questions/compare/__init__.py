@@ -35,6 +35,7 @@ from safevar_sumo.questions.compare.differences import (
     reasons_against,
 )
 from safevar_sumo.questions.compare.settings import (
+    BOTH_STAGE,
     LINE,
     RUN_COLUMNS,
     SAMPLE,
@@ -57,6 +58,7 @@ from safevar_sumo.questions.pairs import (
 )
 from safevar_sumo.questions.research_questions.statistics import fewest_runs
 from safevar_sumo.questions.subject import study_in
+from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
@@ -111,6 +113,7 @@ def compare(
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
+    evaluator.plan({BOTH_STAGE: 1, SCAN_STAGE: 2})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     subjects = (subject, other)

@@ -22,6 +22,8 @@ from safevar_sumo.results import handles_of
 from safevar_sumo.study import Limit, Study
 from safevar_sumo.study.characteristics import Domain, check_limits
 
+BOTH_STAGE = "settings in both systems"
+"""The phase of progress."""
 MAX_FACTOR = 512
 """Largest number of settings that are drawn for each one that satisfies the constraints of both
 studies.
@@ -169,9 +171,7 @@ class CommonDomain(NamedTuple):
     def evaluate(self, settings: tuple[FloatArray, FloatArray]) -> tuple[Evaluations, Evaluations]:
         """Evaluate settings in both systems."""
         in_a, in_b = self.evaluators
-        return in_a.evaluate(settings[0], "settings in A"), in_b.evaluate(
-            settings[1], "settings in B"
-        )
+        return in_a.evaluate(settings[0], BOTH_STAGE), in_b.evaluate(settings[1], BOTH_STAGE)
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:

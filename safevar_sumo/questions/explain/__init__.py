@@ -69,6 +69,8 @@ if TYPE_CHECKING:
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
+USUAL_SHARES = 2, 2, 1, 17, 1, 1
+"""Usual shares of the phases of progress in the time."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
 """What the settings are of which some are unsafe."""
 
@@ -131,7 +133,8 @@ def explain(
     """
     if quick:
         fits, limit = 0, min(limit, QUICK_LIMIT)
-    evaluator.plan(TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, SETS_AT_ONCE, BOUNDARIES, BORDERS)
+    phases = TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, SETS_AT_ONCE, BOUNDARIES, BORDERS
+    evaluator.plan(dict(zip(phases, USUAL_SHARES, strict=True)))
     study = evaluator.study
 
     # The failures, and the minimal causes of a sample of them.

@@ -177,7 +177,7 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    evaluator.plan(SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE)
+    evaluator.plan({SEARCH_STAGE: 1, ATTACK_STAGE: 5, PROOF_STAGE: 10}, PROOF_STAGE)
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(

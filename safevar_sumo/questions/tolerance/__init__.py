@@ -23,7 +23,7 @@ from safevar_sumo.questions.tolerance.limits import (
     POINTS,
     answer_limits,
 )
-from safevar_sumo.questions.tolerance.limits_by import answer_by, check_by
+from safevar_sumo.questions.tolerance.limits_by import BETWEEN_STAGE, answer_by, check_by
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
@@ -105,8 +105,7 @@ def tolerance(
     study = evaluator.study
     parameter = None if by is None else Parameter.parse(by, study)
     check_by(by, unsafe, together, is_quick=quick)
-    stages = [SCAN_STAGE, ALONE_STAGE, SEARCH_STAGE, VALIDATION_STAGE]
-    evaluator.plan(*stages, *([WIDER_STAGE] if study.wider else []))
+    evaluator.plan(*_phases(study, parameter))
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -124,3 +123,12 @@ def tolerance(
         is_quick=quick,
     )
     return answer_limits(asked) if parameter is None else answer_by(asked, parameter)
+
+
+def _phases(study: Study, by: Parameter | None) -> tuple[dict[str, float], str]:
+    """The phases of progress, with their usual shares of the time, and the one that has rounds."""
+    if by is not None:
+        levels = dict.fromkeys((f"limits up to {by.text(value)}" for value in by.values), 1.0)
+        return {**levels, BETWEEN_STAGE: 1.0}, ""
+    phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
+    return {**phases, **({WIDER_STAGE: 4.0} if study.wider else {})}, VALIDATION_STAGE

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+BETWEEN_STAGE = "specified limits between two values"
+"""A phase of progress."""
 UNSAFE_ORIGINAL = "the original vehicle itself is unsafe, or safe in no encounter"
 
 
@@ -55,7 +57,7 @@ def answer_by(asked: Asked, by: Parameter) -> Answer:
     known = asked.unsafe_solutions
     is_changed = (known != members.original) & members.of_vehicle
     levels = search.levels(known[np.count_nonzero(is_changed, axis=1) == 1])
-    with search.evaluator.stage("specified limits between two values"):
+    with search.evaluator.stage(BETWEEN_STAGE):
         reach = search.reach(levels)
     contacts = search.contacts(levels)
     scopes = [by.scope(study, level.value, between=search.budget > 0) for level in levels]
