@@ -208,6 +208,11 @@ class Question:
         """The options by signature and docstring, without those that all questions have."""
         return options_of(self.compute)
 
+    @property
+    def has_rough_answer(self) -> bool:
+        """Whether `--quick` asks for a rough answer."""
+        return any(option.name == QUICK for option in self.options)
+
     def __call__(
         self,
         source: StudyLike | Results,
@@ -253,8 +258,7 @@ class Question:
 
     def _is_long(self, values: JsonObject) -> bool:
         """Whether a rough answer, which comes much earlier, may be shown before the answer."""
-        has_rough_answer = any(option.name == QUICK for option in self.options)
-        return has_rough_answer and not any(values.get(name) for name in (QUICK, "by", "out"))
+        return self.has_rough_answer and not any(values.get(name) for name in (QUICK, "by", "out"))
 
     def answer(
         self,
@@ -302,7 +306,7 @@ class Question:
             reason = about.no_verdict
         numbers = {"driven": not reason, **answer.numbers}
         rough = ""
-        if any(option.name == QUICK for option in self.options):
+        if self.has_rough_answer:
             rough = ROUGH if values.get(QUICK) else ""
             numbers["rough"] = bool(rough or numbers.get("rough"))
         verdict = " ".join(
@@ -438,8 +442,9 @@ def quick_questions(texts: Sequence[str]) -> list[str]:
     for text in texts:
         asked, values = parse_question(text)
         if "by" not in values:
-            is_quick = any(option.name == QUICK for option in asked.options)
-            found.append(f"{text} --{QUICK}" if is_quick and QUICK not in values else text)
+            found.append(
+                f"{text} --{QUICK}" if asked.has_rough_answer and QUICK not in values else text
+            )
     return found
 
 

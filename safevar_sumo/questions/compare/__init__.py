@@ -115,8 +115,7 @@ def compare(
     study = evaluator.study
     evaluator.plan({BOTH_STAGE: 1, SCAN_STAGE: 2})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
-    evaluators = (evaluator, second)
-    subjects = (subject, other)
+    evaluators, subjects = (evaluator, second), (subject, other)
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)

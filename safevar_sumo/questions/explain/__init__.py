@@ -69,8 +69,15 @@ if TYPE_CHECKING:
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
-USUAL_SHARES = 2, 2, 1, 17, 1, 1
-"""Usual shares of the phases of progress in the time."""
+USUAL_SHARES = {
+    TO_EXPLAIN: 2,
+    SUBSETS: 2,
+    REFERENCE_DRIVERS: 1,
+    SETS_AT_ONCE: 17,
+    BOUNDARIES: 1,
+    BORDERS: 1,
+}
+"""The phases of progress, with their usual shares of the time."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
 """What the settings are of which some are unsafe."""
 
@@ -133,8 +140,7 @@ def explain(
     """
     if quick:
         fits, limit = 0, min(limit, QUICK_LIMIT)
-    phases = TO_EXPLAIN, SUBSETS, REFERENCE_DRIVERS, SETS_AT_ONCE, BOUNDARIES, BORDERS
-    evaluator.plan(dict(zip(phases, USUAL_SHARES, strict=True)))
+    evaluator.plan(USUAL_SHARES)
     study = evaluator.study
 
     # The failures, and the minimal causes of a sample of them.
