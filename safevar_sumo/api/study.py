@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Any, Literal
@@ -269,9 +270,15 @@ def _measured(
     rate = measure_speed(task, pool, runs)
     verification = measure_verification(task, pool) if used is Engine.RECORDED else 0.0
 
-    # The time that follows for all evaluations, with the start and the verification.
+    # The summary at the end loads statistics, and lets the original drive in this process.
+    begin = time.monotonic()
+    import_module("scipy.stats")
+    why_no_verdict(system)
+    summary = time.monotonic() - begin
+
+    # The time that follows for all evaluations, with the start, verification and summary.
     evaluations = runs * study.search.evaluations
-    seconds = start + evaluations / rate + verification
+    seconds = start + evaluations / rate + verification + summary
     duration = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
     names = ", ".join(study.search.labels)
     return Answer(

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -144,3 +145,20 @@ def test_a_dry_run_counts_the_start_and_the_verification(monkeypatch: pytest.Mon
     assert command.study("smoke", dry_run=True, jobs=1).numbers["seconds"] > 1000
     in_sumo = command.study("smoke", dry_run=True, jobs=1, engine="sumo").numbers
     assert in_sumo["seconds"] < 1000, "SUMO verifies nothing that it has simulated itself"
+
+
+@pytest.mark.slow
+def test_a_dry_run_counts_the_summary_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In which the original vehicle drives once more: here it takes 100 s, and the start 2 s."""
+    now = [0.0]
+
+    def take_time(system: System) -> None:
+        now[0] += 100
+
+    clock = SimpleNamespace(monotonic=lambda: now[0], process_time=lambda: 2.0)
+    monkeypatch.setattr(command, "time", clock)
+    monkeypatch.setattr(command, "why_no_verdict", take_time)
+    monkeypatch.setattr(command, "measure_speed", lambda *arguments: 1e9)
+    monkeypatch.setattr(command, "measure_verification", lambda *arguments: 0.0)
+    seconds = command.study("smoke", dry_run=True, jobs=1).numbers["seconds"]
+    assert seconds == pytest.approx(102, abs=1e-3)
