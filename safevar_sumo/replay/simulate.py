@@ -21,7 +21,6 @@ from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName, Range
-from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -31,6 +30,7 @@ from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
+from safevar_sumo.replay.safer import rises_again, why_safer
 from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
@@ -417,7 +417,7 @@ def _sweep(
         )
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
-    if len(names) == 1 and _rises_again(frame, names[0], characteristics):
+    if len(names) == 1 and rises_again(frame, names[0], characteristics):
         remarks.append(
             "The safety degree does not fall steadily along this sweep: it rises again further"
             " from the original value. The driving system decides only once per frame, so a weaker"
@@ -442,19 +442,6 @@ def _original_in_words(system: System, evaluations: Evaluations) -> str:
     points = len(system.matrix)
     worst = f", in the worst of {points} test cases" if points > 1 else ""
     return f"The original vehicle{where} {ending}{worst}."
-
-
-def _rises_again(frame: pd.DataFrame, name: str, characteristics: CharacteristicSet) -> bool:
-    """Whether the safety degree rises and falls with the distance from the original value, on one
-    of its sides.
-    """
-    original = characteristics.original[characteristics.names.index(name)]
-    for side in (frame[frame[name] <= original], frame[frame[name] >= original]):
-        degrees = side.sort_values(name)[SAFETY_DEGREE].dropna()
-        steps = np.sign(np.diff(degrees))
-        if (steps > 0).any() and (steps < 0).any():
-            return True
-    return False
 
 
 def _remark_table(remarks: list[str]) -> pd.DataFrame:
@@ -507,7 +494,7 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
         verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
 
     # Why it looks safer, and why a search leaves this encounter out.
-    verdict += _why_safer(simulation)
+    verdict += why_safer(simulation)
     if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
         verdict.append(f"Here {NOT_SAFE}: at least {least:.2f} m.")
     return verdict
@@ -531,46 +518,6 @@ def _safety_comparison(simulation: Simulation) -> str:
     if degree == original:
         return "both are equally safe"
     return f"the changed vehicle is {'less safe' if degree < original else 'safer'}"
-
-
-def _why_safer(simulation: Simulation) -> list[str]:
-    """Why a changed vehicle has a higher safety degree than an original that does not collide, in a
-    sentence; none if it has not, or if neither pedals nor frames explain it.
-    """
-    gain = simulation.metrics[SAFETY_DEGREE] - simulation.original.metrics[SAFETY_DEGREE]
-    if not (gain > 0 and simulation.original.metrics[SAFETY_DEGREE] > 0):
-        return []
-
-    # Where and how fast each begins to brake, and how hard its driving system brakes.
-    runs = simulation.pair.runs
-    trace = runs.trace
-    rows = range(len(simulation.pair.evaluations))
-    onsets = [brake_onset(runs, row) for row in rows]
-    if None in onsets:
-        return []
-    gaps = [float(trace.gap[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
-    speeds = [float(trace.speed[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
-    brakes = [float(np.max(trace.brake[trace.active[:, row], row])) for row in rows]
-    if brakes[-1] > brakes[0]:
-        return [
-            "The driving system brakes the changed vehicle harder: with up to"
-            f" {100 * brakes[-1]:.0f} instead of {100 * brakes[0]:.0f} % of the pedal."
-        ]
-    if round(speeds[-1], 2) < round(speeds[0], 2):
-        return [
-            f"The changed vehicle arrives more slowly: it begins to brake at {speeds[-1]:.2f}"
-            f" instead of {speeds[0]:.2f} m/s."
-        ]
-
-    # A frame moves the start of braking by up to the way that the vehicle covers in it.
-    way = max(speeds) * trace.step
-    if not 0 < gaps[-1] - gaps[0] <= way:
-        return []
-    return [
-        f"It begins to brake {gaps[-1] - gaps[0]:.2f} m earlier, which is less than a frame: the"
-        f" driving system decides once in {trace.step:g} s, in which the vehicle travels"
-        f" {way:.2f} m. So this gain does not show that the change helps."
-    ]
 
 
 def _remarks(system: System) -> list[str]:
