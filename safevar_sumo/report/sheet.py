@@ -137,7 +137,7 @@ def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
         return f"at least {item.lower:.10g}{unit}, the smallest tested value"
     if not ends and item.original == item.lower:
         return f"at most {item.upper:.10g}{unit}, the greatest tested value"
-    return " and ".join(ends) or f"any tested value: {_domain_in_words(item)}"
+    return " and ".join(ends) or f"{_domain_in_words(item)}, as tested"
 
 
 def _domain_in_words(item: Characteristic) -> str:
@@ -146,7 +146,7 @@ def _domain_in_words(item: Characteristic) -> str:
 
 def _tests_in_words(phrase: str) -> str:
     """A phrase of a scope as what happens in Euro NCAP's tests: `an adult crosses from the far
-    side, at 10 to 40 km/h`.
+    side; this vehicle drives at 10 to 40 km/h`.
     """
     # The phrase has the scenario, the names of its tests in brackets, and their speeds.
     tests, _, speeds = phrase.partition(" (")[2].partition(")")
@@ -154,7 +154,7 @@ def _tests_in_words(phrase: str) -> str:
     if not TESTS.keys() >= set(names):
         return phrase
     words = join_phrases(TESTS[name].words for name in names)
-    return words + speeds.replace(" at ", ", at ")
+    return words + speeds.replace(" at ", "; this vehicle drives at ")
 
 
 def _own_limit(by_value: Answer) -> JsonObject:

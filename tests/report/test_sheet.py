@@ -93,13 +93,13 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         blank = f"________{item.suffix}"
         assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
     for words in (
-        "Valid only for the simulated vehicle of the study wear, named below: for no other car.",
+        "Valid only for the vehicle that the study wear simulates, and for no other car.",
         "do what the last column says, measure this item again and enter the new value.",
         "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
         "The driving system must stay off as long as a value is missing or beyond its limit.",
         "The workshop enters every value except those marked “operator”,",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
-        " near side, hidden by parked cars, at 10 to 40 km/h;"
+        " near side, hidden by parked cars; this vehicle drives at 10 to 40 km/h;"
         "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
         "Weather and lightweather wet (friction 0.71, water 1 mm), by day",
         "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these",
@@ -124,7 +124,7 @@ def test_a_limit_has_one_side_if_the_original_is_at_an_end_of_the_domain() -> No
         answer_of(rows=[("treadDepth", 1.6, 8.0, ""), ("payloadCentre", 1.2, 3.2, "")])
     )
     assert "at least 1.6 mm, the smallest tested value" in sheet
-    assert "any tested value: 1.2 to 3.2 m" in sheet
+    assert "1.2 to 3.2 m, as tested" in sheet
 
 
 def test_a_clearance_is_claimed_only_with_one_parameter_set() -> None:
