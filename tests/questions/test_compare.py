@@ -127,7 +127,7 @@ VERSIONS = {
     ),
     "slower": (
         {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.15}}}},
-        "limits of one characteristic alone that shrink",
+        "limits of single characteristics that shrink",
         "",
     ),
 }
@@ -185,7 +185,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
     )
     answer = sv.compare(wear, early, samples=16, pool=POOL)
     assert answer.numbers["better_in"] > 0 == answer.numbers["worse_in"]
-    assert "Not enough evidence that " in answer.verdict
+    assert "not enough evidence that " in answer.verdict
     assert "Needless braking was not measured" in answer.verdict
     assert answer.numbers["b_needless_braking"] is None
     assert answer.numbers["metres_earlier"] > 0

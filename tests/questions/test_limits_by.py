@@ -250,7 +250,7 @@ def test_the_verdict_says_up_to_which_speed_a_worn_car_may_drive(
     """
     reach = answer.numbers["up_to"]
     assert (
-        "On a wet road with brakeTorque at least 0.55, all others as in the original: up to"
+        "In wet weather with brakeTorque at least 0.55, all others as in the original: up to"
         f" {reach:g} km/h." in (answer.verdict)
     )
     kept = [row["by_speed"] for row in rows_of(answer) if row["kept"]]

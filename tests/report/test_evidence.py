@@ -161,7 +161,7 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
             str(slippery) if word == "results/slippery" else word for word in command.split()[3:]
         ]
         assert answer == json_of(*words), "the page's answer is the command's"
-    shares = re.search(r"(\d+) different vehicles in all", page)
+    shares = re.search(r"(\d+) different vehicles\.", page)
     assert shares is not None
     assert int(shares[1]) == len(load(slippery).evaluations), "the page is about the whole search"
 

@@ -463,7 +463,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_all_of_it_is_of_the_point(results: Path) -> None:
     page = page_of(results, ask=["rules --samples 20"], jobs=1, point=DAY)
-    assert f"only at the point {DAY} of its matrix" in page
+    assert f"only the test case {DAY} of its matrix" in page
     (whole,) = load_cases([results])
     assert f" --point &#39;{DAY}&#39;" in page
     worst = re.findall(

@@ -295,7 +295,7 @@ def _sentences(
     unsafe = search.unsafe
     points = search.evaluator.system.points
     names = dict.fromkeys(point.weather.name.replace("_", " ") for point in points)
-    where = f"{rough_in_words(search.budget)}In the weather {' or '.join(names)}"
+    where = f"{rough_in_words(search.budget)}In {' or '.join(names)} weather"
     if search.limits and search.budget:
         what = join_phrases(_limit_texts(search))
         yield f"{where} with {what}, all others as in the original: up to {_text(by, reach.value)}."

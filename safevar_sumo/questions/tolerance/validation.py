@@ -88,13 +88,23 @@ class Validator:
         """Numbers of the models in which earlier boxes failed: these come first."""
 
     def validate(self, box: Box, attempt: int) -> Validation:
-        """Test some corners of a box where earlier ones failed, and falsify it in all models."""
-        corners = self._corners(box, attempt)[:FIRST_CORNERS]
-        with self.evaluator.stage(VALIDATION_STAGE, len(corners) + self.budget):
-            tested = self._test_corners(corners, self._failing)
+        """Test some corners of a box where earlier ones failed, and falsify it in all models.
+
+        In a study that searches its scenario all corners are tested: few encounters break a box,
+        and the search of the next one has to know them.
+        """
+        corners = self._corners(box, attempt)
+        first = corners[:FIRST_CORNERS]
+        is_searched = len(box.region.characteristics.scenario) > 0
+        total = self.budget + len(corners if is_searched else first)
+        with self.evaluator.stage(VALIDATION_STAGE, total):
+            tested = self._test_corners(first, self._failing)
             if tested.failures:
                 return Validation(box, tested.failures)
-            return self._falsify(box, corners, tested.robustness, attempt)
+            validation = self._falsify(box, first, tested.robustness, attempt)
+            if is_searched and not validation.failures:
+                tested = self._test_corners(corners, [0])
+            return validation._replace(failures=validation.failures or tested.failures)
 
     def complete(self, validation: Validation, attempt: int) -> Validation:
         """Test a box that is to be printed with all that it has to pass beside `validate`; the
