@@ -37,9 +37,10 @@ class NarrowedJudge:
         self._may_narrow = not len(model.evaluator.characteristics.scenario)
 
     def __call__(self, settings: FloatArray) -> FloatArray:
-        """What each of M settings leaves, shape (M,), see `Model.robustness`; where it did not meet
-        all points, at most more than it really leaves.
+        """What each of M settings leaves, shape (M,), see `Model.robustness`; one that did not meet
+        all points may leave less.
         """
+        # Two calls cost more than one if the worst points are most of them.
         is_narrow = 2 * len(self._worst) < len(self._model.evaluator.system.points)
         if not self._worst or not is_narrow:
             return self._judge_at_all_points(settings)
