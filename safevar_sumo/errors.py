@@ -75,6 +75,11 @@ class InputError(SafevarError):
         return f"{message}\nexpected: {self.legal}" if self.legal else message
 
 
+def missing_extra(source: object, problem: str, extra: str) -> InputError:
+    """The error that an extra of this package is not installed."""
+    return InputError(source, problem, f"in the checkout: pip install '.[{extra}]'")
+
+
 class UserCodeError(InputError):
     """User code that a study names failed or returned an illegal value; `place` is its file and
     line, "" if they are unknown.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import missing_extra
 from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
 from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation, Quantity
 
@@ -149,8 +149,7 @@ def library(model: str, extra: str, module: str) -> Any:
     try:
         return import_module(module)
     except ImportError:
-        where = f"in the checkout: pip install '.[{extra}]'"
-        raise InputError("", f"ads.model = {model!r} needs {extra}", where) from None
+        raise missing_extra("", f"ads.model = {model!r} needs {extra}", extra) from None
 
 
 class PerVehicleAds(Ads):

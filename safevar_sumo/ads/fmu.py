@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
-from safevar_sumo.errors import InputError, check_name, unknown_name
+from safevar_sumo.errors import InputError, check_name, missing_extra, unknown_name
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.study.schema import ModelTable
@@ -70,9 +70,7 @@ class Fmu:
             extract(path, self._folder.name)
             self._model: Any = read_model_description(self._folder.name, validate=False)
         except ImportError:
-            raise InputError(
-                "", f"{path} needs FMPy", "in the checkout: pip install '.[fmu]'"
-            ) from None
+            raise missing_extra("", f"{path} needs FMPy", "fmu") from None
         except Exception as error:  # any error of FMPy about a user's file
             raise InputError(
                 "", f"{table.model}: {type(error).__name__}: {error}", expected

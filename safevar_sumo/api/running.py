@@ -7,13 +7,11 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import RunKey, algorithm_of, all_runs, problem_of, run_campaign
+from safevar_sumo.campaign import RunKey, all_runs, check_search, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import MAX_BATCH, InputError, about, check_text, check_whole, warn
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.errors import MAX_BATCH, InputError, check_text, check_whole, warn
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
-from safevar_sumo.records import Evaluations
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.system import System
@@ -120,17 +118,5 @@ def load_for_search(study: StudyLike) -> tuple[Study, System]:
         If one of its names or parameters cannot be used.
     """
     loaded_study, system = load_and_assemble(study)
-    characteristics = system.characteristics
-    search = loaded_study.search
-    if search.population > search.evaluations:
-        excess = (
-            f"search.population = {search.population} is more than search.evaluations ="
-            f" {search.evaluations}"
-        )
-        raise InputError(loaded_study.source, excess, "a run of at least one population")
-    problem = problem_of(loaded_study, system, Evaluations.none(len(characteristics), METRICS))
-    for name in loaded_study.search.labels:
-        algorithm = algorithm_of(name, loaded_study)
-        with about(loaded_study.source):
-            algorithm.try_out(problem)
+    check_search(loaded_study, system)
     return loaded_study, system

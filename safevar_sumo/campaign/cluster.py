@@ -11,7 +11,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from typing import Any
 
-from safevar_sumo.errors import InputError, SafevarError, describe_error
+from safevar_sumo.errors import InputError, SafevarError, describe_error, missing_extra
 from safevar_sumo.plugins.process import this_process
 
 CLUSTER = (
@@ -35,9 +35,7 @@ def connect(address: str) -> Iterator[Any]:
     try:
         from distributed import Client
     except ImportError:
-        raise InputError(
-            "cluster", "Dask is not installed", "in the checkout: pip install '.[cluster]'"
-        ) from None
+        raise missing_extra("cluster", "Dask is not installed", "cluster") from None
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # this package reports errors itself
     try:

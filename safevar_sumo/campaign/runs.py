@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, about, unknown_name
+from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.results import FailedSetting, Journal, failed_settings, run_name
@@ -106,6 +107,28 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
         algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
         return algorithm
+
+
+def check_search(study: Study, system: System) -> None:
+    """Refuse a study that cannot be searched.
+
+    Raises
+    ------
+    InputError
+        If a run has less evaluations than a population, or an algorithm cannot be used.
+    """
+    search = study.search
+    if search.population > search.evaluations:
+        excess = (
+            f"search.population = {search.population} is more than search.evaluations ="
+            f" {search.evaluations}"
+        )
+        raise InputError(study.source, excess, "a run of at least one population")
+    problem = problem_of(study, system, Evaluations.none(len(system.characteristics), METRICS))
+    for name in search.labels:
+        algorithm = algorithm_of(name, study)
+        with about(study.source):
+            algorithm.try_out(problem)
 
 
 def problem_of(study: Study, system: System, original: Evaluations) -> Problem:

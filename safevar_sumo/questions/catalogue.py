@@ -283,12 +283,17 @@ def check(
     """
     if name.endswith(".xosc"):
         return check_scenario(name, ego or "Ego", FINDINGS)
-    from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check  # loads SUMO
+    # What loads SUMO is imported where it is needed.
+    from safevar_sumo.campaign import check_search
+    from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check
+    from safevar_sumo.sumo.system import assemble
 
     study = study_to_check(name)
     extents: list[Extent] = []
     with open_progress(True) as progress:
         findings = check_study(study, vehicles=vehicles, progress=progress, tell=extents.append)
+    if not findings:
+        check_search(study, assemble(study))  # what the command `study` would refuse
     rows = [
         (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
         for item in findings

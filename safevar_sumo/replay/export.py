@@ -22,7 +22,8 @@ from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
-from safevar_sumo.sumo.network import NetworkFiles, built_network, run_program
+from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.sumo.network import NetworkFiles, built_network, program_of_sumo, run_program
 from safevar_sumo.sumo.system import assemble
 
 ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
@@ -140,16 +141,29 @@ def poses_of(comparison: Comparison) -> list[Poses]:
 
 
 def open_drive(network: NetworkFiles) -> str:
-    """The network as OpenDRIVE 1.4, by netconvert, without the time of the conversion.
+    """The network as OpenDRIVE 1.4: of a shipped network the file beside it, of others by
+    netconvert.
 
     Raises
     ------
     EnvironmentFault
         If netconvert fails.
+    InputError
+        If it is not installed.
     """
+    if network.folder.parent == NETWORKS and not network.lane_changes:
+        return network.path(ROAD).read_text(encoding="utf-8")
+    return converted(network)
+
+
+def converted(network: NetworkFiles) -> str:
+    """The network as OpenDRIVE 1.4, by netconvert, without the time of the conversion; raises the
+    errors of `open_drive`.
+    """
+    netconvert = program_of_sumo("netconvert", f"an export of {network.folder}")
     with temporary_folder() as folder:
         arguments = ("-s", str(built_network(network)), "--opendrive-output", ROAD, "-o", "net.xml")
-        exit_code, errors = run_program(Path(folder), "netconvert", *arguments)
+        exit_code, errors = run_program(Path(folder), netconvert, *arguments)
         if exit_code != 0:
             raise EnvironmentFault(f"{network.folder}: netconvert writes no OpenDRIVE: {errors}")
         root = ElementTree.parse(Path(folder) / ROAD).getroot()

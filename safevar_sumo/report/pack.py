@@ -18,7 +18,7 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
-from safevar_sumo.results.manifest import PACKAGES, SIMULATORS
+from safevar_sumo.results.manifest import PACKAGES
 
 DESCRIPTION = "pack.json"
 MAX_BYTES = 1_000_000_000
@@ -118,7 +118,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         )
 
     # Results of other versions may differ.
-    here = {name: version(name) for name in ("safevar_sumo", *SIMULATORS)}
+    here = {name: version(name) for name in ("safevar_sumo", "libsumo")}
     other = [
         f"{name} {described.versions.get(name)}"
         for name in here

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,17 @@ FORMAT = 5
 RESULTS = 10
 """Version number of the package's results, raised whenever they change (enforced by tests/golden).
 """
-LIBRARIES = {"ad_rss": ("ad-rss",), "highway_idm": ("highway-env",)}
-"""Packages of shipped driving systems, named in the manifest of a study that they drive."""
-SIMULATORS = ("libsumo", "eclipse-sumo", *sum(LIBRARIES.values(), ()))
+PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")
+"""Packages that every study uses."""
+LIBRARIES = {"ad_rss": "ad-rss", "highway_idm": "highway-env", "fmu": "fmpy"}
+"""Packages of extras by the driving system, or the kind of one, that needs them."""
+SIMULATORS = ("libsumo", *LIBRARIES.values())
 """Packages on whose versions a single simulation depends."""
-PACKAGES = ("safevar_sumo", *SIMULATORS, "deap", "numpy")
 PYMOO_PACKAGES = ("pymoo", "cma")
-"""Packages on whose versions the searches of pymoo depend, named in the manifest of a study that
-has some.
+"""Packages on whose versions the searches of pymoo depend."""
+NOT_ALWAYS_NAMED = ("eclipse-sumo", *LIBRARIES.values(), *PYMOO_PACKAGES)
+"""Packages that manifests of earlier releases name in every study, or only where it has searches of
+pymoo.
 """
 IDENTITY = {
     "study": "the same study and options",
@@ -160,20 +164,22 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
         Inputs of the results besides the study file, by `IDENTITY`; see
         `safevar_sumo.campaign.identity.identity_of`.
     """
-    has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     return {
         "format": FORMAT,
         "study": tables_of(study),
         **identity,
-        "versions": {
-            name: version(name)
-            for name in (
-                *PACKAGES,
-                *(PYMOO_PACKAGES if has_pymoo else ()),
-                *LIBRARIES.get(study.ads.model, ()),
-            )
-        },
+        "versions": {name: version(name) for name in packages_of(study)},
     }
+
+
+def packages_of(study: Study) -> tuple[str, ...]:
+    """The packages that a study uses, and on whose versions its results depend; those of pymoo only
+    where it is installed, as no question about the study needs it.
+    """
+    has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
+    has_pymoo = has_pymoo and find_spec("pymoo") is not None
+    libraries = [LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES]
+    return (*PACKAGES, *libraries, *(PYMOO_PACKAGES if has_pymoo else ()))
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
@@ -208,7 +214,7 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
     """
     for layer, inputs in identity_in(now).items():
         for key, before, after in changed_values(identity_in(stored)[layer], inputs):
-            if key in PYMOO_PACKAGES and None in (before, after):
+            if key in NOT_ALWAYS_NAMED and None in (before, after):
                 continue
             if layer == "files":
                 change = "is new" if before is None else "has changed since"

@@ -81,9 +81,11 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
 
-        # A directory that an earlier version began keeps its journals' format.
+        # A directory that an earlier version began keeps its journals' format, and the packages
+        # that it names, as the journals' heads have a digest of both.
         make_directory(path)
         earlier_manifest = self._earlier_manifest()
+        self.manifest["versions"] = earlier_manifest.get("versions", {}) | self.manifest["versions"]
         if not earlier_manifest or JOURNALS in earlier_manifest:
             self.manifest[JOURNALS] = JOURNAL_FORMAT
 

@@ -21,6 +21,7 @@ from safevar_sumo.errors import (
     UserCodeError,
     check_name,
     describe_error,
+    missing_extra,
 )
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -364,7 +365,7 @@ def _class_of(name: str) -> Any:
         from pymoo.config import Config
     except ImportError:
         problem = "pymoo, the library of search algorithms, is not installed"
-        raise InputError(name, problem, "in the checkout: pip install '.[pymoo]'") from None
+        raise missing_extra(name, problem, "pymoo") from None
     Config.warnings["not_compiled"] = False
     from pymoo.functions import FunctionLoader
 

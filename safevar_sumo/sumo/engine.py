@@ -14,10 +14,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout, suppress
 from enum import StrEnum
 from io import StringIO
-from pathlib import Path
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
-from safevar_sumo.sumo.network import CopiedNetwork, NetworkFiles, options_in, varied_network
+from safevar_sumo.sumo.network import (
+    CopiedNetwork,
+    NetworkFiles,
+    options_in,
+    program_of_sumo,
+    varied_network,
+)
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 CONNECTION_ATTEMPTS = 15
@@ -94,7 +99,7 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
     Raises
     ------
     InputError
-        If there is no display.
+        If there is no display, or the extra `sumo` is not installed.
     SimulationError
         If sumo-gui fails, or its window is closed.
     """
@@ -104,7 +109,7 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
         raise InputError(
             "gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment"
         )
-    import sumo
+    program = program_of_sumo("sumo-gui", "gui")
 
     # The window opens with the first step.
     api = traci_api()
@@ -114,10 +119,7 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
             warnings.catch_warnings(),
         ):  # traci prints that it waits for SUMO
             warnings.simplefilter("ignore")
-            api.start(
-                [str(Path(sumo.SUMO_HOME) / "bin" / "sumo-gui"), *options],
-                numRetries=CONNECTION_ATTEMPTS,
-            )
+            api.start([program, *options], numRetries=CONNECTION_ATTEMPTS)
         yield api
 
 

@@ -2,16 +2,17 @@
 and unconnected.
 
 A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network
-(`.net.xml`); its traffic, and SUMO's options. The user's cache folder keeps the built network and
-the copies, in folders named by the content of the sources.
+(`.net.xml`); its traffic, and SUMO's options. Shipped networks have both, and are used as built, so
+that only a user's recipe needs netconvert (extra `sumo`). The user's cache folder keeps the network
+that netconvert built and the copies, in folders named by the content of the sources.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
-from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean
+from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean, missing_extra
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges
@@ -44,6 +45,16 @@ SOURCE_OPTION = re.compile(
 )
 """Options of netconvert, and of SUMO beside the network and its traffic, that name files to read.
 """
+LOAD = """
+import sys, libsumo
+try:
+    libsumo.start(["sumo", *sys.argv[1:]])
+    libsumo.simulationStep(1.0)
+    libsumo.close()
+except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+    sys.exit(f"Error: {error}")
+"""
+"""A program that loads a network in SUMO and simulates its first second."""
 DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
 """Numbers of characters of a digest, and of a program's message, that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
@@ -53,9 +64,10 @@ Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 class NetworkFiles(NamedTuple):
     """A network as its files are now.
 
-    `roads_file` is the recipe or the built network; `digests` are those of `roads_file`, the
-    recipe's sources, traffic, options and the files that they add, by file name. A scenario's
-    parameters change its lanes once it is built, and its traffic.
+    `roads_file` is the built network, or the recipe that netconvert builds it from; `digests` are
+    those of the recipe and its sources or, without a recipe, of the built network, and of traffic,
+    options and the files that they add, by file name. A scenario's parameters change its lanes once
+    it is built, and its traffic.
     """
 
     folder: Path
@@ -69,7 +81,7 @@ class NetworkFiles(NamedTuple):
 
     @property
     def is_built(self) -> bool:
-        """Whether the user built the network; otherwise netconvert builds it."""
+        """Whether the network is there as it was built; otherwise netconvert builds it."""
         return self.roads_file.endswith(NETWORK_ENDING)
 
 
@@ -100,9 +112,8 @@ def open_network(network: str) -> NetworkFiles:
     for name in names:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
-    return NetworkFiles(
-        folder, roads_file, tuple((name, _digest((folder / name).read_bytes())) for name in names)
-    )
+    digests = tuple((name, _digest((folder / name).read_bytes())) for name in names)
+    return NetworkFiles(folder, NETWORK_FILE if is_shipped(network) else roads_file, digests)
 
 
 def is_shipped(network: str) -> bool:
@@ -179,7 +190,8 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
     Raises
     ------
     InputError
-        If a source is not XML, netconvert refuses the sources, or an element cannot be copied.
+        If a source is not XML, netconvert refuses the sources or is not installed, or an element
+        cannot be copied.
     EnvironmentFault
         If netconvert fails for another reason, or the cache cannot be written.
     """
@@ -197,7 +209,7 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
         with about(traffic_file):
             write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE)
 
-    roads = cache_folder_name(network, size, _road_digests(network))
+    roads = cache_folder_name(network, size, road_digests(network))
     traffic = cache_folder_name(
         network, n, [dict(network.digests)[TRAFFIC_FILE], repr(network.traffic_changes)]
     )
@@ -224,8 +236,8 @@ def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
 
 
 def built_network(network: NetworkFiles) -> Path:
-    """The file of the network, which netconvert or the user built, with its changes; raises the
-    errors of `copied_network`.
+    """The file of the network, which netconvert builds unless it is there, with its changes; raises
+    the errors of `copied_network`.
     """
     # A built network without changed lanes is used as it is.
     original = network._replace(lane_changes=(), traffic_changes=())
@@ -239,7 +251,7 @@ def built_network(network: NetworkFiles) -> Path:
         else:
             _run_netconvert(network, into / NETWORK_FILE)
 
-    return ensure_cached(cache_folder_name(network, 0, _road_digests(network)), NETWORK_FILE, build)
+    return ensure_cached(cache_folder_name(network, 0, road_digests(network)), NETWORK_FILE, build)
 
 
 @cache
@@ -250,7 +262,7 @@ def number_of_lanes(network: NetworkFiles) -> int:
 
 @cache
 def sumo_version() -> str:
-    return version("eclipse-sumo")
+    return version("libsumo")
 
 
 def cache_folder_name(network: NetworkFiles, n: int, digests: Sequence[str]) -> str:
@@ -261,19 +273,39 @@ def cache_folder_name(network: NetworkFiles, n: int, digests: Sequence[str]) -> 
     return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
 
 
-def run_program(folder: Path, program: str, *arguments: str) -> tuple[int, str]:
-    """Run a program of SUMO in a folder; return its exit code, and its errors and warnings."""
-    import sumo
+def program_of_sumo(name: str, source: object) -> str:
+    """The path of a program of SUMO, which a source needs.
 
-    # The program's messages on one line.
+    Raises
+    ------
+    InputError
+        If the extra `sumo` is not installed.
+    """
+    try:
+        import sumo
+    except ImportError:
+        raise missing_extra(source, f"needs SUMO's program {name}", "sumo") from None
+    return str(Path(sumo.SUMO_HOME) / "bin" / name)
+
+
+def load_in_sumo(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Load a network in a SUMO process of its own, as some crash SUMO, and simulate a second;
+    return its exit code, and its errors and warnings.
+    """
+    return run_program(folder, sys.executable, "-P", "-c", LOAD, *arguments)
+
+
+def run_program(folder: Path, *command: str) -> tuple[int, str]:
+    """Run a program of SUMO in a folder; return its exit code, and its errors and warnings on one
+    line.
+    """
     process = subprocess.run(
-        [str(Path(sumo.SUMO_HOME) / "bin" / program), *arguments, "--xml-validation", "never"],
+        [*command, "--xml-validation", "never"],
         capture_output=True,
         text=True,
         errors="replace",
         check=False,
         cwd=folder,
-        env={**os.environ, "SUMO_HOME": sumo.SUMO_HOME},
     )
     lines = [
         line.strip()
@@ -294,24 +326,20 @@ def _code_digest() -> str:
     )
 
 
-def _road_digests(network: NetworkFiles) -> list[str]:
+def road_digests(network: NetworkFiles) -> list[str]:
+    """Digests of a network's roads: of its sources, the file as it was built, and its changes."""
     digests = [
         digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)
     ]
+    if network.is_built:
+        digests.append(_digest(network.path(network.roads_file).read_bytes()))
     return [*digests, repr(network.lane_changes)]
 
 
 def _run_netconvert(network: NetworkFiles, file: Path) -> None:
-    exit_code, errors = run_program(
-        network.folder,
-        "netconvert",
-        "-c",
-        network.roads_file,
-        "-o",
-        str(file),
-        "--no-warnings",
-        "true",
-    )
+    netconvert = program_of_sumo("netconvert", network.path(network.roads_file))
+    arguments = ("-c", network.roads_file, "-o", str(file), "--no-warnings", "true")
+    exit_code, errors = run_program(network.folder, netconvert, *arguments)
     if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
         raise EnvironmentFault(
             f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}"

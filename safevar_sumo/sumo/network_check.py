@@ -25,9 +25,9 @@ from safevar_sumo.sumo.network import (
     cache_folder_name,
     copied_network,
     is_shipped,
+    load_in_sumo,
     open_network,
     options_in,
-    run_program,
 )
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
@@ -297,10 +297,8 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     own = own_options(options_in(network.path(OPTIONS_FILE)))
-    only_load = ("--begin", "0", "--end", "1", "--no-step-log", "true")
-    exit_code, messages = run_program(
-        network.folder, "sumo", *files, *only_load, *as_arguments(own)
-    )
+    only_load = ("--begin", "0", "--no-step-log", "true")
+    exit_code, messages = load_in_sumo(network.folder, *files, *only_load, *as_arguments(own))
     if exit_code != 0:
         problem = (
             f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"

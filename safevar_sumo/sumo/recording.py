@@ -34,6 +34,7 @@ from safevar_sumo.sumo.network import (
     network_for,
     open_network,
     options_in,
+    road_digests,
     sumo_version,
 )
 from safevar_sumo.sumo.world import Api, SumoWorld, direction_of
@@ -162,7 +163,8 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
     network = network_for(scenario)
     if scenario.is_user_code:
         return _play(scenario, network, step)
-    inputs = (type(scenario).__name__, to_builtins(scenario), network.digests, step)
+    files = (network.digests, road_digests(network))
+    inputs = (type(scenario).__name__, to_builtins(scenario), files, step)
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
     def build(folder: Path) -> None:

@@ -30,7 +30,14 @@ from safevar_sumo.results import (
     row_of_handle,
     solutions_frame,
 )
-from safevar_sumo.results.manifest import identity_digest, manifest_differences, read_manifest
+from safevar_sumo.results.manifest import (
+    identity_digest,
+    identity_in,
+    manifest_differences,
+    manifest_of,
+    packages_of,
+    read_manifest,
+)
 from safevar_sumo.study import Study, tables_of
 from tests.campaign.formulas import with_search
 from tests.in_process import json_of, refused, run
@@ -147,6 +154,35 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         assert identity_digest(directory.manifest) == identity_digest(
             ResultsDirectory(tmp_path, study).manifest
         )
+
+
+def test_results_that_name_extras_which_the_study_does_not_use_are_continued(
+    tmp_path: Path, study: Study
+) -> None:
+    """Earlier releases named them in every study."""
+    written(tmp_path, study)
+    file = tmp_path / "manifest.json"
+    stored = json.loads(file.read_text())
+    stored["versions"] |= {"eclipse-sumo": "1.28.0", "ad-rss": "5.0.0", "highway-env": "1.12"}
+    file.write_text(json.dumps(stored))
+    directory = ResultsDirectory(tmp_path, study)
+    assert identity_digest(directory.manifest) == identity_digest(stored)
+    assert not [*manifest_differences(stored, manifest_of(study, identity_in(stored)))]
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("rain", set()),
+        ("wear_rss", {"ad-rss"}),
+        ("wear_idm", {"highway-env"}),
+        ("pymoo", {"pymoo", "cma"}),
+    ],
+)
+def test_a_manifest_names_the_packages_that_its_study_uses(name: str, more: set[str]) -> None:
+    algorithms = {"algorithms": ["pymoo:NSGA3"]}
+    study = load_study("smoke", search=algorithms) if name == "pymoo" else load_study(name)
+    assert {*packages_of(study)} == {"safevar_sumo", "libsumo", "deap", "numpy", *more}
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"study": 3', "\x00"])

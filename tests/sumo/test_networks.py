@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -15,10 +16,11 @@ import sumo
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.replay.export import converted, open_drive
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
-from safevar_sumo.sumo.network import built_network, copied_network, open_network
+from safevar_sumo.sumo.network import built_network, copied_network, open_network, program_of_sumo
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
 
@@ -43,6 +45,25 @@ def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path)
     assert without_head(tmp_path / folder / "network.net.xml") == without_head(
         NETWORKS / folder / "network.net.xml"
     )
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_network_has_the_road_that_netconvert_makes_of_it(folder: str) -> None:
+    assert converted(open_network(folder)) == open_drive(open_network(folder))
+
+
+def test_without_sumos_programs_what_needs_them_says_so(
+    mine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "sumo", None)
+    with pytest.raises(InputError, match=r"netccfg: needs SUMO's program netconvert\n.*\[sumo\]"):
+        check_network(str(mine))
+    with pytest.raises(InputError, match=r"sumo-gui\n.*\[sumo\]"):
+        program_of_sumo("sumo-gui", "gui")
+    (mine / "network.netccfg").unlink()
+    check_network(str(mine))
+    with pytest.raises(InputError, match=r"an export of .*mine: needs SUMO's program netconvert\n"):
+        open_drive(open_network(str(mine)))
 
 
 def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
