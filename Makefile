@@ -4,16 +4,22 @@ RUN := .venv/bin/python
 PACKAGE := setup.cfg pyproject.toml constraints.txt
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-.PHONY: study test test-all lint docs docs-outputs pictures benchmark clean
+.PHONY: study plain test test-all test-lowest lint docs docs-outputs pictures benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
+
+plain:
+	$(PYTHON) -m tests.plain_machine
 
 test: .venv/installed-test
 	$(RUN) -m pytest
 
 test-all: test
 	$(RUN) -m pytest -m slow
+
+test-lowest: .venv/installed-lowest
+	.venv/lowest/bin/python -m pytest
 
 lint: .venv/installed-test
 	$(RUN) -m ruff check .
@@ -45,6 +51,14 @@ benchmark: .venv/installed-test
 .venv/installed-asam: tests/replay/asam.txt .venv/installed
 	$(RUN) -m venv .venv/asam
 	.venv/asam/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
+	touch $@
+
+# The lowest versions that setup.cfg allows, where it says `name >= version`.
+.venv/installed-lowest: setup.cfg
+	$(PYTHON) -m venv .venv/lowest
+	sed -n 's/^    \([A-Za-z0-9_-]*\) >= \([0-9.]*\).*/\1 == \2/p' $< > .venv/lowest/versions.txt
+	.venv/lowest/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint .venv/lowest/versions.txt --editable ".[test]"
 	touch $@
 
 .venv/installed-%: .venv/installed

@@ -1,5 +1,5 @@
 """Campaigns and commands in this process: a pool that computes at once, commands as users type
-them; and the blocks of the manual's pages.
+them.
 """
 
 from __future__ import annotations
@@ -7,7 +7,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable
@@ -24,40 +23,6 @@ from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
-
-ROOT = Path(__file__).parents[1]
-
-
-BLOCK = re.compile(
-    r'(?:^<!-- ([^\n]*) -->\n+)?^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$',
-    flags=re.DOTALL | re.MULTILINE,
-)
-
-
-class Block(NamedTuple):
-    """A fenced block of a page: the comment above it, its language, the file that it is the content
-    of, its text, and the place of the text in the page. What is not there is "".
-    """
-
-    comment: str
-    language: str
-    title: str
-    text: str
-    place: tuple[int, int]
-
-
-def blocks(page: str) -> list[Block]:
-    """The fenced blocks of a page of the manual."""
-    text = (ROOT / page).read_text(encoding="utf-8")
-    return [
-        Block(*(found or "" for found in match.groups()), match.span(4))
-        for match in BLOCK.finditer(text)
-    ]
-
-
-def files_of(*pages: str) -> dict[str, str]:
-    """The files that pages of the manual show, by their names."""
-    return {block.title: block.text for page in pages for block in blocks(page) if block.title}
 
 
 class InlinePool(Pool):

@@ -32,13 +32,12 @@ from typing import Any
 from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
-from tests.in_process import ROOT, Block, blocks
+from tests.manual import PROGRAM, ROOT, Block, blocks
 
 PAGES = [
     "README.md",
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "docs").rglob("*.md"))),
 ]
-PROGRAM = "python -m safevar_sumo "
 WIDTH = 84
 """Width of the text of an output [characters]."""
 TABLE_WIDTH = "120"

@@ -32,8 +32,8 @@ from safevar_sumo.study import (
     study_names,
 )
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import ROOT, blocks
-from tests.pages import PAGES, PROGRAM, run_page, shortened
+from tests.manual import PROGRAM, ROOT, blocks
+from tests.pages import PAGES, run_page, shortened
 
 
 @pytest.mark.slow

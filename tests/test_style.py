@@ -8,7 +8,7 @@ import ast
 from collections import defaultdict
 from collections.abc import Iterator
 
-from tests.in_process import ROOT
+from tests.manual import ROOT
 
 PACKAGE = ROOT / "safevar_sumo"
 SOURCES = {

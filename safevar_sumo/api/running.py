@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from safevar_sumo.api.simulation import load_and_assemble
-from safevar_sumo.campaign import RunKey, all_runs, check_search, run_campaign
+from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import MAX_BATCH, InputError, check_text, check_whole, warn
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
@@ -118,5 +118,5 @@ def load_for_search(study: StudyLike) -> tuple[Study, System]:
         If one of its names or parameters cannot be used.
     """
     loaded_study, system = load_and_assemble(study)
-    check_search(loaded_study, system)
+    check_algorithms(loaded_study, system)
     return loaded_study, system

@@ -21,5 +21,5 @@ from safevar_sumo.campaign.runs import (
     RunKey as RunKey,
     algorithm_of as algorithm_of,
     all_runs as all_runs,
-    check_search as check_search,
+    check_algorithms as check_algorithms,
 )

@@ -109,7 +109,7 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         return algorithm
 
 
-def check_search(study: Study, system: System) -> None:
+def check_algorithms(study: Study, system: System) -> None:
     """Refuse a study that cannot be searched.
 
     Raises

@@ -284,7 +284,7 @@ def check(
     if name.endswith(".xosc"):
         return check_scenario(name, ego or "Ego", FINDINGS)
     # What loads SUMO is imported where it is needed.
-    from safevar_sumo.campaign import check_search
+    from safevar_sumo.campaign import check_algorithms
     from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check
     from safevar_sumo.sumo.system import assemble
 
@@ -293,7 +293,7 @@ def check(
     with open_progress(True) as progress:
         findings = check_study(study, vehicles=vehicles, progress=progress, tell=extents.append)
     if not findings:
-        check_search(study, assemble(study))  # what the command `study` would refuse
+        check_algorithms(study, assemble(study))  # what the command `study` would refuse
     rows = [
         (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
         for item in findings

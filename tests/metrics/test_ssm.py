@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sumolib
 
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import Encounter, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import MetricsTable
+from safevar_sumo.sumo.network import program_of_sumo
 from tests.made_up import made_up_runs
 
 RUNS = 50
@@ -74,7 +74,7 @@ def simulate(
     )
     for name, *words in (net, run.split()):
         subprocess.run(
-            [sumolib.checkBinary(name), *words], cwd=folder, check=True, capture_output=True
+            [program_of_sumo(name, "test"), *words], cwd=folder, check=True, capture_output=True
         )
     rows: Rows = defaultdict(dict)
     for step in ET.parse(folder / "fcd.xml").getroot():

@@ -13,7 +13,7 @@ from safevar_sumo import openscenario
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import open_file, play
 from safevar_sumo.openscenario.expressions import evaluate, literal
-from tests.in_process import ROOT
+from tests.manual import ROOT
 from tests.openscenario.writing import (
     AT_ONCE,
     EGO,

@@ -13,7 +13,7 @@ from scipy.integrate import quad
 
 from safevar_sumo.openscenario import play
 from safevar_sumo.openscenario.road import read_network
-from safevar_sumo.sumo.network import run_program
+from safevar_sumo.sumo.network import program_of_sumo, run_program
 from tests.openscenario.writing import ROAD, STRAIGHT, at, private, speed, teleport, world, write
 
 BEND = """<geometry s="0" x="300" y="-40" hdg="0.5" length="100"><line/></geometry>
@@ -76,8 +76,9 @@ def test_lanes_are_where_netconvert_has_them(
     """
     (tmp_path / "road.xodr").write_text(ROAD.format(length=length, geometry=geometry))
     options = ("--offset.disable-normalization", "--output.original-names", "--precision", "6")
+    netconvert = program_of_sumo("netconvert", "test")
     code, errors = run_program(
-        tmp_path, "netconvert", "--opendrive-files", "road.xodr", *options, "-o", "net.xml"
+        tmp_path, netconvert, "--opendrive-files", "road.xodr", *options, "-o", "net.xml"
     )
     assert code == 0, errors
     road = read_network(str(tmp_path / "road.xodr")).road("1")

@@ -12,7 +12,8 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.plugins.check import check_study, study_to_check, trials
-from tests.in_process import files_of, json_of, run
+from tests.in_process import json_of, run
+from tests.manual import files_of
 
 SCALAR = """import random
 import time

@@ -21,7 +21,8 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import files_of, json_of, run, searched
+from tests.in_process import json_of, run, searched
+from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
 

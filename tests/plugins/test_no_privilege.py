@@ -28,8 +28,9 @@ from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import ROOT, InlinePool, searched
+from tests.in_process import InlinePool, searched
 from tests.made_up import drawn
+from tests.manual import ROOT
 
 BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
 """A study with each scenario; all others are driven by the car of `wear`."""

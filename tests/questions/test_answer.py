@@ -24,7 +24,8 @@ from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabula
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.words import list_of_changes
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, files_of, refused, run
+from tests.in_process import InlinePool, refused, run
+from tests.manual import files_of
 
 COLUMNS = {
     "part": Column("", "part of the vehicle"),

@@ -29,7 +29,8 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import at_point, drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from tests.in_process import ROOT, InlinePool, files_of, refused, run
+from tests.in_process import InlinePool, refused, run
+from tests.manual import ROOT, files_of
 from tests.questions.conftest import made_up_study
 
 SEARCHED = """

@@ -26,7 +26,7 @@ from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, Origin, Study, limits_of, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import ROOT
+from tests.manual import ROOT
 
 SUN = read_study("sun").vehicle.characteristics
 ALL_FIXED = "".join(

@@ -55,6 +55,7 @@ def test_a_network_has_the_road_that_netconvert_makes_of_it(folder: str) -> None
 def test_without_sumos_programs_what_needs_them_says_so(
     mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    rewritten(mine / "network.edg.xml", 'width="4"', 'width="3.9"')  # a network that is in no cache
     monkeypatch.setitem(sys.modules, "sumo", None)
     with pytest.raises(InputError, match=r"netccfg: needs SUMO's program netconvert\n.*\[sumo\]"):
         check_network(str(mine))

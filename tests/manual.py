@@ -1,0 +1,40 @@
+"""The fenced blocks of the manual's pages, without any package."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PROGRAM = "python -m safevar_sumo "
+BLOCK = re.compile(
+    r'(?:^<!-- ([^\n]*) -->\n+)?^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$',
+    flags=re.DOTALL | re.MULTILINE,
+)
+
+
+class Block(NamedTuple):
+    """A fenced block of a page: the comment above it, its language, the file that it is the content
+    of, its text, and the place of the text in the page. What is not there is "".
+    """
+
+    comment: str
+    language: str
+    title: str
+    text: str
+    place: tuple[int, int]
+
+
+def blocks(page: str) -> list[Block]:
+    """The fenced blocks of a page of the manual."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return [
+        Block(*(found or "" for found in match.groups()), match.span(4))
+        for match in BLOCK.finditer(text)
+    ]
+
+
+def files_of(*pages: str) -> dict[str, str]:
+    """The files that pages of the manual show, by their names."""
+    return {block.title: block.text for page in pages for block in blocks(page) if block.title}
