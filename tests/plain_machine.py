@@ -88,6 +88,23 @@ class Machine:
         return printed
 
 
+def installed_files(machine: Machine) -> None:
+    """Every module, study and network of the checkout is installed."""
+    checkout = machine.folder / "checkout"
+    (site,) = (machine.folder / "env").glob("lib/*/site-packages")
+    tracked = subprocess.run(
+        ["git", "ls-files", "safevar_sumo", "studies", "sumo_nets"],
+        cwd=checkout,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    for name in tracked.stdout.splitlines():
+        inside = Path("safevar_sumo", name.removeprefix("safevar_sumo/"))
+        if (site / inside).read_bytes() != (checkout / name).read_bytes():
+            raise SystemExit(f"{name} is another file in the wheel")
+
+
 def read_me(machine: Machine) -> None:
     """README's commands, its files, and the questions of its table."""
     for block in blocks("README.md"):
@@ -169,6 +186,7 @@ def main() -> None:
         machine = Machine(Path(folder))
         (machine.folder / "readme").mkdir()
         read_me(machine)
+        installed_files(machine)
         size = sum(path.lstat().st_blocks * 512 for path in (machine.folder / "env").rglob("*"))
         pages(machine)
         extras(machine)
