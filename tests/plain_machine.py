@@ -51,8 +51,8 @@ STUDIES_OF_EXTRAS = {
 ANSWERS = (0, 3)
 """Exit codes of a question: 3 is a verdict against the vehicle or its driving system."""
 INPUT_ERROR = 2
-MAX_DISK = 1_060_000_000
-"""Largest size of an installation [bytes]."""
+MAX_DISK = 1060
+"""Largest size of an installation, as `du -m` counts it [MiB]."""
 
 
 class Machine:
@@ -196,12 +196,12 @@ def main() -> None:
         (machine.folder / "readme").mkdir()
         read_me(machine)
         installed_files(machine)
-        size = sum(path.lstat().st_blocks * 512 for path in (machine.folder / "env").rglob("*"))
+        size = int(machine.run("du -sm env", ".").split()[0])
         pages(machine)
         extras(machine)
-    print(f"{size / 1e6:.0f} MB, {time.monotonic() - begin:.0f} s")
+    print(f"{size} MiB, {time.monotonic() - begin:.0f} s")
     if size > MAX_DISK:
-        raise SystemExit(f"the installation has more than {MAX_DISK / 1e6:.0f} MB")
+        raise SystemExit(f"the installation has more than {MAX_DISK} MiB")
 
 
 if __name__ == "__main__":
