@@ -5,7 +5,6 @@ simulations tell anything about the ADS; and the check of user code.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -31,7 +30,7 @@ from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import manifest_of
+from safevar_sumo.results import identity_digest, manifest_of
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -231,8 +230,7 @@ def check_code(study: Study, pool: Pool) -> Use:
     """
     if not user_code_names(study):
         return Use({}, [], {})
-    identity = json.dumps(manifest_of(study, identity_of(study, system_of(study))), sort_keys=True)
-    digest = hashlib.sha256(identity.encode()).hexdigest()
+    digest = identity_digest(manifest_of(study, identity_of(study, system_of(study))))
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):
         known = msgspec.json.decode(marker.read_bytes(), type=Use)

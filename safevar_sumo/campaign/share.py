@@ -28,7 +28,6 @@ from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import (
-    JOURNALS,
     MANIFEST,
     Journal,
     identity_digest,
@@ -150,7 +149,7 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
     problem = problem_of(study, system, share.original)
     search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
-    journal = Journal(path, head, share.manifest.get(JOURNALS), retry_failed=share.retry_failed)
+    journal = Journal(path, head, retry_failed=share.retry_failed)
     return Run(key, search, journal, study.search.evaluations)
 
 

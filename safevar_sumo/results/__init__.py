@@ -18,7 +18,6 @@ from safevar_sumo.results.load import (
 )
 from safevar_sumo.results.manifest import (
     FILES as FILES,
-    JOURNALS as JOURNALS,
     MANIFEST as MANIFEST,
     RESULTS as RESULTS,
     SOLUTIONS as SOLUTIONS,

@@ -27,10 +27,8 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.manifest import disk_errors
 
-FORMAT = 6
+FORMAT = 7
 """Version number of the format of journals."""
-FORMAT_WITHOUT_CHECKSUMS = 5
-"""Version number of the format of older journals, which are read and continued as they are."""
 PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
@@ -67,15 +65,14 @@ class JournalContent(NamedTuple):
     size
         Size of the lines that were read [bytes].
     checksum
-        The CRC-32 of these lines without their checksums and ends; None in a journal of the format
-        without checksums.
+        The CRC-32 of these lines without their checksums and ends.
     """
 
     positions: list[int]
     evaluations: Evaluations
     results: Mapping[int, list[int]]
     size: int
-    checksum: int | None
+    checksum: int
 
     def take_positions(self, positions: Sequence[int]) -> Evaluations:
         """The evaluations at `positions`, in this order."""
@@ -102,8 +99,6 @@ class Journal:
     head
         The owner of the journal, as `journal_head` names it. A journal without evaluations passes
         to the owner.
-    stated
-        The format of the journals, if the manifest says so.
     retry_failed
         Whether to drop the first failed evaluation and all that came after it.
 
@@ -120,9 +115,7 @@ class Journal:
         If another live process works on the run, or the file cannot be locked or written.
     """
 
-    def __init__(
-        self, path: Path, head: JsonObject, stated: int | None = None, *, retry_failed: bool = False
-    ) -> None:
+    def __init__(self, path: Path, head: JsonObject, *, retry_failed: bool = False) -> None:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = _open_and_lock(path)
@@ -131,9 +124,7 @@ class Journal:
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
-                self.content = _read(
-                    self._file.read(), path, head, stated, until_failure=retry_failed
-                )
+                self.content = _read(self._file.read(), path, head, until_failure=retry_failed)
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
 
@@ -164,10 +155,8 @@ class Journal:
 
     def _add(self, line: JsonObject) -> None:
         text = msgspec.json.encode(line)
-        if self._checksum is not None:
-            self._checksum = zlib.crc32(text, self._checksum)
-            text = text[:-1] + CHECKSUM_MARK + b"%d}" % self._checksum
-        self._write(text)
+        self._checksum = zlib.crc32(text, self._checksum)
+        self._write(text[:-1] + CHECKSUM_MARK + b"%d}" % self._checksum)
 
     def _write(self, text: bytes) -> None:
         remainder = memoryview(text + b"\n")
@@ -176,7 +165,7 @@ class Journal:
                 remainder = remainder[self._file.write(remainder) :]
 
 
-def read_journal(path: Path, head: JsonObject, stated: int | None = None) -> JournalContent:
+def read_journal(path: Path, head: JsonObject) -> JournalContent:
     """The contents of a journal that another process may be writing; arguments as of `Journal`.
 
     Raises
@@ -188,7 +177,7 @@ def read_journal(path: Path, head: JsonObject, stated: int | None = None) -> Jou
         data = path.read_bytes()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
-    return _read(data, path, head, stated)
+    return _read(data, path, head)
 
 
 class _Progress(msgspec.Struct):
@@ -216,11 +205,12 @@ class JournalReader:
         with suppress(FileNotFoundError), open(self._path, "rb") as file:
             file.seek(self._end)
             for text in file:
+                # Another process may be writing this line, or have truncated the file.
+                if not text.endswith(b"\n"):
+                    break
                 try:
                     progress = msgspec.json.decode(text, type=_Progress)
-                except (
-                    msgspec.DecodeError
-                ):  # another process is writing this line, or has truncated the file
+                except msgspec.DecodeError:
                     break
                 self._end += len(text)
                 if progress.evaluation:
@@ -246,11 +236,10 @@ def _open_and_lock(path: Path) -> IO[bytes]:
 
 
 def _read(
-    data: bytes, path: Path, head: JsonObject, stated: int | None, *, until_failure: bool = False
+    data: bytes, path: Path, head: JsonObject, *, until_failure: bool = False
 ) -> JournalContent:
     """The contents of a journal; with `until_failure`, without the first batch that failed and all
-    that came after it. A first line with another format than the manifest has `stated` is not
-    believed, and so is nothing after it.
+    that came after it.
     """
     positions = list[int]()
     batches = []
@@ -259,17 +248,13 @@ def _read(
     # The first line says to which run the journal belongs.
     first, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(first)
-    is_older = stated is None and owner.get("format") == FORMAT_WITHOUT_CHECKSUMS
-    is_own = owner == ({**head, "format": FORMAT_WITHOUT_CHECKSUMS} if is_older else head)
-    if stated == FORMAT and not is_own and head == {**owner, "format": FORMAT}:
-        lines = []
-    elif lines and not is_own:
+    if lines and owner != head:
         legal = "the manifest.json and journals of one study, as it was run; or another `out`"
         raise InputError(path, "belongs to another study, version or run, or is no journal", legal)
 
     # Each line is a batch of evaluations or the run's solutions, with a checksum.
     size = len(first) if lines or owner == head else 0
-    checksum = None if is_older else zlib.crc32(first.rstrip())
+    checksum = zlib.crc32(first.rstrip())
     for text in lines:
         line, checksum_of_line = _checked(text, checksum)
         try:
@@ -293,15 +278,10 @@ def _read(
     )
 
 
-def _checked(text: bytes, checksum: int | None) -> tuple[JsonObject, int | None]:
+def _checked(text: bytes, checksum: int) -> tuple[JsonObject, int]:
     """A line after the first, and the checksum of the journal up to it; empty if the line is torn,
-    damaged or altered.
-
-    `checksum` is that of the lines before, None in a journal of the format without.
+    damaged or altered. `checksum` is that of the lines before.
     """
-    if checksum is None:
-        line = _decoded(text)
-        return {} if CHECKSUM in line else line, None
     content, _, stated = text.rpartition(CHECKSUM_MARK)
     checksum = zlib.crc32(content + b"}", checksum)
     return _decoded(content + b"}\n") if stated == b"%d}\n" % checksum else {}, checksum

@@ -12,17 +12,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results.journal import journal_head, read_journal
-from safevar_sumo.results.manifest import (
-    JOURNALS,
-    identity_digest,
-    journal_file,
-    read_manifest,
-    run_name,
-)
+from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
 from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
 from safevar_sumo.study import label_of
 
@@ -114,7 +108,6 @@ def load_runs(directory: str | Path) -> StoredResults:
     solutions_of_runs = []
     all_positions = []
     failures = []
-    has_checksums = True
     search = study["search"]
     digest = identity_digest(manifest)
     budget = search["evaluations"]
@@ -124,10 +117,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         path = journal_file(folder, name)
         if not path.exists():
             continue
-        content = read_journal(
-            path, journal_head(digest, name, characteristics), manifest.get(JOURNALS)
-        )
-        has_checksums &= content.checksum is not None
+        content = read_journal(path, journal_head(digest, name, characteristics))
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append(((algorithm, run), evaluations))
         all_positions += positions
@@ -138,11 +128,6 @@ def load_runs(directory: str | Path) -> StoredResults:
             )
 
     # Tables of all runs.
-    if not has_checksums:
-        warn(
-            f"{folder}: has journals of an earlier version, without checksums: altered lines go"
-            " unnoticed"
-        )
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(
         2, "evaluation", all_positions

@@ -23,9 +23,9 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import PYMOO, Study, convert_table, tables_of, with_effect
 from safevar_sumo.study.schema import Tables
 
-FORMAT = 5
+FORMAT = 6
 """Version number of the files' format."""
-RESULTS = 10
+RESULTS = 11
 """Version number of the package's results, raised whenever they change (enforced by tests/golden).
 """
 PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")
@@ -36,10 +36,6 @@ SIMULATORS = ("libsumo", *LIBRARIES.values())
 """Packages on whose versions a single simulation depends."""
 PYMOO_PACKAGES = ("pymoo", "cma")
 """Packages on whose versions the searches of pymoo depend."""
-NOT_ALWAYS_NAMED = ("eclipse-sumo", *LIBRARIES.values(), *PYMOO_PACKAGES)
-"""Packages that manifests of earlier releases name in every study, or only where it has searches of
-pymoo.
-"""
 IDENTITY = {
     "study": "the same study and options",
     "files": "the file as it was",
@@ -49,10 +45,6 @@ IDENTITY = {
 }
 """Inputs that results depend on, each with the remedy if it has changed; an error says "expected:
 another `out` ..., or REMEDY".
-"""
-JOURNALS = "journals"
-"""Key of a manifest: the format of the journals; a directory that an earlier version began lacks
-it.
 """
 MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
 FILES = (
@@ -214,7 +206,7 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
     """
     for layer, inputs in identity_in(now).items():
         for key, before, after in changed_values(identity_in(stored)[layer], inputs):
-            if key in NOT_ALWAYS_NAMED and None in (before, after):
+            if key in PYMOO_PACKAGES and None in (before, after):
                 continue
             if layer == "files":
                 change = "is new" if before is None else "has changed since"

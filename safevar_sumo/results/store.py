@@ -17,11 +17,9 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
-from safevar_sumo.results.journal import FORMAT as JOURNAL_FORMAT
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
-    JOURNALS,
     MANIFEST,
     RUNS,
     SOLUTIONS,
@@ -81,13 +79,9 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
 
-        # A directory that an earlier version began keeps its journals' format, and the packages
-        # that it names, as the journals' heads have a digest of both.
+        # Earlier results in the directory are those of this study.
         make_directory(path)
-        earlier_manifest = self._earlier_manifest()
-        self.manifest["versions"] = earlier_manifest.get("versions", {}) | self.manifest["versions"]
-        if not earlier_manifest or JOURNALS in earlier_manifest:
-            self.manifest[JOURNALS] = JOURNAL_FORMAT
+        self._earlier_manifest()
 
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove a table of solutions

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from types import UnionType
 from typing import Annotated, Any, get_args, get_origin
 
 import msgspec
@@ -20,6 +21,8 @@ def _mark(name: str) -> Meta:
 
 WITHOUT_EFFECT = _mark("without effect")
 """No evaluation depends on it."""
+ORDERED = _mark("ordered")
+"""The order of its keys has an effect, too: settings and points are arrays in this order."""
 PART_OF_SYSTEM = _mark("part of system")
 """It names a part of the system that is studied: a model and its network, a weather, a matrix."""
 OF_SYSTEM = _mark("of system")
@@ -46,16 +49,25 @@ def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
 
 
 def with_effect(value: Any, kind: Any) -> Any:
-    """A value of a type, as plain tables, without the keys on which no evaluation depends."""
+    """A value of a type, as plain tables, without the keys on which no evaluation depends, and with
+    the order of the keys of tables whose order has an effect.
+    """
+    # A container by the type of what it holds, and an optional table by its record.
+    inner_kinds = get_args(kind)
     if get_origin(kind) is Annotated:
-        return with_effect(value, get_args(kind)[0])
+        return with_effect(value, inner_kinds[0])
     if get_origin(kind) is dict:
-        return {name: with_effect(inner, get_args(kind)[1]) for name, inner in value.items()}
+        return {name: with_effect(inner, inner_kinds[1]) for name, inner in value.items()}
+    if get_origin(kind) is list:
+        return [with_effect(inner, inner_kinds[0]) for inner in value]
+    if get_origin(kind) is UnionType and isinstance(value, dict):
+        return with_effect(value, next((one for one in inner_kinds if isinstance(one, type)), None))
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return value
     kinds = {field.name: field.type for field in msgspec.structs.fields(kind)}
     left_out = keys_with(WITHOUT_EFFECT, kind)
-    return {
+    ordered = [key for key in keys_with(ORDERED, kind) if key in value]
+    return {f"order of {key}": list(value[key]) for key in ordered} | {
         key: with_effect(inner, kinds.get(key))
         for key, inner in value.items()
         if key not in left_out

@@ -29,6 +29,7 @@ from safevar_sumo.study.marks import (
     OF_STUDY,
     OF_SYSTEM,
     OF_VEHICLE_AND_ADS,
+    ORDERED,
     PART_OF_SYSTEM,
     WHOLE,
     WITHOUT_EFFECT,
@@ -103,7 +104,7 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     of the variant.
     """
 
-    search: dict[str, Domain] = {}
+    search: Annotated[dict[str, Domain], ORDERED] = {}
     margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
 
     def __post_init__(self) -> None:
@@ -123,7 +124,7 @@ class VehicleTable(Table, frozen=True, kw_only=True):
     """
 
     model: str
-    characteristics: dict[str, CharacteristicTable]
+    characteristics: Annotated[dict[str, CharacteristicTable], ORDERED]
     parameters: Parameters = {}
     files: list[str] = []
 
@@ -227,7 +228,7 @@ class MatrixTest(Table, frozen=True, kw_only=True):
     name: Annotated[str, Meta(min_length=1)]
     model: str = ""
     parameters: Parameters = {}
-    over: dict[str, Annotated[list[Any], Meta(min_length=1)]] = {}
+    over: Annotated[dict[str, Annotated[list[Any], Meta(min_length=1)]], ORDERED] = {}
     weathers: list[str | Weather] = []
     allowed_impact_speed: Annotated[float, Meta(ge=0, le=250)] = 0.0
 
