@@ -9,10 +9,11 @@ import platform
 from collections.abc import Iterable
 from pathlib import Path
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Files, code_files, digests, digests_by_name, files_in
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results import RESULTS
+from safevar_sumo.results import RESULTS, manifest_differences, manifest_of
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
 from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
@@ -30,6 +31,17 @@ def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonO
         "results": RESULTS,
         "platform": {"system": platform.system(), "machine": platform.machine()},
     }
+
+
+def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:
+    """Raise an error if the inputs of a study's results are no longer those of a manifest."""
+    now = manifest_of(study, identity_of(study, system, manifest["files"]))
+    for _, text, _ in manifest_differences(manifest, now):
+        raise InputError(
+            f"study {study.name!r}",
+            f"{text}: it was changed meanwhile, or a worker has another one",
+            "the file as it was, and the same command; or another `out`",
+        )
 
 
 def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:

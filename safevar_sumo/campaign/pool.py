@@ -22,6 +22,7 @@ from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import Use
+from safevar_sumo.records import JsonObject
 
 Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
@@ -65,6 +66,8 @@ class Pool:
     uses
         What the user code of a study uses, by packed study; a study that it lacks is new to the
         pool.
+    inputs
+        The inputs of a study's results when it was new to the pool, a manifest, by packed study.
     verified
         Number of settings whose results were verified, by packed study.
     compiled
@@ -78,6 +81,7 @@ class Pool:
         self._is_abandoned = Event()
         self._started = dict[int, Worker]()
         self.uses = dict[bytes, Use]()
+        self.inputs = dict[bytes, JsonObject]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
 

@@ -26,7 +26,7 @@ from safevar_sumo.campaign.evaluation import (
     system_of,
     verify_settings,
 )
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.identity import files_of, identity_of, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
@@ -73,6 +73,9 @@ def evaluate_all(
     """
     packed_study = msgspec.msgpack.encode(study)
     use = _use_of(study, packed_study, pool)
+    system = system_of(study)
+    if packed_study not in pool.inputs:
+        pool.inputs[packed_study] = manifest_of(study, identity_of(study, system, use.modules))
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -92,6 +95,9 @@ def evaluate_all(
         sample_size = verified - pool.verified[packed_study]
         task = Task(study=study, batch_size=batches.best, selection=selection)
         evaluations = _simulate(task, portion, pool, batches, done, sample_size)
+        inputs = pool.inputs[packed_study]
+        if files_of(study, system, inputs["files"]) != inputs["files"]:
+            refuse_changed_inputs(study, system, inputs)
         pool.verified[packed_study] += max(min(sample_size, len(portion)), 0)
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations))

@@ -15,7 +15,7 @@ import numpy as np
 
 from safevar_sumo.campaign.cluster import has_caller
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.identity import refuse_changed_inputs
 from safevar_sumo.campaign.runs import (
     Run,
     RunKey,
@@ -27,15 +27,7 @@ from safevar_sumo.campaign.runs import (
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
-from safevar_sumo.results import (
-    MANIFEST,
-    Journal,
-    identity_digest,
-    journal_file,
-    journal_head,
-    manifest_differences,
-    manifest_of,
-)
+from safevar_sumo.results import MANIFEST, Journal, identity_digest, journal_file, journal_head
 from safevar_sumo.sumo.verification import Sample, spread_points, verify_sample
 
 MAX_NAMES = 6
@@ -102,7 +94,7 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
             f"a worker does not see {share.directory}",
             "a directory on a disk that all workers share",
         )
-    refuse_other_inputs(task, share)
+    refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
     with about(task.study.source), ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
         # Each search goes on until it asks for settings that are in no journal; a run's settings
@@ -124,21 +116,8 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
             if share.verifies
             else ""
         )
-        refuse_other_inputs(task, share)
+        refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
         return [run.finish() for run in runs], remark
-
-
-def refuse_other_inputs(task: Task, share: Share) -> None:
-    """Raise an error if the inputs of a study's results are not those with which it began."""
-    now = manifest_of(
-        task.study, identity_of(task.study, system_of(task.study), share.manifest["files"])
-    )
-    for _, text, _ in manifest_differences(share.manifest, now):
-        raise InputError(
-            f"study {task.study.name!r}",
-            f"{text}: it was changed meanwhile, or a worker has another one",
-            "the file as it was, and the same command; or another `out`",
-        )
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:

@@ -204,8 +204,9 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
     search libraries, other machines, other versions of this package with the same `RESULTS`, and
     new keys of a study do not.
     """
+    inputs_before = identity_in(stored)
     for layer, inputs in identity_in(now).items():
-        for key, before, after in changed_values(identity_in(stored)[layer], inputs):
+        for key, before, after in changed_values(inputs_before[layer], inputs):
             if key in PYMOO_PACKAGES and None in (before, after):
                 continue
             if layer == "files":

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import UnionType
 from typing import Annotated, Any, get_args, get_origin
 
@@ -39,12 +40,14 @@ WHOLE = _mark("whole")
 """A study inherits it as a whole or not at all."""
 
 
+fields_of = cache(msgspec.structs.fields)
+"""The fields of a record, whose annotations msgspec evaluates anew each time."""
+
+
 def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
     """The keys of a record's fields that have a mark."""
     return tuple(
-        field.name
-        for field in msgspec.structs.fields(record)
-        if mark in getattr(field.type, "__metadata__", ())
+        field.name for field in fields_of(record) if mark in getattr(field.type, "__metadata__", ())
     )
 
 
@@ -64,7 +67,7 @@ def with_effect(value: Any, kind: Any) -> Any:
         return with_effect(value, next((one for one in inner_kinds if isinstance(one, type)), None))
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return value
-    kinds = {field.name: field.type for field in msgspec.structs.fields(kind)}
+    kinds = {field.name: field.type for field in fields_of(kind)}
     left_out = keys_with(WITHOUT_EFFECT, kind)
     ordered = [key for key in keys_with(ORDERED, kind) if key in value]
     return {f"order of {key}": list(value[key]) for key in ordered} | {

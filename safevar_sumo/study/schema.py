@@ -34,6 +34,7 @@ from safevar_sumo.study.marks import (
     WHOLE,
     WITHOUT_EFFECT,
     Table,
+    fields_of,
 )
 from safevar_sumo.study.parameters import FreeParameter, searched
 
@@ -429,7 +430,7 @@ def _without_defaults(value: Any) -> Any:
         return value
     config = value.__struct_config__
     table = {} if config.tag_field is None else {config.tag_field: config.tag}
-    for field in msgspec.structs.fields(value):
+    for field in fields_of(type(value)):
         inner = getattr(value, field.name)
         default = (
             field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -24,9 +25,11 @@ from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulat
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
+from safevar_sumo.errors import InputError
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray
+from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
@@ -150,6 +153,27 @@ def test_an_interrupted_question_goes_on_where_it_was(
     again = evaluated(study, settings)
     assert sum(simulated) == 32
     assert_equal(again, evaluated(study, settings, fresh=True))
+
+
+def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
+    folder: Path, simulated: list[int], in_tmp: Path
+) -> None:
+    own = Path(shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "own"))
+    study = load_study("smoke", scenario={"parameters": {"network": str(own)}})
+    settings = some_settings(study, 8)
+    traffic = own / "traffic.rou.xml"
+
+    def edit(size: int) -> None:
+        traffic.write_text(traffic.read_text() + "<!-- edited -->\n")
+
+    with (
+        keep_simulations(),
+        pytest.raises(InputError, match=r"rou\.xml has changed since: it was ch"),
+    ):
+        evaluate_all(study, settings, InlinePool(), edit, verified=0)
+    edited = evaluated(study, settings)
+    assert sum(simulated) == 16, "nothing was kept"
+    assert_equal(evaluated(study, settings, fresh=True), edited)
 
 
 @pytest.mark.slow
