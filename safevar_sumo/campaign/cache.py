@@ -1,12 +1,18 @@
 """The cache of simulations: what questions have simulated, on disk, by its content. A question that
 is asked again, or was interrupted, simulates only what it lacks.
+
+What user code reads cannot be known, so that its simulations are kept for the running command
+alone, in a folder of their own, which is removed at the end of the command. A command that was
+killed or interrupted leaves it, and the same command continues from it within a day.
 """
 
 from __future__ import annotations
 
 import os
 import platform
+import shutil
 import sqlite3
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,17 +29,18 @@ import diskcache
 import msgspec
 import numpy as np
 import platformdirs
+import portalocker
 from diskcache.core import MODE_BINARY, MODE_RAW
 
 from safevar_sumo.campaign.evaluation import Selection, system_of
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.errors import warn
-from safevar_sumo.plugins import Use, digests, digests_by_name, files_in
+from safevar_sumo.plugins import Use, digests, file_by_name, files_in
 from safevar_sumo.records import CellResults, Evaluations, FloatArray
 from safevar_sumo.records.evaluations import COLUMNS
 from safevar_sumo.results import identity_digest, manifest_of
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, user_code_names
 
 FOLDER_VARIABLE = "SAFEVAR_CACHE"
 """The environment variable that names the cache's folder."""
@@ -45,6 +52,12 @@ DIGEST_SIZE = 32
 """Size of the digest with which an entry begins [bytes]."""
 FAST = 1
 """The level of zlib's compression: results take a sixth of their size, at 100 MB/s."""
+COMMANDS, DAY = "commands", 86_400.0
+"""Name of the folder of what commands with user code have simulated, and how long they may be
+continued [s].
+"""
+NUMBER = b"number"
+"""The key of an entry with the number of settings that a command has kept."""
 METRIC, CELLS, POINTS = "metric ", "cells ", "worst_points"
 """Names of an entry's further arrays, or their beginnings."""
 UNUSABLE = (OSError, sqlite3.Error, diskcache.Timeout)
@@ -68,6 +81,11 @@ class Cache:
     ----------
     is_read
         Whether entries are read, besides written.
+
+    Attributes
+    ----------
+    settings_kept
+        Number of settings that were kept since it was opened.
     """
 
     def __init__(self, folder: Path, *, is_read: bool = True) -> None:
@@ -75,6 +93,7 @@ class Cache:
         self._is_read = is_read
         self._entries: diskcache.Cache | None = None
         self._keys = dict[bytes, bytes]()
+        self.settings_kept = 0
         self._guarded(self._open, None)
 
     def key_of(self, study: Study, use: Use) -> bytes:
@@ -135,7 +154,75 @@ class Cache:
             return otherwise
 
 
-_cache = ContextVar[Cache | None]("cache", default=None)
+class CommandCache:
+    """What a command keeps: simulations of shipped parts for everybody, those of user code for
+    itself.
+
+    Parameters
+    ----------
+    command
+        The command line.
+    is_fresh
+        Whether nothing is read that an earlier command has simulated.
+    """
+
+    def __init__(self, folder: Path, command: str, *, is_fresh: bool) -> None:
+        self._folder = folder / COMMANDS
+        self._command = command
+        self._is_fresh = is_fresh
+        self._lock: portalocker.Lock | None = None
+        self._own: Cache | None = None
+        self._own_folder: Path | None = None
+        self._of_everybody = Cache(folder, is_read=not is_fresh)
+
+    def of(self, study: Study, use: Use) -> Cache | None:
+        """The cache of a study's simulations; `use` is what its user code uses. None if another
+        process runs the same command with the same code.
+        """
+        if not user_code_names(study):
+            return self._of_everybody
+        if self._own_folder is None:
+            self._open_own(self._of_everybody.key_of(study, use))
+        return self._own
+
+    def end(self, *, is_interrupted: bool) -> None:
+        """Close the caches; that of user code is removed unless the command was interrupted."""
+        self._of_everybody.close()
+        if self._own is not None and self._own_folder is not None:
+            self._own.close()
+            if not is_interrupted:
+                shutil.rmtree(self._own_folder, ignore_errors=True)
+        if self._lock is not None:
+            self._lock.release()
+
+    def _open_own(self, key: bytes) -> None:
+        self._own_folder = self._folder / sha256(key + self._command.encode()).hexdigest()
+        try:
+            # Nobody continues what is older than a day.
+            self._folder.mkdir(parents=True, exist_ok=True)
+            for folder in self._folder.iterdir():
+                if time.time() - folder.stat().st_mtime > DAY:
+                    shutil.rmtree(folder, ignore_errors=True)
+
+            # One process at a time; its lock ends with it.
+            lock_file = self._own_folder.with_suffix(".lock")
+            lock = portalocker.Lock(lock_file, "a", timeout=0, fail_when_locked=True)
+            lock.acquire()
+            self._lock = lock
+        except (OSError, portalocker.LockException):
+            return
+        if self._is_fresh:
+            shutil.rmtree(self._own_folder, ignore_errors=True)
+        begun = self._own_folder.stat().st_mtime if self._own_folder.is_dir() else None
+        self._own = Cache(self._own_folder)
+        kept = self._own.get(NUMBER)
+        if begun is not None and kept is not None:
+            self._own.settings_kept = int(kept)
+            at = time.strftime("%H:%M", time.localtime(begun))
+            warn(f"continues: {int(kept):,} simulated at {at}")
+
+
+_cache = ContextVar[CommandCache | None]("cache", default=None)
 _is_forbidden = ContextVar("is_forbidden", default=False)
 
 
@@ -148,21 +235,25 @@ def cache_folder() -> Path | None:
 
 
 @contextmanager
-def keep_simulations(*, fresh: bool = False) -> Iterator[None]:
-    """Within the block, simulations are kept, and those that were kept are not simulated again;
-    with `fresh` they are.
+def keep_simulations(command: str = "", *, fresh: bool = False) -> Iterator[None]:
+    """Within the block, which carries out a command, simulations are kept, and those that were kept
+    are not simulated again; with `fresh` they are.
     """
     folder = cache_folder()
     if folder is None or _is_forbidden.get() or _cache.get() is not None:
         yield
         return
-    cache = Cache(folder, is_read=not fresh)
+    cache = CommandCache(folder, command, is_fresh=fresh)
     token = _cache.set(cache)
+    is_interrupted = False
     try:
         yield
+    except KeyboardInterrupt:
+        is_interrupted = True
+        raise
     finally:
         _cache.reset(token)
-        cache.close()
+        cache.end(is_interrupted=is_interrupted)
 
 
 @contextmanager
@@ -175,9 +266,12 @@ def simulate_anew() -> Iterator[None]:
         _is_forbidden.reset(token)
 
 
-def cache_in_use() -> Cache | None:
-    """The cache of the question that is being asked, if it has one."""
-    return _cache.get()
+def cache_of(study: Study, use: Use) -> Cache | None:
+    """Where simulations of a study are kept while a question is asked, if they are; `use` is what
+    its user code uses.
+    """
+    cache = _cache.get()
+    return cache.of(study, use) if cache else None
 
 
 def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray) -> bytes:
@@ -228,18 +322,12 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
 def _key_of_study(study: Study, use: Use) -> bytes:
     """What the simulations of a study depend on besides their settings, as a digest.
 
-    The study and its files count as in the identity of results, and besides that the files that
-    user code `use`s, this package's own files, and the versions of Python and of all that is
-    installed.
+    The study and its files count as in the identity of results, and besides that where the files
+    are, this package's own files, and the versions of Python and of all that is installed.
     """
-    places = study.origin.places
-    identity = identity_of(study, system_of(study), use.modules)
-    parts = [
-        identity_digest(manifest_of(study, identity)),
-        digests_by_name(use.opened, places),
-        digests_by_name(use.elsewhere, places),
-        _environment(),
-    ]
+    manifest = manifest_of(study, identity_of(study, system_of(study), use.modules))
+    paths = [os.path.abspath(file_by_name(name, study.origin.places)) for name in manifest["files"]]
+    parts = [identity_digest(manifest), paths, _environment()]
     return sha256(msgspec.json.encode(parts)).digest()
 
 
@@ -252,5 +340,5 @@ def _environment() -> Any:
     """The versions of Python and of all installed distributions, and the digests of this package's
     files.
     """
-    versions = sorted((one.metadata["Name"] or "", one.version) for one in distributions())
+    versions = sorted((one.metadata["Name"] or "", one.version or "") for one in distributions())
     return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])

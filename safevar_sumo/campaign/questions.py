@@ -15,7 +15,13 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.cache import cache_in_use, content_of, evaluations_in, key_of_settings
+from safevar_sumo.campaign.cache import (
+    NUMBER,
+    cache_of,
+    content_of,
+    evaluations_in,
+    key_of_settings,
+)
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -80,7 +86,7 @@ def evaluate_all(
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
-    cache = cache_in_use()
+    cache = cache_of(study, use)
     found = list[Evaluations]()
     portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
     for portion in np.array_split(distinct_settings, portions):
@@ -101,6 +107,8 @@ def evaluate_all(
         pool.verified[packed_study] += max(min(sample_size, len(portion)), 0)
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations))
+            cache.settings_kept += len(portion)
+            cache.put(NUMBER, str(cache.settings_kept).encode())
         found.append(evaluations)
     return Evaluations.concatenate(found).take(row_of.ravel())
 
@@ -206,10 +214,10 @@ def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lam
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
     "" if they do. `begin` is called before anything is simulated.
     """
-    cache = cache_in_use()
+    use = _use_of(study, msgspec.msgpack.encode(study), pool)
+    cache = cache_of(study, use)
     key = b""
     if cache:
-        use = _use_of(study, msgspec.msgpack.encode(study), pool)
         key = hashlib.sha256(b"no verdict" + cache.key_of(study, use)).digest()
         content = cache.get(key)
         if content is not None:
@@ -235,7 +243,7 @@ def check_code(study: Study, pool: Pool) -> Use:
         With file, line and advice of the first finding that makes results wrong.
     """
     if not user_code_names(study):
-        return Use({}, [], {})
+        return Use({}, [])
     digest = identity_digest(manifest_of(study, identity_of(study, system_of(study))))
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):

@@ -60,13 +60,12 @@ this_process = _Process()
 
 
 class Use(NamedTuple):
-    """What user code has used: digests of the modules in its folders by name, names of the files
-    that it has opened, and digests of modules of the user's in other folders.
+    """What user code has used: digests of the modules in its folders by name, and names of the
+    files that it has opened.
     """
 
     modules: Files
     opened: list[str]
-    elsewhere: Files
 
 
 @contextmanager
@@ -81,7 +80,7 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
         this_process.is_listening = True
 
     # What is loaded and opened in the block.
-    use = Use({}, [], {})
+    use = Use({}, [])
     before = set(sys.modules)
     opened = this_process.opened = set[str]()
     try:
@@ -93,10 +92,10 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
     loaded = sys.modules.keys() - before
     this_process.modules |= loaded
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
-    of_user = {file for file in map(file_of_module, loaded) if is_user_file(file)}
-    files = {file for file in of_user if file.startswith(tuple(own_folders))}
-    for used, paths in ((use.modules, files), (use.elsewhere, of_user - files)):
-        used.update(digests((Path(file) for file in paths if os.path.isfile(file)), folders))
+    loaded_files = map(file_of_module, loaded)
+    files = {file for file in loaded_files if file.startswith(tuple(own_folders))}
+    files = {file for file in files if is_user_file(file)}
+    use.modules.update(digests((Path(file) for file in files if os.path.isfile(file)), folders))
     caches = (
         f"{path}{os.sep}"  # such as lists of fonts
         for path in (platformdirs.user_cache_path(), platformdirs.user_config_path())

@@ -249,7 +249,7 @@ class Question:
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
-        with keep_simulations(fresh=fresh):
+        with keep_simulations(command, fresh=fresh):
             if self._is_long(values) and progress is True and sys.stderr.isatty():
                 first = self.answer(subjects, {**values, "quick": True}, pool=pool, jobs=jobs)
                 print_text(Console(stderr=True), f"{first.verdict}\n")

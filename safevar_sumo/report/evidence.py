@@ -106,9 +106,10 @@ def evidence(
     check_writable(out, "out", (".zip",))
 
     # Each study once, with its files.
+    command = f"evidence {results} {ask} {unsafe}"
     studies = []
     files = dict[str, bytes]()
-    with open_progress(progress) as show, keep_simulations(fresh=fresh):
+    with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
             described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
             studies.append(described)

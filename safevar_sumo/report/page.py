@@ -142,24 +142,24 @@ def report(
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     at_point = cases if point is None else [case_at(case, point) for case in cases]
-    with keep_simulations(fresh=fresh):
+    command = f"report {paths} {point} {ask} {unsafe} {quick}"
+    with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
-    asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
-    asked = [quick_questions(texts) if quick else texts for texts in asked]
-    numbers, total = count(1), sum(map(len, asked)) + len(joint)
+        asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
+        asked = [quick_questions(texts) if quick else texts for texts in asked]
+        numbers, total = count(1), sum(map(len, asked)) + len(joint)
 
-    def next_answer(text: str, chosen: slice) -> Answer:
-        """The next answer, about these of the results."""
-        question = with_criterion(text, unsafe)
-        subjects = by_criterion if has_criterion(question, unsafe) else at_point
-        number = next(numbers)
-        name = f"question {number} of {total}, {question.split()[0]}"
-        show_part = partial(show_within, show, name, (number - 1) / total, 1 / total)
-        answer = answer_to if ask else answer_or_reason
-        return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
+        def next_answer(text: str, chosen: slice) -> Answer:
+            """The next answer, about these of the results."""
+            question = with_criterion(text, unsafe)
+            subjects = by_criterion if has_criterion(question, unsafe) else at_point
+            number = next(numbers)
+            name = f"question {number} of {total}, {question.split()[0]}"
+            show_part = partial(show_within, show, name, (number - 1) / total, 1 / total)
+            answer = answer_to if ask else answer_or_reason
+            return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
-    # The answers, in the order of the page.
-    with open_progress(progress) as show, keep_simulations(fresh=fresh):
+        # The answers, in the order of the page.
         studies = [
             ReportedStudy(
                 directory=path,

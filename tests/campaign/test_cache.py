@@ -23,9 +23,9 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import cache, questions
 from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
 from safevar_sumo.errors import InputError
+from safevar_sumo.plugins import unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray
@@ -176,24 +176,63 @@ def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     assert_equal(evaluated(study, settings, fresh=True), edited)
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("worker_processes")
-def test_a_change_of_a_module_that_user_code_imports_is_noticed(
-    folder: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_continuation(
+    folder: Path, simulated: list[int], in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The module lies in a folder of its own, far from the study."""
-    library = in_tmp / "library"
-    library.mkdir()
-    monkeypatch.syspath_prepend(str(library))
+    """What user code reads cannot be known: here a file whose name no study has."""
+    monkeypatch.setattr(questions, "PORTION", 16)
+    monkeypatch.setattr(questions, "SMALL_PORTION", 16)
+    (in_tmp / "threshold.py").write_text(
+        "from pathlib import Path\nTTC = float(Path('t').read_text())"
+    )
     (in_tmp / "own.py").write_text(OWN_ADS)
+    (in_tmp / "t").write_text("3.0")
     study = load_study("smoke", ads={"model": "own:Own"})
-    settings = some_settings(study, 4)
-    outcomes = []
-    for threshold in ("3.0", "3.0", "0.2"):
-        (library / "threshold.py").write_text(f"TTC = {threshold}\n")
-        with keep_simulations(), open_pool(1) as pool:
-            outcomes.append(evaluate_all(study, settings, pool, verified=0).f_safe.tolist())
-    assert outcomes[0] == outcomes[1] != outcomes[2]
+    settings = some_settings(study, 64)
+
+    def ask(command: str, after: float = np.inf) -> Evaluations:
+        """As a command does, which is interrupted after so many settings."""
+        simulated.clear()
+        seen = list[int]()
+
+        def interrupt(number: int) -> None:
+            seen.append(number)
+            if sum(seen) > after:
+                raise KeyboardInterrupt
+
+        with keep_simulations(command):
+            evaluate_all(study, settings, InlinePool(), interrupt, verified=0)
+            return evaluate_all(study, settings, InlinePool(), verified=0)
+
+    # A command finds what it has simulated itself; another one does not.
+    first = ask("risk own")
+    assert sum(simulated) == 64
+    ask("risk own")
+    assert sum(simulated) == 64
+    assert not [*(folder / "commands").glob("*[!k]")], "only locks are left"
+
+    # An interrupted command is continued once, and by itself alone.
+    for command, continued in (("risk own", 32), ("risk own", 0), ("rules own", 0)):
+        if continued:
+            with pytest.raises(KeyboardInterrupt):
+                ask("risk own", after=40)
+            with pytest.warns(UserWarning, match=r"continues: 32 simulated at \d\d:\d\d"):
+                assert_equal(ask(command), first)
+        else:
+            assert_equal(ask(command), first)
+        assert sum(simulated) == 64 - continued
+
+    # Nobody continues what is older than a day, or simulated with other modules.
+    with pytest.raises(KeyboardInterrupt):
+        ask("risk own", after=40)
+    (in_tmp / "own.py").write_text(OWN_ADS + "# changed\n")
+    unload_user_modules()
+    ask("risk own")
+    assert sum(simulated) == 64
+    (in_tmp / "own.py").write_text(OWN_ADS)
+    monkeypatch.setattr(cache, "DAY", -1.0)
+    ask("risk own")
+    assert sum(simulated) == 64
 
 
 def test_an_altered_entry_is_simulated_again(folder: Path, simulated: list[int]) -> None:
