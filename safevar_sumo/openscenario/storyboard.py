@@ -13,7 +13,7 @@ from safevar_sumo.openscenario.actions import INIT_ORDER, PLACING, act, leaf_of
 from safevar_sumo.openscenario.actors import STEP, Unplaced
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
-from safevar_sumo.openscenario.events import Act, Event
+from safevar_sumo.openscenario.events import Act, Event, note_moving
 from safevar_sumo.openscenario.player import Key, Player
 from safevar_sumo.openscenario.reading import Document
 from safevar_sumo.openscenario.ways import STRAY, Way
@@ -63,6 +63,9 @@ class Storyboard(Player):
             for story in self._board.findall("Story")
             for each in story.findall("Act")
         ]
+        note_moving(self.acts)
+        for one in self.acts:
+            self._note_reactions(one)
 
     def _act(self, element: Element, story: Key) -> Act:
         act_key = _below(story, element)
@@ -83,9 +86,7 @@ class Storyboard(Player):
                     Event(event, group, _below(key, event), outer, own)
                     for event in maneuver.findall("Event")
                 ]
-        found = Act(element, act_key, events)
-        self._note_reactions(found)
-        return found
+        return Act(element, act_key, events)
 
     def _leave_out_criteria(self) -> None:
         """Leave out conditions of the StopTrigger by which CARLA's scenario runner judges a run."""
@@ -116,7 +117,8 @@ class Storyboard(Player):
 
     def _refuse_repeats(self) -> None:
         """Refuse events that could begin again, by a count of theirs or of their group."""
-        for event in (event for one in self.acts for event in one.events if event.moves):
+        events = [event for one in self.acts for event in one.events if not event.is_ignored]
+        for event in (event for event in events if event.moves or event.running):
             for element in (event.element, event.group):
                 times = number(element, "maximumExecutionCount", 1)
                 key = event.key if element is event.element else event.outer[1]
