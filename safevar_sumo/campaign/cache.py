@@ -252,5 +252,5 @@ def _environment() -> Any:
     """The versions of Python and of all installed distributions, and the digests of this package's
     files.
     """
-    versions = sorted((one.metadata["Name"] or "", one.version) for one in distributions())
+    versions = sorted((one.metadata["Name"] or "", one.version or "") for one in distributions())
     return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])

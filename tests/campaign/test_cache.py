@@ -152,6 +152,23 @@ def test_an_interrupted_question_goes_on_where_it_was(
     assert_equal(again, evaluated(study, settings, fresh=True))
 
 
+def test_a_distribution_may_lack_a_version(
+    folder: Path, in_tmp: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also beside another one of its name."""
+    for name, version in (("with", "Version: 1\n"), ("without", "")):
+        metadata = in_tmp / name / "twice-1.dist-info" / "METADATA"
+        metadata.parent.mkdir(parents=True)
+        metadata.write_text(f"Metadata-Version: 2.1\nName: twice\n{version}")
+        monkeypatch.syspath_prepend(str(metadata.parents[1]))
+    cache._environment.cache_clear()
+    study = load_study("smoke")
+    for _ in "ab":
+        evaluated(study, some_settings(study, 4))
+    cache._environment.cache_clear()
+    assert sum(simulated) == 4
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("worker_processes")
 def test_a_change_of_a_module_that_user_code_imports_is_noticed(
