@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import signal
 import warnings
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -18,6 +19,8 @@ MAX_BATCH = 10_000
 """Largest number of settings in a batch that a user may ask for."""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end the program as Ctrl-C does."""
 
 
 _subject: ContextVar[str] = ContextVar("subject", default="study")

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import this_process
@@ -84,8 +85,8 @@ class ProcessWorker:
 
 def _begin_work(path: ImportPath, last_words: Path) -> None:
     path.inherit()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for interrupt in INTERRUPTS:
+        signal.signal(interrupt, signal.SIG_IGN)
     tempfile.tempdir = str(last_words.parent)  # which ends with the pool; a worker is killed
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
@@ -137,7 +138,7 @@ def _block_interrupts() -> Iterator[None]:
     from multiprocessing import resource_tracker
 
     resource_tracker.ensure_running()  # a later start would unblock interrupts
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
     try:
         yield
     finally:

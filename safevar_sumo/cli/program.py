@@ -18,7 +18,13 @@ from typing import Any, NoReturn, cast
 
 import click
 
-from safevar_sumo.errors import INTERRUPT_EXIT_CODE, InputError, SafevarError, did_you_mean
+from safevar_sumo.errors import (
+    INTERRUPT_EXIT_CODE,
+    INTERRUPTS,
+    InputError,
+    SafevarError,
+    did_you_mean,
+)
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 
 COMMANDS_BY_GROUP = {
@@ -55,8 +61,6 @@ COMMANDS_BY_GROUP = {
 COMMANDS = {
     name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()
 }
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end the program as Ctrl-C does."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 

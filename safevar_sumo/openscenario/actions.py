@@ -247,9 +247,14 @@ def leaf_of(action: Element) -> Element:
 
 
 def is_ignored(action: Element) -> bool:
-    """Whether an action moves nobody."""
+    """Whether an action has no effect."""
+    return not moves_somebody(action) and action.find(f"*[@{IS_READ}]") is None
+
+
+def moves_somebody(action: Element) -> bool:
+    """Whether an action does more than to set values and what has no effect."""
     leaf = leaf_of(action) if action.tag in ("PrivateAction", "GlobalAction") else action
-    return leaf.tag in IGNORED and IS_READ not in leaf.attrib
+    return leaf.tag not in IGNORED
 
 
 def _set_value(player: Player, action: Element) -> None:

@@ -175,8 +175,7 @@ def _why_uneventful(player: Storyboard) -> str:
         last = int(np.flatnonzero(is_in_lane | ~is_in_lane.any())[-1])
         has_company |= bool(is_in_lane.any())
         meets |= bool((gap[: last + long] <= 0).any() or is_close.sum() >= long)
-    moving = [event for one in player.acts for event in one.events if event.moves]
-    if moving and not has_company and not any(event.running for event in moving):
+    if player.moving and not has_company and not any(one.running for one in player.moving):
         return (
             f"no event begins that moves somebody, and nobody is in {own.name}'s lane or crosses it"
         )
@@ -239,7 +238,6 @@ def _remark(player: Storyboard) -> None:
             player.remark("without effect here: the road's elevation")
         if actor.deleted < math.inf:
             player.remark(f"{actor.name} is deleted at {actor.deleted:.1f} s")
-    for one in player.acts:
-        for event in one.events:
-            if event.moves and not event.running:
-                player.remark(f"the event {event.name} never fires")
+    for event in player.moving:
+        if not event.running:
+            player.remark(f"the event {event.name} never fires")

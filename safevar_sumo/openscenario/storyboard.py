@@ -13,7 +13,7 @@ from safevar_sumo.openscenario.actions import INIT_ORDER, PLACING, act, leaf_of
 from safevar_sumo.openscenario.actors import STEP, Unplaced
 from safevar_sumo.openscenario.conditions import LEFT_TO_RUNS, REACTIONS, holds, watched
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
-from safevar_sumo.openscenario.events import Act, Event
+from safevar_sumo.openscenario.events import Act, Event, note_moving
 from safevar_sumo.openscenario.player import Key, Player
 from safevar_sumo.openscenario.reading import Document
 from safevar_sumo.openscenario.ways import STRAY, Way
@@ -63,6 +63,11 @@ class Storyboard(Player):
             for story in self._board.findall("Story")
             for each in story.findall("Act")
         ]
+        self.all_events = [event for one in self.acts for event in one.events]
+        note_moving(self.acts)
+        self.moving = [event for event in self.all_events if event.moves]
+        for one in self.acts:
+            self._note_reactions(one)
 
     def _act(self, element: Element, story: Key) -> Act:
         act_key = _below(story, element)
@@ -83,9 +88,7 @@ class Storyboard(Player):
                     Event(event, group, _below(key, event), outer, own)
                     for event in maneuver.findall("Event")
                 ]
-        found = Act(element, act_key, events)
-        self._note_reactions(found)
-        return found
+        return Act(element, act_key, events)
 
     def _leave_out_criteria(self) -> None:
         """Leave out conditions of the StopTrigger by which CARLA's scenario runner judges a run."""
@@ -116,8 +119,9 @@ class Storyboard(Player):
 
     def _refuse_repeats(self) -> None:
         """Refuse events that could begin again, by a count of theirs or of their group."""
-        for event in (event for one in self.acts for event in one.events if event.moves):
-            for element in (event.element, event.group):
+        for event in self.all_events:
+            may_begin = event.moves or (event.running and not event.is_ignored)
+            for element in (event.element, event.group) if may_begin else ():
                 times = number(element, "maximumExecutionCount", 1)
                 key = event.key if element is event.element else event.outer[1]
                 if times <= 1:
@@ -213,10 +217,9 @@ class Storyboard(Player):
                 self._begin(event, one)
             if event.has_begun and not event.has_ended:
                 self._finish(event)
-        events = [event for other in self.acts for event in other.events]
         for key in dict.fromkeys(chain(*(event.outer for event in one.events))):
             self.begun.setdefault(key, self.now)
-            if all(event.has_ended for event in events if key in event.outer):
+            if all(event.has_ended for event in self.all_events if key in event.outer):
                 self.ended.setdefault(key, self.now)
         if not one.events:
             self.ended.setdefault(one.key, self.now)
@@ -281,8 +284,7 @@ class Storyboard(Player):
 
     def _next(self, last: int) -> int:
         """The first sample up to the last of a block at which something may begin or end."""
-        events = [event for one in self.acts for event in one.events]
-        running = chain(*(chain(*event.running.values()) for event in events))
+        running = chain(*(chain(*event.running.values()) for event in self.all_events))
         ends = [
             math.ceil((one.end - 1e-9) / STEP) for one in running if self.now < one.end < math.inf
         ]
@@ -367,9 +369,7 @@ class Storyboard(Player):
                 self.begun.get(event.key, math.nan) if event.running else math.nan,
                 self.ended.get(event.key, math.nan) if event.running else math.nan,
             )
-            for one in self.acts
-            for event in one.events
-            if event.moves
+            for event in self.moving
         ]
         return sorted(found, key=lambda one: math.inf if math.isnan(one[2]) else one[2])
 
@@ -382,8 +382,7 @@ class Storyboard(Player):
 
     def _straight_end(self, last: int) -> int:
         """The last sample at which Ego is on its line, once all that the file says has happened."""
-        events = [event for one in self.acts for event in one.events if event.moves]
-        is_over = bool(events) and all(one.has_ended for one in events)
+        is_over = bool(self.moving) and all(one.has_ended for one in self.moving)
         if math.isinf(self.stop) and not is_over:
             return last
         places = self.ego.place[: last + 1]

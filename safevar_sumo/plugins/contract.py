@@ -30,7 +30,7 @@ from safevar_sumo.errors import (
     describe_error,
 )
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import this_process
+from safevar_sumo.plugins.process import Interrupt, mark_interrupts, this_process
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 UserValue = Any
@@ -49,10 +49,10 @@ def user_errors(source: str) -> Iterator[None]:
     """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors
     are about the study `source`.
     """
-    with about(source):
+    with about(source), mark_interrupts():
         try:
             yield
-        except (UserCodeError, SimulationError, EnvironmentFault, KeyboardInterrupt):
+        except (UserCodeError, SimulationError, EnvironmentFault, Interrupt):
             raise
         except BaseException as error:
             if user_error := user_error_of(error):

@@ -5,15 +5,19 @@ tell: modules imported by computed names, and files that it opens.
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import IO, Any, NamedTuple
 
 import platformdirs
 
+from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.plugins.files import Files, digests, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
@@ -57,6 +61,36 @@ class _Process:
 
 
 this_process = _Process()
+
+
+class Interrupt(KeyboardInterrupt):
+    """A KeyboardInterrupt that a signal has raised, not user code."""
+
+
+@contextmanager
+def mark_interrupts() -> Iterator[None]:
+    """Within the block, Ctrl-C and the like raise an `Interrupt`, where they would raise a
+    KeyboardInterrupt.
+    """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        try:
+            handlers[number](number, frame)
+        except KeyboardInterrupt:
+            raise Interrupt from None
+
+    # Only the main thread is interrupted, and only it may set handlers.
+    is_main = threading.current_thread() is threading.main_thread()
+    found = {one: signal.getsignal(one) for one in INTERRUPTS if is_main}
+    handlers: dict[int, Any] = {one: handler for one, handler in found.items() if callable(handler)}
+    for one in handlers:
+        signal.signal(one, interrupt)
+    try:
+        yield
+    finally:
+        for one, handler in handlers.items():
+            if signal.getsignal(one) is interrupt:  # user code may have set its own
+                signal.signal(one, handler)
 
 
 class Use(NamedTuple):

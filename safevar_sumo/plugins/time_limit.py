@@ -17,13 +17,13 @@ from typing import IO
 
 from safevar_sumo.errors import SimulationError, UserCodeError
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import this_process
+from safevar_sumo.plugins.process import Interrupt, this_process
 
 TIMEOUT_MARK = "Timeout ("
 """What the interpreter writes first when a process exceeds its time limit."""
 
 
-class _TimeIsUp(KeyboardInterrupt):
+class _TimeIsUp(Interrupt):
     """Passes user code as Ctrl-C does; its argument is the error for the user."""
 
 

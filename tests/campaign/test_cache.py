@@ -155,6 +155,23 @@ def test_an_interrupted_question_goes_on_where_it_was(
     assert_equal(again, evaluated(study, settings, fresh=True))
 
 
+def test_a_distribution_may_lack_a_version(
+    folder: Path, in_tmp: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also beside another one of its name."""
+    for name, version in (("with", "Version: 1\n"), ("without", "")):
+        metadata = in_tmp / name / "twice-1.dist-info" / "METADATA"
+        metadata.parent.mkdir(parents=True)
+        metadata.write_text(f"Metadata-Version: 2.1\nName: twice\n{version}")
+        monkeypatch.syspath_prepend(str(metadata.parents[1]))
+    cache._environment.cache_clear()
+    study = load_study("smoke")
+    for _ in "ab":
+        evaluated(study, some_settings(study, 4))
+    cache._environment.cache_clear()
+    assert sum(simulated) == 4
+
+
 def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     folder: Path, simulated: list[int], in_tmp: Path
 ) -> None:

@@ -180,15 +180,113 @@ def test_an_action_changes_what_conditions_compare(tmp_path: Path, kind: str, ch
     assert car.speed[[400, 500]].tolist() == [10, pytest.approx(8, abs=0.03)]
 
 
-def test_what_no_condition_compares_may_wait_for_a_collision(tmp_path: Path) -> None:
-    collision = watching(
-        "Ego", "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>"
+COLLISION = watching("Ego", "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>")
+SLOWS = event(speed(0, "linear", "rate", 2), AT_ONCE.format(4), "Slows", "parallel")
+
+
+def setting(name: str, when: str, *values: str, repeats: int = 1) -> str:
+    """An event that sets parameters to 5, or variables, which have capital letters."""
+    actions = [
+        f"<GlobalAction><{kind}Action {kind.lower()}Ref='{value}'>{CHANGES['set']}</{kind}Action></GlobalAction>"
+        for value in values
+        for kind in ["Variable" if value.isupper() else "Parameter"]
+    ]
+    written = event("", when, name, "parallel").replace(
+        "<PrivateAction></PrivateAction>", f"</Action><Action name='{name} too'>".join(actions)
     )
-    action = f"<GlobalAction><ParameterAction parameterRef='v'>{CHANGES['set']}</ParameterAction></GlobalAction>"
-    logs = event("", collision, "Logs").replace("<PrivateAction></PrivateAction>", action)
-    parameters = V.format("v", "double", "3", "")
-    played = play(write(tmp_path, logs, parameters=parameters), {})
-    assert played.remarks == []
-    compared = event(speed(5), "<ParameterCondition parameterRef='v' rule='equalTo' value='5'/>")
+    return written.replace("<Event ", f"<Event maximumExecutionCount='{repeats}' ")
+
+
+def is_set(value: str, rule: str = "equalTo", than: str = "5") -> str:
+    kind = "Variable" if value.isupper() else "Parameter"
+    return f"<{kind}Condition {kind.lower()}Ref='{value}' rule='{rule}' value='{than}'/>"
+
+
+def write_values(
+    folder: Path,
+    *events: str,
+    stops: tuple[str, ...] = (),
+    act: str = AT_ONCE.format(0),
+    **parts: str,
+) -> str:
+    """A file of parameters p, q and variables V, W; several conditions can stop it, as 10 s do."""
+    file = write(
+        folder,
+        *events,
+        parameters="".join(V.format(name, "double", "3", "") for name in "pq"),
+        stop="".join(trigger(condition, "") for condition in (AT_ONCE.format(10), *stops)),
+        act_trigger=act if act.startswith("<StartTrigger") else trigger(act),
+        **parts,
+    )
+    names = "".join(
+        f"<VariableDeclaration name='{name}' variableType='double' value='3'/>" for name in "VW"
+    )
+    variables = f"<VariableDeclarations>{names}</VariableDeclarations>"
+    text = Path(file).read_text().replace("<CatalogLocations>", f"{variables}<CatalogLocations>")
+    Path(file).write_text(text)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("events", "stops"),
+    [
+        ([setting("Logs", COLLISION, "p")], []),
+        ([setting("Logs", COLLISION, "p")], [is_set("p")]),
+        ([setting("Logs", COLLISION, "V")], [is_set("V")]),
+        ([setting("Logs", COLLISION, "V")], [is_set("V", "notEqualTo", "3")]),
+        ([setting("Logs", COLLISION, "V", "W", "p")], [is_set("V"), is_set("W"), is_set("p")]),
+        ([setting("Logs", COLLISION, "V"), setting("Next", is_set("V"), "W")], [is_set("W")]),
+        ([setting("Logs", COLLISION, "V"), setting("Next", is_set("V"), "q")], [is_set("q")]),
+        (
+            [setting("Logs", COLLISION, "V"), setting("Next", ENDED.format("Logs"), "W")],
+            [is_set("W")],
+        ),
+        ([setting("Logs", COLLISION, "V")], [ENDED.format("Logs")]),
+    ],
+)
+def test_what_moves_nobody_may_wait_for_a_collision(
+    tmp_path: Path, events: list[str], stops: list[str]
+) -> None:
+    """All is as without these events: nothing but the end of the scene depends on them."""
+    played = play(write_values(tmp_path, *events, SLOWS, stops=tuple(stops)), {})
+    without = play(write_values(tmp_path, SLOWS), {})
+    assert [*map(str, played)] == [*map(str, without)]
+    (car,), (alone,) = played.others, without.others
+    assert (car.place.tobytes(), car.speed.tobytes()) == (
+        alone.place.tobytes(),
+        alone.speed.tobytes(),
+    )
+
+
+def test_what_an_event_sets_ends_the_scene(tmp_path: Path) -> None:
+    """At 5 s, and 4 s are played after that."""
+    sets = setting("Sets", AT_ONCE.format(5), "V"), setting("Next", is_set("V"), "W")
+    assert play(write_values(tmp_path, *sets, SLOWS, stops=(is_set("W"),)), {}).duration == 9
+    repeated = setting("Sets", AT_ONCE.format(5), "V", repeats=2)
+    with pytest.raises(InputError, match="the event Sets could begin again after 5"):
+        play(write_values(tmp_path, repeated, SLOWS, stops=(is_set("V"),)), {})
+
+
+LOGS = setting("Logs", COLLISION, "V")
+
+
+@pytest.mark.parametrize(
+    ("events", "act"),
+    [
+        ([LOGS, event(speed(5), is_set("V"))], AT_ONCE.format(0)),
+        ([LOGS, event(speed(5), is_set("V", "notEqualTo"))], AT_ONCE.format(0)),
+        ([LOGS, setting("Next", is_set("V"), "p"), event(speed(5), is_set("p"))], AT_ONCE.format(0)),
+        ([LOGS, setting("Next", is_set("V"), "p"), event(speed(5), ENDED.format("Next"))], AT_ONCE.format(0)),
+        ([LOGS, event(speed(5), ENDED.format("Logs"))], AT_ONCE.format(0)),
+        ([LOGS, SLOWS], is_set("V")),
+        ([LOGS, SLOWS], trigger(AT_ONCE.format(0)) + trigger(is_set("V"), "StopTrigger")),
+        ([LOGS.replace("</Event>", f"<Action name='Brakes'><PrivateAction>{speed(5)}</PrivateAction></Action></Event>")], AT_ONCE.format(0)),
+    ],
+    ids=["direct", "negated", "chain", "chain by a state", "state", "begin of an act", "end of an act", "moves, too"],
+)  # fmt: skip
+def test_what_a_motion_depends_on_may_not_wait_for_a_collision(
+    tmp_path: Path, events: list[str], act: str
+) -> None:
+    file = write_values(tmp_path, *events, act=act, stops=(is_set("V"),))
     with pytest.raises(InputError, match="the event Logs waits for a CollisionCondition of Ego"):
-        play(write(tmp_path, logs, compared, parameters=parameters), {})
+        play(file, {})

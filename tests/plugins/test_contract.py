@@ -16,6 +16,7 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import differences
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import run
 from tests.made_up import original_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
 
@@ -175,6 +176,7 @@ def failing(system: object) -> str:
     [
         ("1 / 0", "raised in drive: ZeroDivisionError: division by zero"),
         (r"raise RuntimeError('my\n message')", "raised in drive: RuntimeError: my message ("),
+        ("raise KeyboardInterrupt", "raised in drive: KeyboardInterrupt ("),
         ("pass", "returned None from drive"),
         ("return 0, 2", "returned brake = 2.0 from drive"),
     ],
@@ -188,18 +190,56 @@ def test_a_scalar_ads_that_is_wrong(body: str, expected: str, mine: Mine, folder
     )
 
 
-def test_ctrl_c_passes(mine: Mine) -> None:
-    pressed = (
-        "    def drive(self, seen):\n        import signal\n       "
-        " signal.raise_signal(signal.SIGINT)\n"
-    )
-    ctrl_c = mine(SCALAR + pressed)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+PRESSED = (
+    "    def drive(self, seen):\n        import signal\n       "
+    " signal.raise_signal(signal.{})\n        return 0, 0\n"
+)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_ctrl_c_passes(name: str, mine: Mine) -> None:
+    """Its handler is the same afterwards."""
+    ctrl_c = mine(SCALAR + PRESSED.format(name))
+    number = signal.Signals[name]
+    handler = signal.signal(number, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             drive_and_score(ctrl_c, original_of(ctrl_c))
+        assert signal.getsignal(number) is signal.default_int_handler
+    finally:
+        signal.signal(number, handler)
+
+
+def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    own = (
+        "        import signal\n        signal.signal(signal.SIGINT, print)\n        return 0, 0\n"
+    )
+    system = mine(f"{SCALAR}    def drive(self, seen):\n{own}")
+    try:
+        drive_and_score(system, original_of(system))
+        assert signal.getsignal(signal.SIGINT) is print
     finally:
         signal.signal(signal.SIGINT, handler)
+
+
+@pytest.mark.parametrize(
+    ("drive", "code", "message"),
+    [
+        (PRESSED.format("SIGINT"), 130, "interrupted"),
+        (PRESSED.format("SIGTERM"), 130, "interrupted"),
+        (
+            "    def drive(self, seen):\n        raise KeyboardInterrupt\n",
+            2,
+            "user code raised in drive: KeyboardInterrupt (",
+        ),
+    ],
+)
+def test_a_command_is_interrupted_by_ctrl_c_alone(
+    drive: str, code: int, message: str, mine: Mine, folder: Path
+) -> None:
+    mine(SCALAR + drive)
+    assert message in run("simulate", str(folder / "mine.toml"), expect=code).stderr
 
 
 ARRAYS = "from safevar_sumo.records import Command\n\n\n"
