@@ -20,7 +20,7 @@ from safevar_sumo.campaign.pool import Pool, WorkerLostError
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins.time_limit import end_if_longer
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, Outcome, differences
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
@@ -35,6 +35,8 @@ KNOWN_SYSTEMS = 64
 """Number of systems that a process keeps: questions about the fits of a vehicle change between
 them.
 """
+_first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
+"""The first batch of each study with user code that this process has simulated, by packed study."""
 COMMAND_PREFIX = "; to reproduce it: "
 
 
@@ -200,8 +202,37 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     system.vehicle.compile()  # outside the time limit
     with end_if_longer(task.study.search.time_limit):
         if task.selection != EVERYTHING:
-            return _evaluate_parameters(task.selection.of(system), task, rows)
-        return drive_and_score(system, rows, task.engine)
+            evaluations = _evaluate_parameters(task.selection.of(system), task, rows)
+        else:
+            evaluations = drive_and_score(system, rows, task.engine)
+    if user_code_names(task.study):
+        _first_batches.setdefault(msgspec.msgpack.encode(task.study), (task, rows, evaluations))
+    return evaluations
+
+
+def repeat_first_batch(study: Study) -> None:
+    """Simulate the first batch of a study with user code in this process again, and forget it.
+
+    Raises
+    ------
+    UserCodeError
+        If a result differs: user code depends on what it has simulated before.
+    """
+    first = _first_batches.pop(msgspec.msgpack.encode(study), None)
+    if first is None:
+        return
+    task, rows, before = first
+    now = evaluate_batch(task, rows)
+    _first_batches.clear()
+    for row, difference in differences(before.results, now.results):
+        command = reproduction_command(study, rows[row, : len(study.domains)])
+        raise UserCodeError(
+            f"study {study.name!r}",
+            f"{difference} when a worker simulated its first batch again at the end, with"
+            f" {' or '.join(user_code_names(study))}{COMMAND_PREFIX}{command}",
+            "user code that keeps nothing in a class or a module: this result depends on what was"
+            " simulated before, so no result counts",
+        )
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:

@@ -184,6 +184,12 @@ class Pool:
         part._is_abandoned = is_abandoned
         return part
 
+    def everywhere(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Carry out a function in each worker that has started and lives."""
+        futures = [self._begin(place, function, arguments) for place in [*self._started]]
+        for future in futures:
+            future.result()
+
     def close(self) -> None:
         """End all workers."""
         while self._started:

@@ -29,6 +29,7 @@ from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
     evaluate_settings,
+    repeat_first_batch,
     system_of,
     verify_settings,
 )
@@ -111,6 +112,14 @@ def evaluate_all(
             cache.put(NUMBER, str(cache.settings_kept).encode())
         found.append(evaluations)
     return Evaluations.concatenate(found).take(row_of.ravel())
+
+
+def repeat_first_batches(study: Study, pool: Pool) -> None:
+    """Have each worker simulate its first batch of a study with user code again; raises the error
+    of `repeat_first_batch`.
+    """
+    if user_code_names(study):
+        pool.everywhere(repeat_first_batch, study)
 
 
 def _use_of(study: Study, packed_study: bytes, pool: Pool) -> Use:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.cluster import has_caller
-from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings, repeat_first_batch, system_of
 from safevar_sumo.campaign.identity import refuse_changed_inputs
 from safevar_sumo.campaign.runs import (
     Run,
@@ -24,7 +24,7 @@ from safevar_sumo.campaign.runs import (
     problem_of,
     random_generator_of,
 )
-from safevar_sumo.errors import InputError, SafevarError, about
+from safevar_sumo.errors import InputError, SafevarError, UserCodeError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import MANIFEST, Journal, identity_digest, journal_file, journal_head
@@ -117,6 +117,12 @@ def carry_share(task: Task, share: Share) -> tuple[list[RunResult], str]:
             else ""
         )
         refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
+        try:
+            repeat_first_batch(task.study)
+        except UserCodeError:
+            for key in share.keys:  # what they hold is not repeatable, and is not continued
+                journal_file(share.directory, str(key)).unlink(missing_ok=True)
+            raise
         return [run.finish() for run in runs], remark
 
 

@@ -304,6 +304,7 @@ class Question:
             # An answer about a driving system that fails by itself begins with that.
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
+            evaluator.end()
         numbers = {"driven": not reason, **answer.numbers}
         rough = ""
         if self.has_rough_answer:

@@ -14,7 +14,12 @@ import numpy as np
 
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, compile_vehicle, evaluate_all
+from safevar_sumo.campaign.questions import (
+    ask_why_no_verdict,
+    compile_vehicle,
+    evaluate_all,
+    repeat_first_batches,
+)
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -346,6 +351,10 @@ class Evaluator:
         return self.for_study(
             msgspec.structs.replace(self.study, step_length=step, metrics=metrics)
         )
+
+    def end(self) -> None:
+        """Have user code simulate again what it began with: an error if it does not repeat it."""
+        repeat_first_batches(self.study, self._pool)
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in

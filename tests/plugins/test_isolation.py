@@ -21,7 +21,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import json_of, run, searched
+from tests.in_process import json_of, refused, run, searched
 from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
@@ -143,6 +143,39 @@ def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
     tables = json_of("tables", "out")["tables"]
     for question in ("rq1", "rq2"):
         assert "jerk" in {row["metric"] for row in tables[question]["rows"]}
+
+
+LATE = """
+from safevar_sumo.ads import ScalarAds
+
+class Late(ScalarAds):
+    number = 0
+
+    def __init__(self):
+        Late.number += 1
+        self.is_late = Late.number > 1_200
+
+    def drive(self, seen):
+        if abs(seen.lateral) < 2.5 and seen.gap < 10 and not self.is_late:
+            return 0.0, 1.0
+        return (0.5, 0.0) if seen.speed < 5 else (0.0, 0.0)
+"""
+"""A driving system that no longer brakes after 1,200 instances: more than `check` makes."""
+
+
+@pytest.mark.parametrize(
+    "command", ["rules late.toml --samples 1500", "study late.toml --out out --quiet"]
+)
+def test_a_state_that_shows_late_is_an_error_at_the_end(command: str, in_tmp: Path) -> None:
+    Path("late.py").write_text(LATE)
+    Path("late.toml").write_text(
+        'extends = "smoke"\nname = "late"\n[ads]\nmodel = "late:Late"\n'
+        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 1500\n'
+    )
+    refused(
+        *command.split(), message=("when a worker simulated its first batch again", "late:Late")
+    )
+    assert not [*Path().rglob("*.jsonl")], "nothing is continued"
 
 
 NATIVE = assemble(load_study("native"))
