@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.records import Evaluations
@@ -30,6 +30,7 @@ from safevar_sumo.results import (
     row_of_handle,
     solutions_frame,
 )
+from safevar_sumo.results.journal import open_and_lock
 from safevar_sumo.results.manifest import (
     identity_digest,
     identity_in,
@@ -38,8 +39,8 @@ from safevar_sumo.results.manifest import (
     packages_of,
     read_manifest,
 )
-from safevar_sumo.study import Study, tables_of
-from tests.campaign.formulas import with_search
+from safevar_sumo.study import Study, tables_of, write_study
+from tests.campaign.formulas import carried_out, with_search
 from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations
 
@@ -380,6 +381,79 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
         refused(
             *command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew")
         )
+
+
+def as_of_another_study(journal: Path) -> None:
+    journal.write_bytes(re.sub(rb'"study":"\w+"', b'"study":"other"', journal.read_bytes()))
+
+
+def made_anew(make: Callable[[Path], object], path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    make(path)
+
+
+IN_THE_WAY: dict[str, Callable[[Path], object]] = {
+    "journal of another study": lambda out: as_of_another_study(out / "runs/rs-00.jsonl"),
+    "journal of another run": lambda out: shutil.copy(
+        out / "runs/rs-00.jsonl", out / "runs/rs-01.jsonl"
+    ),
+    "journal without a manifest": lambda out: [
+        as_of_another_study(out / "runs/rs-00.jsonl"),
+        (out / "manifest.json").unlink(),
+    ],
+    "torn head": lambda out: (out / "runs/rs-00.jsonl").write_text('{"format":6,\n{}\n'),
+    "no journal": lambda out: (out / "runs/rs-01.jsonl").write_text("notes\nand more"),
+    "folder as a new journal": lambda out: (out / "runs/rs-01.jsonl").mkdir(),
+    "pipe as a journal": lambda out: made_anew(os.mkfifo, out / "runs/rs-00.jsonl"),
+    "file as the journals' folder": lambda out: made_anew(Path.touch, out / "runs"),
+    "folder as the table": lambda out: made_anew(os.mkdir, out / "solutions.csv"),
+    "pipe as the manifest": lambda out: made_anew(os.mkfifo, out / "manifest.json"),
+    "torn manifest": lambda out: (out / "manifest.json").write_text('{"study":'),
+}
+
+
+@pytest.mark.parametrize("what", IN_THE_WAY)
+def test_what_makes_a_study_refuse_is_found_before_anything_is_written(
+    what: str, study: Study, tmp_path: Path
+) -> None:
+    study = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(study, tmp_path)
+    (tmp_path / "runs/rs-00.verified").touch()
+    IN_THE_WAY[what](tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=r"rs-0\d\.jsonl|manifest|solutions|runs"):
+        carried_out(with_search(study, runs=2), tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_run_in_other_hands_makes_a_study_refuse_before_anything_is_written(
+    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("safevar_sumo.results.journal.PATIENCE", 0.1)
+    study = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(study, tmp_path)
+    before = contents(tmp_path)
+    with (
+        open_and_lock(tmp_path / "runs/rs-00.jsonl"),
+        pytest.raises(SafevarError, match=r"rs-00\.jsonl: another process works on this run"),
+    ):
+        carried_out(with_search(study, runs=2), tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_results_survive_a_study_whose_characteristics_are_in_another_order(
+    copied: Path, case: Case, in_tmp: Path
+) -> None:
+    rows = case.study.vehicle.characteristics
+    vehicle = msgspec.structs.replace(
+        case.study.vehicle, characteristics=dict(reversed(rows.items()))
+    )
+    write_study(Path("slippery.toml"), msgspec.structs.replace(case.study, vehicle=vehicle), "")
+    before = contents(copied)
+    command = ("study", "slippery.toml", "--runs", "2", "--out", str(copied), "--jobs", "1")
+    refused(*command, message=("another study",))
+    assert contents(copied) == before
+    assert "collision" in run("explain", str(copied), "--limit", "200", "--fits", "0").stdout
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
