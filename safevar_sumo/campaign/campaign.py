@@ -99,9 +99,9 @@ def run_campaign(
     """
     # The directory, with the inputs of its results as they are now.
     use = check_code(study, pool)
-    results = ResultsDirectory(
-        directory, study, identity_of(study, system, use.modules), system.measuring.scoring
-    )
+    identity = identity_of(study, system, use.modules)
+    wanted = [*map(str, keys)]
+    results = ResultsDirectory(directory, study, identity, system.measuring.scoring, wanted)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)

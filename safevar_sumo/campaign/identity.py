@@ -18,6 +18,9 @@ from safevar_sumo.study import Study, data_files, fmus_of, user_modules
 from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
 
+PLATFORM = {"system": platform.system(), "machine": platform.machine()}
+"""Properties of this machine that may affect the last bit of a result."""
+
 
 def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
     """The layers of a manifest except the study: plain values that are the same in every process.
@@ -26,11 +29,7 @@ def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonO
     the identity. `files` are digests of files; `results` is the version of the results; `platform`
     are properties of the machine that may affect the last bit of a result.
     """
-    return {
-        "files": files_of(study, system, used),
-        "results": RESULTS,
-        "platform": {"system": platform.system(), "machine": platform.machine()},
-    }
+    return {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:

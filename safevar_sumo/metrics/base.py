@@ -58,7 +58,7 @@ MeasureName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
 TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
 
 
-class Measure(Struct, frozen=True, kw_only=True):
+class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A column of results: a metric of simulation runs, or a measure of change of settings. A
     search may minimise it, or maximise it if larger values are more unsafe.
 
@@ -132,7 +132,7 @@ def checked_measure(code: UserCode) -> Measure:
     )
 
 
-class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True):
+class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """The metrics of a study and the objectives of its searches; stored in results beside the
     study.
 

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from itertools import zip_longest
 from pathlib import Path
 from shlex import split
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -20,8 +20,9 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
+from safevar_sumo.campaign.identity import PLATFORM
 from safevar_sumo.errors import InputError, SafevarError, about
-from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
@@ -32,11 +33,20 @@ from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.report.pack import DESCRIPTION, PackedStudy
+from safevar_sumo.report.pack import DESCRIPTION, PackedManifest, PackedStudy, json_of
 from safevar_sumo.report.page import answer_to, make_page
 from safevar_sumo.report.sections import ReportedStudy
-from safevar_sumo.results import MANIFEST, SOLUTIONS, evaluations_frame, in_order, record
-from safevar_sumo.study import Origin, Study, convert_table, user_code_names, write_study
+from safevar_sumo.results import (
+    MANIFEST,
+    SOLUTIONS,
+    changed_values,
+    evaluations_frame,
+    in_order,
+    manifest_of,
+    record,
+)
+from safevar_sumo.study import Origin, Study, convert_table, tables_of, user_code_names, write_study
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
 
 STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
@@ -100,14 +110,11 @@ class Packed:
         self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
-            study = convert_table(self.manifest["study"], Study, "study")
-        study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
+            known = convert_table(self.manifest, PackedManifest)
+        for key, _, _ in changed_values(self.manifest["study"], tables_of(known.study), "study"):
+            raise ValueError(f"{MANIFEST}: {key} is not as the command `study` writes it")
+        study = msgspec.structs.replace(known.study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
-        scoring = (
-            msgspec.convert(self.manifest["scoring"], Scoring)
-            if "scoring" in self.manifest
-            else None
-        )
 
         # The solutions of its runs, of which no row is missing or new.
         solutions = read_table(files[SOLUTIONS])
@@ -122,7 +129,7 @@ class Packed:
 
         # The case that questions are asked about.
         original = self.manifest["original"]
-        scoring = scoring or PUBLISHED_SCORING
+        scoring = known.scoring or PUBLISHED_SCORING
         self.case = build_case(
             study, original, solutions, evaluations, packed.runs, scoring=scoring
         )
@@ -218,17 +225,27 @@ class Packed:
             )
             return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 
+    def _inputs(self, folder: Path) -> bytes:
+        """What differs from the inputs of the manifest in `folder`; nothing if all is the same."""
+        changes = changes_since(folder, self.case, as_it_is_now=True)
+        if self.case.scoring != assemble(self.case.study).measuring.scoring:
+            changes.append("scoring is not that of the study")
+        return "; ".join(changes).encode()
+
+    @property
+    def versions(self) -> tuple[JsonObject, JsonObject]:
+        """Versions and platform with which the study was searched, and those here."""
+        packed = {key: self.manifest[key] for key in ("versions", "platform")}
+        versions = manifest_of(self.case.study, {})["versions"]
+        return packed, {"versions": versions, "platform": PLATFORM}
+
     def claims(self, folder: Path, search: bool) -> Iterator[Claim]:
         """What the pack claims, and the functions that compute it again; the manifest is in
         `folder`.
         """
         # Inputs and study.
         solutions = self.files[SOLUTIONS]
-        yield Claim(
-            "inputs",
-            b"",
-            lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode(),
-        )
+        yield Claim("inputs", b"", partial(self._inputs, folder))
         yield Claim("study", self.files[STUDY], self.study_file)
 
         # The original vehicle, solutions, answers and page.
@@ -282,15 +299,6 @@ def read_table(content: bytes) -> pd.DataFrame:
 def packed_answer(answer: Answer) -> JsonObject:
     """An answer as a pack holds it: with its command."""
     return {"command": answer.command, **answer.to_dict()}
-
-
-def json_of(content: bytes) -> Any:
-    """The value of a JSON text; raises ValueError if it is none, or holds NaN or an infinity."""
-
-    def refuse(name: str) -> NoReturn:
-        raise ValueError(f"{name} is no JSON")
-
-    return json.loads(content, parse_constant=refuse)
 
 
 def json_bytes(value: Any) -> bytes:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -40,21 +40,24 @@ from safevar_sumo.report.claims import (
     count_solutions,
     csv_of,
     json_bytes,
-    json_of,
     packed_answer,
 )
 from safevar_sumo.report.pack import (
     DESCRIPTION,
     PACK,
+    Description,
+    PackedManifest,
     PackedStudy,
     digest_of,
     digests_of,
+    json_of,
     read_pack,
+    versions_here,
     write_pack,
 )
 from safevar_sumo.report.page import usual_questions
-from safevar_sumo.results import MANIFEST, SOLUTIONS, read_manifest
-from safevar_sumo.study import Study
+from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
+from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
@@ -127,7 +130,7 @@ def _pack_study(
     progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
-    # The results, without what belongs to this machine.
+    # The results, with what `verify` compares or names of their manifest.
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
     if not case.has_runs:
@@ -135,8 +138,8 @@ def _pack_study(
             directory, "holds imported solutions, which have no identity", "results of `study`"
         )
     study = case.study
-    manifest = read_manifest(directory)
-    manifest.pop("folders", None)  # of this machine
+    stored = {**read_manifest(directory), "study": tables_of(study)}
+    manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
 
     # The questions, by the criterion that the user gave.
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
@@ -264,6 +267,7 @@ def verify(
         verdict=(
             f"{counts[SAME]} of {number_of(len(claims), 'claim')} are the same, {counts[DIFFERS]}"
             f" differ, {counts[CANNOT]} cannot be run."
+            f"{_not_compared(description, studies.values(), search)}"
         ),
         numbers={
             "passed": counts[SAME] == len(claims),
@@ -273,6 +277,20 @@ def verify(
         },
         tables={"claims": claims},
     )
+
+
+def _not_compared(description: Description, studies: Iterable[Packed], search: bool) -> str:
+    """A sentence on what a pack says that `verify` does not compare, after a space; "" without."""
+    # Versions and machines may differ, as their results are compared.
+    pairs = {DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})}
+    pairs |= {f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies}
+    parts = [
+        f"{key} of {file}: {stated} ({here} here)"
+        for file, both in pairs.items()
+        for key, stated, here in changed_values(*both)
+    ]
+    parts += [] if search else ["how many simulations had which outcome (--search compares)"]
+    return f" Not compared: {'; '.join(parts)}." if parts else ""
 
 
 def _unpack(

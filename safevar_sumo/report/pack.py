@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import lzma
 import stat
 import sys
@@ -10,21 +11,29 @@ import zlib
 from collections.abc import Mapping
 from hashlib import file_digest, sha256
 from importlib.metadata import version
+from itertools import accumulate
 from pathlib import Path, PurePosixPath
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import msgspec
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Scoring
 from safevar_sumo.output import whole_file
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results.manifest import PACKAGES
+from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
 MAX_BYTES = 1_000_000_000
 """Largest size of a pack's files together, unpacked."""
 MAX_FILES = 10_000
 MAX_EVALUATIONS = 100_000_000
+MORE_IN_DIRECTORY, DIRECTORY_END = 16, 22
+"""By how much an entry of a zip archive's directory is larger than the header of its file, and the
+size of the directory's end [bytes].
+"""
 UNIX_MODE_SHIFT = 16
 """Bits of a zip entry's attributes below the mode of its file."""
 PACK = "a file that the command `evidence` has written, unchanged"
@@ -45,6 +54,19 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     unsafe: str | None = None
 
 
+class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
+    """The keys of a manifest that a pack holds: those that `verify` compares or names."""
+
+    format: int
+    study: Study
+    files: dict[str, str]
+    results: int
+    platform: dict[str, str]
+    versions: dict[str, str]
+    original: dict[str, bool | float | str | None]
+    scoring: Scoring | None = None
+
+
 class Description(Struct, frozen=True, forbid_unknown_fields=True):
     """The file `pack.json`; `files` are the sha256 of all other files of the pack, by name."""
 
@@ -55,9 +77,7 @@ class Description(Struct, frozen=True, forbid_unknown_fields=True):
 
 def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes]) -> None:
     """Write a pack; equal contents give equal bytes."""
-    packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
-    versions = {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
-    described = msgspec.json.encode(Description(versions, digests_of(files), studies))
+    described = msgspec.json.encode(Description(versions_here(), digests_of(files), studies))
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
@@ -65,6 +85,28 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
+
+
+def versions_here() -> dict[str, str]:
+    """Versions of Python and of the packages with which a pack's answers and page are computed."""
+    packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
+    return {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
+
+
+def json_of(content: bytes) -> Any:
+    """The value of a JSON text; raises ValueError if it is none, has a key twice, or holds NaN or
+    an infinity.
+    """
+
+    def once(pairs: list[tuple[str, Any]]) -> JsonObject:
+        names = [name for name, _ in pairs]
+        if len({*names}) < len(names):
+            raise ValueError(f"the key {max(names, key=names.count)!r} is there twice")
+        return dict(pairs)
+
+    value = json.loads(content.decode(), object_pairs_hook=once)
+    json.dumps(value, allow_nan=False)  # refuses 1e999, too
+    return value
 
 
 def digests_of(files: Mapping[str, bytes]) -> dict[str, str]:
@@ -91,6 +133,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     try:
         with zipfile.ZipFile(path) as archive:
             _check_entries(path, archive.infolist())
+            _check_layout(path, archive.infolist())
             files = {entry.filename: archive.read(entry) for entry in archive.infolist()}
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", PACK) from None
@@ -107,8 +150,8 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     if DESCRIPTION not in files:
         _refuse(path, f"holds no {DESCRIPTION}")
     try:
-        described = msgspec.json.decode(files.pop(DESCRIPTION), type=Description)
-    except (msgspec.MsgspecError, RecursionError) as error:
+        described = msgspec.convert(json_of(files.pop(DESCRIPTION)), Description)
+    except (ValueError, msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
 
     # The files that the description names.
@@ -159,6 +202,18 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
         _refuse(
             path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed"
         )
+
+
+def _check_layout(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive with bytes that belong to no file: before, between or behind the files, or
+    in comments.
+    """
+    headers = [len(entry.FileHeader()) for entry in entries]
+    sizes = [size + entry.compress_size for size, entry in zip(headers, entries, strict=True)]
+    *places, end = accumulate(sizes, initial=0)
+    end += sum(headers) + MORE_IN_DIRECTORY * len(headers) + DIRECTORY_END
+    if [entry.header_offset for entry in entries] != places or path.stat().st_size != end:
+        _refuse(path, "holds bytes that belong to no file")
 
 
 def _refuse(path: Path, problem: str) -> NoReturn:

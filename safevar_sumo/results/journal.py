@@ -118,7 +118,7 @@ class Journal:
     def __init__(self, path: Path, head: JsonObject, *, retry_failed: bool = False) -> None:
         self.path = path
         self._characteristics = head["characteristics"]
-        self._file = _open_and_lock(path)
+        self._file = open_and_lock(path)
 
         # What the journal has, without a torn end.
         try:
@@ -165,8 +165,9 @@ class Journal:
                 remainder = remainder[self._file.write(remainder) :]
 
 
-def read_journal(path: Path, head: JsonObject) -> JournalContent:
+def read_journal(path: Path, head: JsonObject, *, head_only: bool = False) -> JournalContent:
     """The contents of a journal that another process may be writing; arguments as of `Journal`.
+    With `head_only`, only its owner is checked.
 
     Raises
     ------
@@ -174,7 +175,8 @@ def read_journal(path: Path, head: JsonObject) -> JournalContent:
         If the journal cannot be read, or belongs to another study or run.
     """
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.readline() + file.read(1 if head_only else -1)
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     return _read(data, path, head)
@@ -221,7 +223,14 @@ class JournalReader:
         return self._asked
 
 
-def _open_and_lock(path: Path) -> IO[bytes]:
+def open_and_lock(path: Path) -> IO[bytes]:
+    """A journal's file, made if it does not exist; the lock ends when it is closed.
+
+    Raises
+    ------
+    SafevarError
+        If another live process works on the run, or the file cannot be locked or written.
+    """
     lock = portalocker.Lock(path, "a+b", PATIENCE, SECONDS_BETWEEN_ATTEMPTS, buffering=0)
     with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)

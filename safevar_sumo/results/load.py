@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,10 +14,14 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.results.journal import journal_head, read_journal
-from safevar_sumo.results.manifest import identity_digest, journal_file, read_manifest, run_name
-from safevar_sumo.results.store import evaluations_frame, read_imported, solutions_frame
-from safevar_sumo.study import label_of
+from safevar_sumo.results.journal import read_journal
+from safevar_sumo.results.manifest import read_manifest
+from safevar_sumo.results.store import (
+    evaluations_frame,
+    read_imported,
+    solutions_frame,
+    stored_journals,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -108,24 +111,15 @@ def load_runs(directory: str | Path) -> StoredResults:
     solutions_of_runs = []
     all_positions = []
     failures = []
-    search = study["search"]
-    digest = identity_digest(manifest)
-    budget = search["evaluations"]
-    labels = dict.fromkeys(map(label_of, search["algorithms"]))
-    for algorithm, run in product(labels, range(search["runs"])):
-        name = run_name(algorithm, run)
-        path = journal_file(folder, name)
-        if not path.exists():
-            continue
-        content = read_journal(path, journal_head(digest, name, characteristics))
+    budget = study["search"]["evaluations"]
+    for key, path, head in stored_journals(folder, manifest):
+        content = read_journal(path, head)
         positions, evaluations = content.requested_within(budget)
-        evaluations_of_runs.append(((algorithm, run), evaluations))
+        evaluations_of_runs.append((key, evaluations))
         all_positions += positions
-        failures += failed_settings((algorithm, run), positions, evaluations)
+        failures += failed_settings(key, positions, evaluations)
         if budget in content.results:
-            solutions_of_runs.append(
-                ((algorithm, run), content.take_positions(content.results[budget]))
-            )
+            solutions_of_runs.append((key, content.take_positions(content.results[budget])))
 
     # Tables of all runs.
     frame = evaluations_frame(characteristics, evaluations_of_runs)

@@ -104,7 +104,7 @@ def make_directory(path: Path) -> None:
     Raises
     ------
     InputError
-        If the directory cannot be written.
+        If the directory cannot be written, or something else is in place of one of its files.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -116,6 +116,14 @@ def make_directory(path: Path) -> None:
         raise InputError(
             "out", f"cannot write to {path}: {problem}", "a directory that can be written"
         ) from None
+    for name, is_right in {
+        MANIFEST: Path.is_file,
+        SOLUTIONS: Path.is_file,
+        RUNS: Path.is_dir,
+    }.items():
+        if (path / name).exists() and not is_right(path / name):
+            problem = f"is no {'folder' if name == RUNS else 'file'}"
+            raise InputError(path / name, problem, "nothing of this name, or another `out`")
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -5,8 +5,9 @@ and solutions. The same study and seed give the same bytes.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeVar
@@ -17,6 +18,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
+from safevar_sumo.results.journal import journal_head, open_and_lock, read_journal
 from safevar_sumo.results.manifest import (
     FORMAT,
     IDENTITY,
@@ -24,16 +26,19 @@ from safevar_sumo.results.manifest import (
     RUNS,
     SOLUTIONS,
     disk_errors,
+    identity_digest,
+    journal_file,
     make_directory,
     manifest_differences,
     manifest_of,
     read_manifest,
+    run_name,
     search_extent_of,
     stored_runs,
     write_manifest,
     write_whole,
 )
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import Study, label_of, tables_of
 from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
@@ -57,11 +62,14 @@ class ResultsDirectory:
         `safevar_sumo.campaign.identity.identity_of`.
     scoring
         Metrics and objectives.
+    wanted
+        Names of the runs that are to be carried out.
 
     Raises
     ------
-    InputError
-        If the directory cannot be written, or belongs to another study or version.
+    SafevarError
+        If the directory cannot be written, it or a journal in it belongs to another study or
+        version, or another process works on a wanted run; then nothing in it was changed.
     """
 
     def __init__(
@@ -70,6 +78,7 @@ class ResultsDirectory:
         study: Study,
         identity: Tables = MappingProxyType({}),
         scoring: Scoring = PUBLISHED_SCORING,
+        wanted: Collection[str] = (),
     ) -> None:
         # The manifest as it would be written now.
         self.path = path
@@ -82,6 +91,12 @@ class ResultsDirectory:
         # Earlier results in the directory are those of this study.
         make_directory(path)
         self._earlier_manifest()
+
+        # Journals that the runs cannot continue are refused before anything is changed.
+        for key, journal, head in stored_journals(path, self.manifest):
+            read_journal(journal, head, head_only=True)
+            if run_name(*key) in wanted:
+                open_and_lock(journal).close()
 
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove a table of solutions
@@ -137,6 +152,24 @@ class ResultsDirectory:
                 self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}"
             )
         return stored
+
+
+def stored_journals(
+    directory: Path, manifest: JsonObject
+) -> Iterator[tuple[tuple[str, int], Path, JsonObject]]:
+    """The journals that exist of a manifest's study: the algorithm and number of each run, its
+    file, and the head that the file must have.
+    """
+    study = manifest["study"]
+    search = study["search"]
+    characteristics = [*study["vehicle"]["characteristics"], *study["scenario"].get("search", ())]
+    digest = identity_digest(manifest)
+    labels = dict.fromkeys(map(label_of, search["algorithms"]))
+    for algorithm, run in product(labels, range(search["runs"])):
+        name = run_name(algorithm, run)
+        path = journal_file(directory, name)
+        if path.exists():
+            yield (algorithm, run), path, journal_head(digest, name, characteristics)
 
 
 def solutions_frame(

@@ -109,6 +109,7 @@ def test_a_run_in_other_hands_is_left_to_them_and_named(
     with pytest.raises(SafevarError, match=r"rs-01\.jsonl: another process works on this run"):
         carried_out(study, tmp_path / "out")
     journal.close()
+    assert [*path.parent.iterdir()] == [path], "no other run has begun"
     assert path.read_bytes() == theirs
     carried_out(study, tmp_path / "out")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")

@@ -37,8 +37,8 @@ from safevar_sumo.results.manifest import (
     packages_of,
     read_manifest,
 )
-from safevar_sumo.study import Study, tables_of
-from tests.campaign.formulas import with_search
+from safevar_sumo.study import Study, tables_of, write_study
+from tests.campaign.formulas import carried_out, with_search
 from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations
 
@@ -374,6 +374,7 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
     journal = copied / "runs/rs-00.jsonl"
     journal.unlink()
     make(journal)
+    before = contents(copied)
     study = str(slippery.parent / "slippery.toml")
     for command in (
         ("tables", str(copied)),
@@ -383,6 +384,58 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
         refused(
             *command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew")
         )
+    assert contents(copied) == before
+
+
+def as_of_another_study(journal: Path) -> None:
+    journal.write_bytes(re.sub(rb'"study":"\w+"', b'"study":"other"', journal.read_bytes()))
+
+
+def made_anew(make: Callable[[Path], object], path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    make(path)
+
+
+IN_THE_WAY: dict[str, Callable[[Path], object]] = {
+    "journal of another study": lambda out: as_of_another_study(out / "runs/rs-00.jsonl"),
+    "journal without a manifest": lambda out: [
+        as_of_another_study(out / "runs/rs-00.jsonl"),
+        (out / "manifest.json").unlink(),
+    ],
+    "no journal": lambda out: (out / "runs/rs-01.jsonl").write_text("notes\nand more"),
+    "file as the journals' folder": lambda out: made_anew(Path.touch, out / "runs"),
+    "folder as the table": lambda out: made_anew(os.mkdir, out / "solutions.csv"),
+    "pipe as the manifest": lambda out: made_anew(os.mkfifo, out / "manifest.json"),
+}
+
+
+@pytest.mark.parametrize("what", IN_THE_WAY)
+def test_what_makes_a_study_refuse_is_found_before_anything_is_written(
+    what: str, study: Study, tmp_path: Path
+) -> None:
+    study = with_search(study, algorithms=["rs"], runs=1)
+    carried_out(study, tmp_path)
+    (tmp_path / "runs/rs-00.verified").touch()
+    IN_THE_WAY[what](tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match=r"rs-0\d\.jsonl|manifest|solutions|runs"):
+        carried_out(with_search(study, runs=2), tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_results_survive_a_study_whose_characteristics_are_in_another_order(
+    copied: Path, case: Case, in_tmp: Path
+) -> None:
+    rows = case.study.vehicle.characteristics
+    vehicle = msgspec.structs.replace(
+        case.study.vehicle, characteristics=dict(reversed(rows.items()))
+    )
+    write_study(Path("slippery.toml"), msgspec.structs.replace(case.study, vehicle=vehicle), "")
+    before = contents(copied)
+    command = ("study", "slippery.toml", "--runs", "2", "--out", str(copied), "--jobs", "1")
+    refused(*command, message=("another study",))
+    assert contents(copied) == before
+    assert "collision" in run("explain", str(copied), "--limit", "200", "--fits", "0").stdout
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
