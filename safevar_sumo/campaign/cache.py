@@ -81,19 +81,16 @@ class Cache:
     ----------
     is_read
         Whether entries are read, besides written.
-
-    Attributes
-    ----------
-    settings_kept
-        Number of settings that were kept since it was opened.
+    is_counted
+        Whether an entry, `NUMBER`, counts the settings that are kept.
     """
 
-    def __init__(self, folder: Path, *, is_read: bool = True) -> None:
+    def __init__(self, folder: Path, *, is_read: bool = True, is_counted: bool = False) -> None:
         self._folder = folder
         self._is_read = is_read
         self._entries: diskcache.Cache | None = None
         self._keys = dict[bytes, bytes]()
-        self.settings_kept = 0
+        self._is_counted = is_counted
         self._guarded(self._open, None)
 
     def key_of(self, study: Study, use: Use) -> bytes:
@@ -116,11 +113,17 @@ class Cache:
         content = entry[DIGEST_SIZE:]
         return content if entry[:DIGEST_SIZE] == _digest(key, content) else None
 
-    def put(self, key: bytes, content: bytes) -> None:
-        """Keep an entry."""
+    def put(self, key: bytes, content: bytes, settings: int = 0) -> None:
+        """Keep an entry, with the results of so many settings."""
         entries = self._entries
         if entries is not None:
             self._guarded(entries.set, None, key, _digest(key, content) + content)
+        if settings and self._is_counted:
+            self.put(NUMBER, str(self.number_kept() + settings).encode())
+
+    def number_kept(self) -> int:
+        """Number of settings whose results a counted cache has."""
+        return int(self.get(NUMBER) or 0)
 
     def extent(self) -> tuple[int, int]:
         """How many entries there are, and their size on disk [bytes]."""
@@ -214,12 +217,10 @@ class CommandCache:
         if self._is_fresh:
             shutil.rmtree(self._own_folder, ignore_errors=True)
         begun = self._own_folder.stat().st_mtime if self._own_folder.is_dir() else None
-        self._own = Cache(self._own_folder)
-        kept = self._own.get(NUMBER)
-        if begun is not None and kept is not None:
-            self._own.settings_kept = int(kept)
+        self._own = Cache(self._own_folder, is_counted=True)
+        if begun is not None and (number := self._own.number_kept()):
             at = time.strftime("%H:%M", time.localtime(begun))
-            warn(f"continues: {int(kept):,} simulated at {at}")
+            warn(f"continues: {number:,} simulated at {at}")
 
 
 _cache = ContextVar[CommandCache | None]("cache", default=None)

@@ -15,13 +15,7 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.cache import (
-    NUMBER,
-    cache_of,
-    content_of,
-    evaluations_in,
-    key_of_settings,
-)
+from safevar_sumo.campaign.cache import cache_of, content_of, evaluations_in, key_of_settings
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -107,9 +101,7 @@ def evaluate_all(
             refuse_changed_inputs(study, system, inputs)
         pool.verified[packed_study] += max(min(sample_size, len(portion)), 0)
         if cache and not evaluations.failed.any():
-            cache.put(key, content_of(evaluations))
-            cache.settings_kept += len(portion)
-            cache.put(NUMBER, str(cache.settings_kept).encode())
+            cache.put(key, content_of(evaluations), len(portion))
         found.append(evaluations)
     return Evaluations.concatenate(found).take(row_of.ravel())
 
