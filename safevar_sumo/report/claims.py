@@ -33,7 +33,7 @@ from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.report.pack import DESCRIPTION, PackedManifest, PackedStudy, json_of
+from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
 from safevar_sumo.report.page import answer_to, make_page
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.results import (
@@ -168,14 +168,19 @@ class Packed:
 
     @cached_property
     def shown(self) -> Case:
-        """The results by the criterion of the pack."""
+        """The results by the criterion of the pack; raises InputError if it states a scoring that
+        its study does not have.
+        """
+        if self.case.scoring != assemble(self.case.study).measuring.scoring:
+            raise InputError(MANIFEST, "scoring is not that of the study", PACK)
         (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
         return case
 
     def answer(self, text: str) -> Answer:
         if text not in self._answers:
             add_import_folders(self._places)
-            case = self.shown if has_criterion(text, self.packed.unsafe) else self.case
+            shown = self.shown
+            case = shown if has_criterion(text, self.packed.unsafe) else self.case
             self._answers[text] = answer_to(
                 text, [case], [self._directory], None, self._jobs, self._progress
             )
@@ -225,13 +230,6 @@ class Packed:
             )
             return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 
-    def _inputs(self, folder: Path) -> bytes:
-        """What differs from the inputs of the manifest in `folder`; nothing if all is the same."""
-        changes = changes_since(folder, self.case, as_it_is_now=True)
-        if self.case.scoring != assemble(self.case.study).measuring.scoring:
-            changes.append("scoring is not that of the study")
-        return "; ".join(changes).encode()
-
     @property
     def versions(self) -> tuple[JsonObject, JsonObject]:
         """Versions and platform with which the study was searched, and those here."""
@@ -245,7 +243,11 @@ class Packed:
         """
         # Inputs and study.
         solutions = self.files[SOLUTIONS]
-        yield Claim("inputs", b"", partial(self._inputs, folder))
+        yield Claim(
+            "inputs",
+            b"",
+            lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode(),
+        )
         yield Claim("study", self.files[STUDY], self.study_file)
 
         # The original vehicle, solutions, answers and page.

@@ -54,6 +54,13 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     unsafe: str | None = None
 
 
+class PackedPlatform(Struct, frozen=True, forbid_unknown_fields=True):
+    """System and processor with which results were computed."""
+
+    system: str
+    machine: str
+
+
 class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
     """The keys of a manifest that a pack holds: those that `verify` compares or names."""
 
@@ -61,7 +68,7 @@ class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
     study: Study
     files: dict[str, str]
     results: int
-    platform: dict[str, str]
+    platform: PackedPlatform
     versions: dict[str, str]
     original: dict[str, bool | float | str | None]
     scoring: Scoring | None = None

@@ -402,7 +402,6 @@ IN_THE_WAY: dict[str, Callable[[Path], object]] = {
         as_of_another_study(out / "runs/rs-00.jsonl"),
         (out / "manifest.json").unlink(),
     ],
-    "no journal": lambda out: (out / "runs/rs-01.jsonl").write_text("notes\nand more"),
     "file as the journals' folder": lambda out: made_anew(Path.touch, out / "runs"),
     "folder as the table": lambda out: made_anew(os.mkdir, out / "solutions.csv"),
     "pipe as the manifest": lambda out: made_anew(os.mkfifo, out / "manifest.json"),
@@ -415,7 +414,6 @@ def test_what_makes_a_study_refuse_is_found_before_anything_is_written(
 ) -> None:
     study = with_search(study, algorithms=["rs"], runs=1)
     carried_out(study, tmp_path)
-    (tmp_path / "runs/rs-00.verified").touch()
     IN_THE_WAY[what](tmp_path)
     before = contents(tmp_path)
     with pytest.raises(InputError, match=r"rs-0\d\.jsonl|manifest|solutions|runs"):
