@@ -15,13 +15,16 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 
 from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import show_no_progress
 
 
@@ -66,6 +69,13 @@ def searched(study: Study, out: Path) -> Path:
         lambda message: None,
     )
     return out
+
+
+def verify_everywhere(system: System, settings: FloatArray) -> None:
+    """Verify settings, shape (M, n), in SUMO at every point, of a rating at some."""
+    points = system.points if system.rater is None else system.points[:: len(system.points) // 8]
+    for point in points:
+        assert not verify_in_sumo(system.at(point), settings, np.zeros(len(settings), dtype=int))
 
 
 class CommandOutput(NamedTuple):

@@ -171,7 +171,7 @@ def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() 
         for names, file in MENTION.findall((ROOT / page).read_text())
         for name in re.findall(r"`([\w.]+)`", names)
     ]
-    assert ("docs/architecture.md", "verify_sample", "sumo/verification.py") in mentions
+    assert ("docs/architecture.md", "verify_in_sumo", "sumo/verification.py") in mentions
     for page, name, file in mentions:
         path = next(
             (place / file for place in (ROOT / "safevar_sumo", ROOT) if (place / file).is_file()),

@@ -268,7 +268,7 @@ def _measured(
     ask_why_no_verdict(study, pool)
     start = time.process_time() + time.monotonic() - begin  # of this process and of a worker
     rate = measure_speed(task, pool, runs)
-    verification = measure_verification(task, pool) if used is Engine.RECORDED else 0.0
+    verification = measure_verification(task, pool, runs) if used is Engine.RECORDED else 0.0
 
     # The summary at the end loads statistics, and lets the original drive in this process.
     begin = time.monotonic()

@@ -7,25 +7,32 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
+from safevar_sumo.campaign.evaluation import (
+    Task,
+    carry_out,
+    evaluate_settings,
+    system_of,
+    verify_settings,
+)
 from safevar_sumo.campaign.identity import identity_of
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
-from safevar_sumo.campaign.runs import RunKey, RunResult, algorithm_of, all_runs
-from safevar_sumo.campaign.share import (
-    SAFE_SIMULATIONS,
-    Share,
-    carry_share,
-    verification_file,
-    verify_safe,
+from safevar_sumo.campaign.runs import (
+    MAX_REPEATED,
+    REPEATED,
+    RunKey,
+    RunResult,
+    algorithm_of,
+    all_runs,
 )
+from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
@@ -34,7 +41,7 @@ from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.terminal import Progress
+from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
 
 BATCHES_PER_SHARE = 2
@@ -45,12 +52,10 @@ PROBE_TIME = 5.0
 """Time of a measurement with a driving system that is called for each vehicle, roughly [s]."""
 PROBE_VEHICLES = 4000
 """Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
-VERIFIED_IN_SUMO = (
-    "each unsafe solution at its worst point, and up to"
-    f" {SAFE_SIMULATIONS} safe simulations of all tests and outcomes, half of them with the least"
-    " clearance"
-)
-"""What SUMO repeats of a search in recorded scenes, as the manifest says it."""
+UNSAFE_REPEATED = 150
+"""Largest number of unsafe solutions that SUMO repeats after a search in recorded scenes."""
+SETTINGS_PER_JOB = 150
+"""Largest number of settings that a worker repeats in SUMO at once."""
 ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
 """The engines that a study may name."""
 
@@ -87,8 +92,8 @@ def run_campaign(
     batch_size
         Maximum number of settings in a batch, which may hold settings of several runs.
     engine
-        What moves the vehicles; before a run is finished, results from recorded scenes are verified
-        in SUMO.
+        What moves the vehicles; when the results are written, some of those from recorded scenes
+        are verified in SUMO.
     retry_failed
         Whether to simulate settings again that failed before.
 
@@ -105,12 +110,7 @@ def run_campaign(
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)
-    verifies = engine_used is Engine.RECORDED
-    results.manifest["engine"] = {
-        "name": str(engine_used),
-        "reason": reason,
-        **({"verified": VERIFIED_IN_SUMO} if verifies else {}),
-    }
+    results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
     results.manifest |= _about_algorithms(study)
     task = Task(
         study=study,
@@ -119,7 +119,7 @@ def run_campaign(
     )
 
     # What the user should know before the search begins.
-    show_journals = journal_progress(study, keys, directory, progress, verifies=verifies)
+    show_journals = journal_progress(study, keys, directory, progress)
     show_journals([])
     compile_vehicle(study, pool, progress)
     no_verdict = ask_why_no_verdict(study, pool)
@@ -131,18 +131,17 @@ def run_campaign(
 
     # Each worker carries out a share of the runs.
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
-    about = directory.absolute(), results.manifest, original, verifies, retry_failed
-    shares = [(task, Share(dealt, *about, k, len(hands))) for k, dealt in enumerate(hands)]
-    runs = list[RunResult]()
-    for finished_runs, remark in carry_out(carry_share, shares, pool, show_journals):
-        runs += finished_runs
-        if remark:
-            warn(remark)
+    about = directory.absolute(), results.manifest, original, retry_failed
+    shares = [(task, Share(dealt, *about)) for dealt in hands]
+    runs = [*chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))]
 
-    # Solutions are written when all runs are finished.
+    # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
     runs.sort(key=lambda run: run.key)
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
+    if engine_used is Engine.RECORDED and runs:
+        for remark in repeat_in_sumo(task, choose_sample(study, original, runs), pool, progress):
+            warn(remark)
     return Campaign(original, runs, system.measuring.scoring, no_verdict)
 
 
@@ -204,41 +203,56 @@ def deal(
     ]  # like cards: each share gets runs of all algorithms
 
 
-def journal_progress(
-    study: Study,
-    keys: Sequence[RunKey],
-    directory: Path,
-    progress: Progress,
-    *,
-    verifies: bool = False,
-) -> Callable[[Sequence[int]], None]:
-    """A function that shows the evaluations that runs have asked for, as their journals tell, and
-    the simulations that SUMO repeats, which count as evaluations.
+def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]) -> Evaluations:
+    """What SUMO repeats of a search: its unsafe solutions, or as many of them as `UNSAFE_REPEATED`
+    allows, and others that the study's seed draws.
     """
+    # Unsafe solutions, each once.
+    solutions = Evaluations.concatenate([run.solutions for run in runs])
+    values = {name: float(one[0]) for name, one in original.metrics.items()}
+    rows = np.flatnonzero(Unsafe.default(values, solutions.outcome).of(solutions))
+    rows = rows[np.unique(solutions.settings[rows], axis=0, return_index=True)[1]]
+
+    # Others after them, in turns of all runs.
+    rng = np.random.default_rng(study.search.seed)
+    drawn = Evaluations.concatenate([run.sample for run in runs])
+    drawn = drawn.take(rng.permutation(len(drawn)))
+    unsafe = solutions.take(rng.permutation(rows)[:UNSAFE_REPEATED])
+    both = Evaluations.concatenate([unsafe, drawn])
+    first = np.unique(both.settings, axis=0, return_index=True)[1]
+    return both.take(np.sort(first)[:MAX_REPEATED])
+
+
+def repeat_in_sumo(task: Task, sample: Evaluations, pool: Pool, progress: Progress) -> set[str]:
+    """Repeat evaluations in SUMO; returns remarks on what could not be simulated. Raises the error
+    of `verify_in_sumo`.
+    """
+    phase = f"{task.study.name}: verifying in SUMO, settings"
+    batches = np.array_split(np.arange(len(sample)), math.ceil(len(sample) / SETTINGS_PER_JOB) or 1)
+    jobs = [(task, sample.settings[rows], sample.points[rows]) for rows in batches]
+    verified = 0
+
+    def show(ended: Sequence[int]) -> None:
+        nonlocal verified
+        verified += sum(len(batches[number]) for number in ended)
+        progress(phase, verified, len(sample))
+
+    return {remark for remark in carry_out(verify_settings, jobs, pool, show) if remark}
+
+
+def journal_progress(
+    study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
+) -> Callable[[Sequence[int]], None]:
+    """A function that shows the evaluations that runs have asked for, as their journals tell."""
     readers = [
         JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys
     ]
-    counters = [verification_file(directory, key) for key in keys]
-    for counter in counters:
-        with suppress(OSError):
-            counter.unlink()  # of a command that was killed
-    counts = dict[Path, tuple[int, int]]()
 
     def show(ended: Sequence[int]) -> None:
         asked = sum(reader.asked() for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
-
-        # A share's file is gone when its verification has ended.
-        for counter in counters:
-            with suppress(OSError, ValueError):
-                repeated, expected = map(int, counter.read_text().split())
-                counts[counter] = repeated, expected
-        repeated, expected = map(sum, zip(*counts.values(), strict=True)) if counts else (0, 0)
         phase = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
-        if counts:
-            phase = f"{study.name}: verifying in SUMO, {repeated} of {expected}"
-        left = max(expected, SAFE_SIMULATIONS if verifies else 0)
-        progress(phase, asked + repeated, len(keys) * study.search.evaluations + left)
+        progress(phase, asked, len(keys) * study.search.evaluations)
 
     return show
 
@@ -283,13 +297,15 @@ def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
     return workers * size / (time.perf_counter() - start)
 
 
-def measure_verification(task: Task, pool: Pool) -> float:
-    """The time that the verification of safe simulations in SUMO takes, measured with those of
-    random settings [s].
+def measure_verification(task: Task, pool: Pool, runs: int) -> float:
+    """The time that the verification of so many runs in SUMO takes, measured with random settings
+    [s].
     """
-    settings = _random_settings(task.study, SAFE_SIMULATIONS)
+    number = min(math.ceil(runs * task.study.search.evaluations / REPEATED), MAX_REPEATED)
+    settings = _random_settings(task.study, number)
+    (evaluations,) = carry_out(evaluate_settings, [(task, settings)], pool)
     start = time.monotonic()
-    carry_out(verify_safe, [(task, settings)], pool)
+    repeat_in_sumo(task, evaluations, pool, show_no_progress)
     return time.monotonic() - start
 
 

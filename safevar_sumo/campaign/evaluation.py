@@ -20,7 +20,7 @@ from safevar_sumo.campaign.pool import Pool, WorkerLostError
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins.time_limit import end_if_longer
-from safevar_sumo.records import Evaluations, FloatArray, Outcome, differences
+from safevar_sumo.records import Evaluations, FloatArray, IntArray, Outcome, differences
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
@@ -300,6 +300,6 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     return " ".join(words)
 
 
-def verify_settings(task: Task, settings: FloatArray) -> str:
+def verify_settings(task: Task, settings: FloatArray, worst: IntArray) -> str:
     """Verify recorded scenes of a task; see `verify_in_sumo`."""
-    return verify_in_sumo(system_of(task.study), settings)
+    return verify_in_sumo(system_of(task.study), settings, worst)

@@ -143,7 +143,7 @@ def _simulate(
     if batches.are_recorded and sample_size > 0 and task.selection == EVERYTHING:
         sample = np.linspace(0, len(settings) - 1, sample_size).astype(int)
         sample = sample[~evaluations.failed[sample]]
-        carry_out(verify_settings, [(task, settings[sample])], pool)
+        carry_out(verify_settings, [(task, settings[sample], evaluations.points[sample])], pool)
     return evaluations
 
 
@@ -259,7 +259,7 @@ def check_code(study: Study, pool: Pool) -> Use:
 
 
 def _refuse_defects(task: Task) -> Use:
-    from safevar_sumo.plugins.check import refuse_defects  # slow to import, and rarely needed
+    from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
 
     unload_user_modules()
     with record_use(task.study.origin.places) as use:

@@ -4,6 +4,7 @@ and its known evaluations.
 
 from __future__ import annotations
 
+import math
 import zlib
 from typing import NamedTuple
 
@@ -12,8 +13,8 @@ import numpy as np
 from safevar_sumo.errors import InputError, about, unknown_name
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins import Lookup, Member, instance_of
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.results import FailedSetting, Journal, failed_settings, run_name
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.results import Journal, run_name
 from safevar_sumo.search import (
     ALGORITHMS,
     DESCRIPTIONS,
@@ -25,6 +26,11 @@ from safevar_sumo.search import (
 )
 from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 from safevar_sumo.sumo.system import System
+
+REPEATED, MAX_REPEATED = 10, 300
+"""SUMO repeats at most one in so many simulations of a search, besides its unsafe solutions, and at
+most so many settings.
+"""
 
 
 class RunKey(NamedTuple):
@@ -38,17 +44,13 @@ class RunKey(NamedTuple):
 
 
 class RunResult(NamedTuple):
-    """A finished run: its solutions, settings that could not be simulated, and numbers of distinct
-    settings: all that were simulated, those that collided, and those that left the speed tolerance
-    of a test.
+    """A finished run: its solutions, and what SUMO may repeat: one in `REPEATED` of the settings
+    that could be simulated, drawn at random, and at most `MAX_REPEATED`.
     """
 
     key: RunKey
     solutions: Evaluations
-    failures: list[FailedSetting]
-    simulated: int
-    collisions: int
-    invalid_tests: int
+    sample: Evaluations
 
 
 def all_runs(study: Study) -> list[RunKey]:
@@ -233,25 +235,19 @@ class Run:
             evaluations=Evaluations.concatenate([known, evaluations]),
         )
 
-    def requested(self) -> Evaluations:
-        """Evaluations of the distinct settings that the search has requested."""
-        return self._content.requested_within(self._budget)[1]
-
-    def finish(self) -> RunResult:
+    def finish(self, rng: np.random.Generator) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""
         if not self.is_finished:
             rows = [self._row_of[setting.tobytes()] for setting in self.solutions.settings]
             self._journal.finish([self._content.positions[row] for row in rows], self._budget)
         self.close()
-        positions, requested = self._content.requested_within(self._budget)
-        return RunResult(
-            self.key,
-            self.solutions,
-            failed_settings(self.key, positions, requested),
-            simulated=len(requested),
-            collisions=int(np.count_nonzero(requested.collided)),
-            invalid_tests=int(np.count_nonzero(requested.outcome == Outcome.INVALID_TEST.value)),
-        )
+
+        # What SUMO may repeat.
+        requested = self._content.requested_within(self._budget)[1]
+        simulated = np.flatnonzero(~requested.failed & ~requested.infeasible)
+        number = min(math.ceil(len(simulated) / REPEATED), MAX_REPEATED)
+        sample = requested.take(rng.permutation(simulated)[:number])
+        return RunResult(self.key, self.solutions, sample)
 
     def close(self) -> None:
         """Leave the run to another process."""

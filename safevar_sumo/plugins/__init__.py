@@ -1,8 +1,4 @@
-"""User code: looked up by its name, checked against a contract; `plugins.check` tries it.
-
-`plugins.check` stands above `sumo` and `search`, which it uses; the rest of this room stands below
-the models, which use it.
-"""
+"""User code: looked up by its name, checked against a contract; the room `check` tries it."""
 
 from safevar_sumo.plugins.contract import (
     FINITE as FINITE,

@@ -35,7 +35,7 @@ from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
-    from safevar_sumo.plugins.check.trials import Extent
+    from safevar_sumo.check.trials import Extent
 
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
@@ -285,7 +285,7 @@ def check(
         return check_scenario(name, ego or "Ego", FINDINGS)
     # What loads SUMO is imported where it is needed.
     from safevar_sumo.campaign import check_algorithms
-    from safevar_sumo.plugins.check import CHECKS, check_study, study_to_check
+    from safevar_sumo.check import CHECKS, check_study, study_to_check
     from safevar_sumo.sumo.system import assemble
 
     study = study_to_check(name)

@@ -33,13 +33,8 @@ PATIENCE = 2.0
 """Time within which the workers of a killed process end, which hold locks until then [s]."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-POSITION, OUTCOME, REASON, SOLUTIONS, CHECKSUM = (
-    "evaluation",
-    "outcome",
-    "reason",
-    "solutions",
-    "crc32",
-)
+POSITION, OUTCOME, REASON, POINT = "evaluation", "outcome", "reason", "point"
+SOLUTIONS, CHECKSUM = "solutions", "crc32"
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
@@ -315,6 +310,8 @@ def _batch_line(
         **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
         **{name: values.tolist() for name, values in evaluations.metrics.items()},
     }
+    if evaluations.worst_points is not None:
+        line[POINT] = evaluations.worst_points.tolist()
     if evaluations.reasons:
         reasons = [evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings]
         line |= {REASON: reasons} if any(reasons) else {}
@@ -331,7 +328,7 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     columns = {
         name: np.array(values, dtype=float)
         for name, values in line.items()
-        if name not in (POSITION, OUTCOME, REASON)
+        if name not in (POSITION, OUTCOME, REASON, POINT)
     }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
     reasons = line.get(REASON, [None] * len(settings))
@@ -348,4 +345,5 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
             for setting, reason in zip(settings, reasons, strict=True)
             if reason
         },
+        worst_points=np.array(line[POINT], dtype=np.intp) if POINT in line else None,
     )

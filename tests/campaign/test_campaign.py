@@ -18,20 +18,17 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
-from safevar_sumo.campaign.campaign import deal, journal_progress, measure_speed
+from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
-from safevar_sumo.campaign.share import settings_to_verify, verification_file
 from safevar_sumo.errors import SafevarError
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, Outcome
+from safevar_sumo.records import Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
 from tests.in_process import InlinePool, searched
-from tests.made_up import made_up_evaluations
 
 
 @pytest.fixture
@@ -159,9 +156,10 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(
     journal.append([0, 1], both)
     journal.finish([0], 1)
     journal.close()
-    result = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1).finish()  # type: ignore[arg-type]
-    assert (result.collisions, result.invalid_tests, result.failures) == (0, 0, [])
-    assert np.array_equal(result.solutions.settings, both.settings[:1])
+    run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1)  # type: ignore[arg-type]
+    result = run.finish(np.random.default_rng(0))
+    for found in (result.solutions, result.sample):
+        assert np.array_equal(found.settings, both.settings[:1])
 
 
 def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused(
@@ -207,65 +205,6 @@ def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
     assert pool.sizes == [1, 1, 10]
 
 
-def test_each_unsafe_solution_is_verified_once_and_the_least_safe_of_each_kind_of_others() -> None:
-    """Of 5,000 settings half collide, and those are solutions twice."""
-    rng = np.random.default_rng(1)
-    requested = made_up_evaluations(rng.uniform(-1, 1, 5000), settings=rng.random((5000, 3)))
-    both = Evaluations.concatenate([requested, requested])
-    solutions = both.take(np.arange(0, 10_000, 4))
-    unsafe, others = settings_to_verify(requested, solutions, Unsafe(), 100)
-    collided = solutions.take(solutions.collided).settings
-    assert {row.tobytes() for row in unsafe} == {row.tobytes() for row in collided}
-    assert len(unsafe) == len({row.tobytes() for row in unsafe})
-    named = {row.tobytes() for row in others}
-    safe = requested.take(~requested.collided)
-    assert {row.tobytes() for row in safe.settings[np.argsort(safe.f_safe)[:100]]} <= named
-    assert not {row.tobytes() for row in collided} & named
-    kinds = Counter(requested.outcome[[row.tobytes() in named for row in requested.settings]])
-    assert min(kinds.values()) >= 100
-    assert len(kinds) == len({*requested.outcome})
-    assert len(others) <= 300
-
-
-def test_what_sumo_refused_and_searches_without_a_solution_are_not_repeated() -> None:
-    settings = np.arange(6.0).reshape(3, 2)
-    requested = made_up_evaluations([1.0, 1.0, 1.0], settings=settings)
-    failed = dataclasses.replace(
-        requested, outcome=np.array(["stopped", "stopped", Outcome.SIMULATOR_ERROR.value])
-    )
-    unsafe, others = settings_to_verify(failed, failed.take([]), Unsafe(), 300)
-    assert unsafe.shape == (0, 2)
-    assert np.array_equal(others, settings[:2])
-    unsafe, others = settings_to_verify(failed.take([2]), failed.take([2]), Unsafe(), 300)
-    assert unsafe.shape == others.shape == (0, 2)
-
-
-@pytest.mark.parametrize("killed_before", [False, True])
-def test_progress_counts_what_sumo_repeats_and_leaves_time_for_it(
-    tmp_path: Path, *, killed_before: bool
-) -> None:
-    """A file of a command that was killed counts for nothing."""
-    study = with_search(load_study("smoke"), algorithms=["rs"], runs=2, evaluations=100)
-    shown = list[tuple[str, int, int]]()
-    keys = [RunKey("rs", 0), RunKey("rs", 1)]
-    files = [verification_file(tmp_path, key) for key in keys]
-    files[0].parent.mkdir()
-    if killed_before:
-        files[0].write_text("290 300")
-    progress = journal_progress(
-        study, keys, tmp_path, lambda *values: shown.append(values), verifies=True
-    )
-    progress([])
-    assert shown[-1] == ("smoke: 0/2 runs, evaluations", 0, 500)
-    files[0].write_text("120 155")
-    progress([])
-    files[0].unlink()
-    files[1].write_text("0 160")
-    progress([])
-    assert [(done, total) for _, done, total in shown[1:]] == [(120, 500), (120, 515)]
-    assert "verifying in SUMO, 120 of 315" in shown[-1][0]
-
-
 ROOT = Path(__file__).parents[2]
 PACKAGE = f"{ROOT / 'safevar_sumo'}/"
 ENDS = {
@@ -289,7 +228,7 @@ ENDS = {
 """Where a setting, or what became of it, leaves the package's way: into a model, a metric, or a
 file.
 """
-BESIDE = "_verify"
+BESIDE = "repeat_in_sumo"
 """Verification takes a way of its own."""
 
 

@@ -16,8 +16,8 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import _verdict
+from safevar_sumo.check import check_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.plugins.check import check_study
 from safevar_sumo.protocol import EURO_NCAP_2026, protocol_of, rater
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain

@@ -19,8 +19,7 @@ from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import json_of, run
+from tests.in_process import json_of, run, verify_everywhere
 from tests.made_up import drawn
 
 MINE = """
@@ -108,7 +107,7 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
             found.f_safe[row],
             found.metrics["original_safety_degree"][row],
         ]
-    assert not verify_in_sumo(system, settings)
+    verify_everywhere(system, settings)
 
 
 def test_a_matrix_runs_over_them(in_tmp: Path) -> None:

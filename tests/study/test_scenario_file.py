@@ -23,8 +23,7 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import json_of, run
+from tests.in_process import json_of, run, verify_everywhere
 from tests.openscenario.writing import (
     AT_ONCE,
     PARAMETER,
@@ -175,7 +174,7 @@ def test_sumo_repeats_a_run() -> None:
     (result,) = simulate_all_points(system, settings)
     assert result.runs.outcome[0] != Outcome.INVALID_TEST
     (point,) = system.points
-    assert verify_in_sumo(system, settings) == ""
+    verify_everywhere(system, settings)
     assert point.scenario.vut_length == 4.2  # type: ignore[attr-defined]
 
 

@@ -25,8 +25,7 @@ from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import InlinePool, searched
+from tests.in_process import InlinePool, searched, verify_everywhere
 from tests.made_up import drawn
 from tests.sumo.planted import BRAKING, GAP
 
@@ -146,7 +145,7 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
             rtol=0,
             atol=ROUNDING,
         )
-    assert not verify_in_sumo(system, settings)
+    verify_everywhere(system, settings)
 
 
 def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:

@@ -28,8 +28,7 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import at_point, drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.in_process import json_of, run
+from tests.in_process import json_of, run, verify_everywhere
 from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
@@ -141,11 +140,11 @@ def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_o
     system = assemble(load_study("wear", ads=ads, scenario=car, matrix={"tests": tests}))
     outcomes = drive_and_score(system, original_of(system)).outcome.tolist()
     assert outcomes == ["timeout"]
-    verify_in_sumo(system, original_of(system))
+    verify_everywhere(system, original_of(system))
 
 
 def test_driven_speeds_lead_to_the_same_places_and_collisions_in_sumo(any_system: System) -> None:
-    verify_in_sumo(any_system, drawn(any_system, 20, 7))
+    verify_everywhere(any_system, drawn(any_system, 20, 7))
 
 
 def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
@@ -158,7 +157,7 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
     with pytest.raises(
         InputError, match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = "
     ):
-        verify_in_sumo(system, drawn(system, 60, 5))
+        verify_everywhere(system, drawn(system, 60, 5))
 
 
 FIRST = "On a first drive, with nobody in sight, the original vehicle "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,20 +13,23 @@ import pytest
 
 from safevar_sumo.api import study as command
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import all_runs, run_campaign
+from safevar_sumo.campaign import RunKey
+from safevar_sumo.campaign.campaign import UNSAFE_REPEATED, choose_sample
+from safevar_sumo.campaign.runs import MAX_REPEATED, RunResult
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import FloatArray, SimulationRuns
+from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import matrix, verification
 from safevar_sumo.sumo.system import System, assemble
-from safevar_sumo.sumo.verification import Sample, spread_points, verify_sample
-from safevar_sumo.terminal import show_no_progress
-from tests.in_process import InlinePool
-from tests.made_up import drawn
+from safevar_sumo.sumo.verification import verify_in_sumo
+from tests.campaign.formulas import with_search
+from tests.in_process import searched
+from tests.made_up import drawn, made_up_evaluations
 
-TESTS = ("cut_in", "cut_out", "following")
-Repeated = list[tuple[str, FloatArray, SimulationRuns]]
+TESTS = ("CutIn", "CutOut", "CarToCar")
+"""Scenarios of the tests of `alks`."""
+Repeated = list[tuple[Point, FloatArray]]
 
 
 @pytest.fixture
@@ -37,11 +39,11 @@ def study() -> Study:
 
 @pytest.fixture
 def repeated(monkeypatch: pytest.MonkeyPatch) -> Repeated:
-    """The scenarios, settings and runs that SUMO is to repeat."""
+    """The points and settings that SUMO is to repeat."""
     them: Repeated = []
 
     def note(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
-        them.append((type(system.scenario).__name__, settings, runs))
+        them.append((system.points[0], settings))
 
     monkeypatch.setattr(verification, "_verify_point", note)
     return them
@@ -53,7 +55,7 @@ def with_fault(test: str) -> Callable[..., Any]:
 
     def drive(system: System, *arguments: Any) -> SimulationRuns:
         runs = drive_all(system, *arguments)
-        names = [dict(point.parameters)["test"] for point in system.points]
+        names = [type(point.scenario).__name__ for point in system.points]
         is_of_test = np.repeat(np.array(names) == test, len(runs.outcome) // len(names))
         gap = runs.trace.gap + np.where(is_of_test, 1e-3, 0.0)
         return replace(runs, trace=replace(runs.trace, gap=gap))
@@ -66,73 +68,64 @@ def with_fault(test: str) -> Callable[..., Any]:
 def test_a_fault_of_the_fast_engine_in_one_test_of_a_matrix_is_found(
     test: str, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(matrix, "drive_all", with_fault(test))
-    with pytest.raises(InputError, match=r"gap at .* in the recorded scene and .* in SUMO"):
-        run_campaign(
-            study,
-            assemble(study),
-            all_runs(study),
-            tmp_path,
-            InlinePool(),
-            show_no_progress,
-            lambda remark: None,
-        )
+    """Each time that the command is given; the results are kept."""
+    faulty = with_fault(test)
+    for module in (matrix, verification):
+        monkeypatch.setattr(module, "drive_all", faulty)
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"gap at .* in the recorded scene and .* in SUMO"):
+            searched(study, tmp_path)
+        assert (tmp_path / "solutions.csv").exists()
 
 
-def test_a_sample_has_each_unsafe_setting_once_and_safe_simulations_of_every_test(
+def test_each_setting_drives_at_its_worst_point_and_one_of_each_test_has_its_turn(
     study: Study, repeated: Repeated
 ) -> None:
-    """Half of a point's safe simulations are those with the least clearance there."""
     system = assemble(study)
-    settings = drawn(system, 40, 2)
-    points = spread_points(system)
-    unsafe = settings[10:14]
-    worst = np.array([0, 0, 3, 14])
-    counts = list[int]()
-    sample = Sample(unsafe, worst, settings[14:], 30, points)
-    safe, remark = verify_sample(system, Unsafe(), sample, counts.append)
-    assert 30 <= safe <= 32, "of each kind of outcome one, too"
-    assert not remark
-    tests = Counter[str]()
-    for test, rows, _ in repeated:
-        tests[test] += len(rows)
-    assert {*tests} == {"CutIn", "CutOut", "CarToCar"}
-    assert counts[-1] == sum(tests.values())
-    assert counts == sorted(counts)
-    collided = sum(int((runs.outcome == "collision").sum()) for *_, runs in repeated)
-    assert collided <= len(unsafe), "safe simulations, and the unsafe settings at their worst point"
-    for setting in unsafe:
-        assert any((rows == setting).all(axis=1).any() for _, rows, _ in repeated)
+    settings = drawn(system, 12, 2)
+    worst = np.repeat([0, 3], 6)
+    assert not verify_in_sumo(system, settings, worst)
+    assert {type(point.scenario).__name__ for point, _ in repeated} == {*TESTS}
+    assert len(repeated) <= 2 + len(TESTS)
+    for number in (0, 3):
+        scenario = system.points[number].scenario
+        (rows,) = [rows for point, rows in repeated if point.scenario is scenario]
+        at_point = {row.tobytes() for row in rows}
+        assert {row.tobytes() for row in settings[worst == number]} <= at_point
+    assert sum(len(rows) for _, rows in repeated) <= 2 * len(settings)
 
 
-def test_the_sample_of_one_scenario_has_those_with_the_least_clearance(repeated: Repeated) -> None:
-    system = assemble(load_study("smoke"))
-    settings = drawn(system, 200, 4)
-    nothing = Sample(settings[:0], np.zeros(0, dtype=np.intp), settings, 60, [0])
-    found = matrix.drive_and_score(system, settings)
-    safe = np.flatnonzero(~found.collided)
-    number, _ = verify_sample(system, Unsafe(), nothing, lambda repeated: None)
-    assert 60 <= number <= 62, "one of each kind of outcome is among them"
-    [(_, rows, _)] = repeated
-    named = {row.tobytes() for row in rows}
-    least = safe[np.argsort(found.f_safe[safe], kind="stable")[:30]]
-    assert {row.tobytes() for row in settings[least]} <= named
-    assert {row.tobytes() for row in settings[found.collided]}.isdisjoint(named)
+def test_a_sample_has_unsafe_solutions_once_and_others_that_the_seed_draws(study: Study) -> None:
+    """Of two runs whose settings are partly the same."""
+    rng = np.random.default_rng(1)
+    settings = rng.random((5000, len(study.domains)))
+    requested = made_up_evaluations(rng.uniform(-1, 1, 5000), settings=settings)
+    requested = replace(requested, worst_points=np.arange(5000) % 15)
+    solutions = requested.take(np.arange(400))
+    samples = requested.take(np.arange(100, 400)), requested.take(np.arange(300, 600))
+    runs = [RunResult(RunKey("rs", run), solutions, samples[run]) for run in (0, 1)]
+    original = made_up_evaluations([1.0], settings=settings[:1])
+
+    def chosen() -> Evaluations:
+        return choose_sample(study, original, runs)
+
+    sample = chosen()
+    collided = {row.tobytes() for row in solutions.settings[solutions.collided]}
+    keys = [row.tobytes() for row in sample.settings]
+    assert len(keys) == len({*keys}) == MAX_REPEATED
+    assert {*keys[:UNSAFE_REPEATED]} <= collided
+    known = {row.tobytes(): point for row, point in zip(settings, requested.points, strict=True)}
+    assert [known[key] for key in keys] == sample.points.tolist()
+    assert np.array_equal(sample.settings, chosen().settings)
+    other = with_search(study, seed=7)
+    assert not np.array_equal(sample.settings, choose_sample(other, original, runs).settings)
 
 
-def test_points_of_a_sample_are_of_every_test() -> None:
-    """Ten tests of one point each, beside one of sixty."""
-    parameters = {"test": "CCRs", "vut_length": 4.7, "vut_width": 1.85}
-    many = {"name": "many", "parameters": parameters, "over": {"speed": [*range(20, 80)]}}
-    few = [
-        {"name": f"few {speed}", "parameters": {**parameters, "speed": speed}}
-        for speed in range(30, 40)
-    ]
-    car = {"model": "car_to_car", "parameters": {}}
-    system = assemble(load_study("wear", scenario=car, matrix={"tests": [many, *few]}))
-    names = {dict(system.points[number].parameters)["test"] for number in spread_points(system)}
-    assert names == {test["name"] for test in [many, *few]}
-    assert len(spread_points(system)) <= 26
+def test_a_search_without_a_solution_is_verified_too(study: Study) -> None:
+    drawn_settings = np.arange(3.0 * len(study.domains)).reshape(3, -1)
+    sample = made_up_evaluations([1.0, 1.0, 1.0], settings=drawn_settings)
+    runs = [RunResult(RunKey("rs", 0), sample.take([]), sample)]
+    assert len(choose_sample(study, sample.take([0]), runs)) == 3
 
 
 @pytest.mark.slow

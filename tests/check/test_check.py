@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.plugins.check import check_study, study_to_check, trials
+from safevar_sumo.check import check_study, study_to_check, trials
 from tests.in_process import json_of, run
 from tests.manual import files_of
 

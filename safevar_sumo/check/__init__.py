@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.check.trials import FailedCheck, try_algorithm, try_simulations
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
-from safevar_sumo.plugins.check.trials import FailedCheck, try_algorithm, try_simulations
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code

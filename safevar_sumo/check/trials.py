@@ -90,7 +90,7 @@ def try_simulations(
     system = _system(study)
     if ":" in study.scenario.model and is_recorded(system):
         try:
-            verify_in_sumo(system, settings)
+            verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:
             found, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
