@@ -33,12 +33,12 @@ import portalocker
 from diskcache.core import MODE_BINARY, MODE_RAW
 
 from safevar_sumo.campaign.evaluation import Selection, system_of
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Use, digests, file_by_name, files_in
 from safevar_sumo.records import CellResults, Evaluations, FloatArray
 from safevar_sumo.records.evaluations import COLUMNS
-from safevar_sumo.results import identity_digest, manifest_of
+from safevar_sumo.results import identity_digest
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import Study, user_code_names
 
@@ -326,7 +326,7 @@ def _key_of_study(study: Study, use: Use) -> bytes:
     The study and its files count as in the identity of results, and besides that where the files
     are, this package's own files, and the versions of Python and of all that is installed.
     """
-    manifest = manifest_of(study, identity_of(study, system_of(study), use.modules))
+    manifest = manifest_now(study, system_of(study), use.modules)
     paths = [os.path.abspath(file_by_name(name, study.origin.places)) for name in manifest["files"]]
     parts = [identity_digest(manifest), paths, _environment()]
     return sha256(msgspec.json.encode(parts)).digest()

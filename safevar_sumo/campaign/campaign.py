@@ -21,7 +21,7 @@ from safevar_sumo.campaign.evaluation import (
     system_of,
     verify_settings,
 )
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import (
@@ -104,9 +104,9 @@ def run_campaign(
     """
     # The directory, with the inputs of its results as they are now.
     use = check_code(study, pool)
-    identity = identity_of(study, system, use.modules)
+    manifest = manifest_now(study, system, use.modules)
     wanted = [*map(str, keys)]
-    results = ResultsDirectory(directory, study, identity, system.measuring.scoring, wanted)
+    results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, wanted)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     engine_used, reason = choose_engine(system, engine)

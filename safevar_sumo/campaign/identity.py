@@ -22,19 +22,20 @@ PLATFORM = {"system": platform.system(), "machine": platform.machine()}
 """Properties of this machine that may affect the last bit of a result."""
 
 
-def identity_of(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
-    """The layers of a manifest except the study: plain values that are the same in every process.
+def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
+    """The manifest of a study with the inputs of its results as they are now: plain values that are
+    the same in every process.
 
     `used` are names of further files, which user code was seen to load; those that exist belong to
-    the identity. `files` are digests of files; `results` is the version of the results; `platform`
-    are properties of the machine that may affect the last bit of a result.
+    the inputs.
     """
-    return {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
+    files = files_of(study, system, used)
+    return manifest_of(study, {"files": files, "results": RESULTS, "platform": PLATFORM})
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:
     """Raise an error if the inputs of a study's results are no longer those of a manifest."""
-    now = manifest_of(study, identity_of(study, system, manifest["files"]))
+    now = manifest_now(study, system, manifest["files"])
     for _, text, _ in manifest_differences(manifest, now):
         raise InputError(
             f"study {study.name!r}",

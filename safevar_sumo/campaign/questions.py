@@ -27,11 +27,11 @@ from safevar_sumo.campaign.evaluation import (
     system_of,
     verify_settings,
 )
-from safevar_sumo.campaign.identity import files_of, identity_of, refuse_changed_inputs
+from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.results import identity_digest, manifest_of
+from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -76,7 +76,7 @@ def evaluate_all(
     use = _use_of(study, packed_study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
-        pool.inputs[packed_study] = manifest_of(study, identity_of(study, system, use.modules))
+        pool.inputs[packed_study] = manifest_now(study, system, use.modules)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -245,7 +245,7 @@ def check_code(study: Study, pool: Pool) -> Use:
     """
     if not user_code_names(study):
         return Use({}, [])
-    digest = identity_digest(manifest_of(study, identity_of(study, system_of(study))))
+    digest = identity_digest(manifest_now(study, system_of(study)))
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):
         known = msgspec.json.decode(marker.read_bytes(), type=Use)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results import MANIFEST, manifest_differences, manifest_of, read_manifest
+from safevar_sumo.results import MANIFEST, manifest_differences, read_manifest
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study, StudyLike, study_names
 
@@ -204,7 +204,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     InputError
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
-    from safevar_sumo.campaign.identity import identity_of
+    from safevar_sumo.campaign.identity import manifest_now
     from safevar_sumo.sumo.system import assemble
 
     # Inputs of the results that have changed since.
@@ -212,7 +212,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     study = case.study
     if "imported" in manifest:
         return []
-    present = manifest_of(study, identity_of(study, assemble(study), manifest.get("files", {})))
+    present = manifest_now(study, assemble(study), manifest.get("files", {}))
     changes = [text for _, text, matters in manifest_differences(manifest, present) if matters]
 
     # Without `as_it_is_now` they are refused.

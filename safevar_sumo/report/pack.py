@@ -22,7 +22,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Scoring
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results.manifest import PACKAGES
+from safevar_sumo.results.identity import PACKAGES
 from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"

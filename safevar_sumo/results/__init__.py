@@ -1,5 +1,13 @@
 """Results of campaigns: journalled, written, and read back."""
 
+from safevar_sumo.results.identity import (
+    RESULTS as RESULTS,
+    changed_values as changed_values,
+    evaluation_keys as evaluation_keys,
+    identity_digest as identity_digest,
+    manifest_differences as manifest_differences,
+    manifest_of as manifest_of,
+)
 from safevar_sumo.results.journal import (
     Journal as Journal,
     JournalReader as JournalReader,
@@ -19,16 +27,10 @@ from safevar_sumo.results.load import (
 from safevar_sumo.results.manifest import (
     FILES as FILES,
     MANIFEST as MANIFEST,
-    RESULTS as RESULTS,
     SOLUTIONS as SOLUTIONS,
-    changed_values as changed_values,
-    evaluation_keys as evaluation_keys,
     folders_of as folders_of,
-    identity_digest as identity_digest,
     journal_file as journal_file,
     make_directory as make_directory,
-    manifest_differences as manifest_differences,
-    manifest_of as manifest_of,
     read_manifest as read_manifest,
     run_name as run_name,
     write_whole as write_whole,

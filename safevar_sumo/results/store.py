@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
@@ -18,28 +17,28 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
-from safevar_sumo.results.journal import journal_head, open_and_lock, read_journal
-from safevar_sumo.results.manifest import (
+from safevar_sumo.results.identity import (
     FORMAT,
     IDENTITY,
+    identity_digest,
+    manifest_differences,
+    search_extent_of,
+)
+from safevar_sumo.results.journal import journal_head, open_and_lock, read_journal
+from safevar_sumo.results.manifest import (
     MANIFEST,
     RUNS,
     SOLUTIONS,
     disk_errors,
-    identity_digest,
     journal_file,
     make_directory,
-    manifest_differences,
-    manifest_of,
     read_manifest,
     run_name,
-    search_extent_of,
     stored_runs,
     write_manifest,
     write_whole,
 )
 from safevar_sumo.study import Study, label_of, tables_of
-from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,9 +56,8 @@ class ResultsDirectory:
         The directory, made if it does not exist.
     study
         The study as it is run.
-    identity
-        Inputs of the study's results besides the study file; see
-        `safevar_sumo.campaign.identity.identity_of`.
+    manifest
+        The study's manifest; see `safevar_sumo.campaign.identity.manifest_now`.
     scoring
         Metrics and objectives.
     wanted
@@ -76,7 +74,7 @@ class ResultsDirectory:
         self,
         path: Path,
         study: Study,
-        identity: Tables = MappingProxyType({}),
+        manifest: JsonObject,
         scoring: Scoring = PUBLISHED_SCORING,
         wanted: Collection[str] = (),
     ) -> None:
@@ -84,7 +82,7 @@ class ResultsDirectory:
         self.path = path
         self._study = study
         folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
-        self.manifest = {**manifest_of(study, identity), "folders": folders}
+        self.manifest = {**manifest, "folders": folders}
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
 

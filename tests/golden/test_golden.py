@@ -17,11 +17,10 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.identity import identity_of
+from safevar_sumo.campaign.identity import PLATFORM
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import searched
 
 WHY = {
@@ -98,15 +97,8 @@ def _digest(text: str) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def platform_here() -> dict[str, str]:
-    """The platform as a manifest records it."""
-    study = small("native")
-    platform = identity_of(study, assemble(study))["platform"]
-    return platform
-
-
 CHANGED = (
-    "results changed: if that is meant, raise RESULTS in safevar_sumo/results/manifest.py, renew"
+    "results changed: if that is meant, raise RESULTS in safevar_sumo/results/identity.py, renew"
     " golden.json and say why"
 )
 GOLDEN = json.loads(FILE.read_text(encoding="utf-8"))
@@ -122,7 +114,7 @@ def test_a_shipped_studys_results_are_those_of_ever(name: str) -> None:
     assert {key: here["original"][key] for key in numbers} == pytest.approx(numbers, rel=1e-4), (
         "other results, not only other bits"
     )
-    if platform_here() == GOLDEN["platform"]:
+    if GOLDEN["platform"] == PLATFORM:
         assert here == expected, CHANGED
 
 
@@ -137,7 +129,7 @@ def test_results_and_the_number_that_stands_for_them_change_together() -> None:
     reason="bytes are promised for Linux on x86-64",
 )
 def test_this_is_the_platform_that_bytes_are_promised_for() -> None:
-    assert platform_here() == GOLDEN["platform"], (
+    assert GOLDEN["platform"] == PLATFORM, (
         "the C library rounds powers differently: NSGA-II finds other last bits here"
     )
 
@@ -146,8 +138,8 @@ if __name__ == "__main__":
     studies = {name: computed(name) for name in WHY}
     if studies != GOLDEN["studies"] and GOLDEN["results"] == RESULTS:
         raise SystemExit(
-            "results have changed: raise RESULTS in safevar_sumo/results/manifest.py above"
+            "results have changed: raise RESULTS in safevar_sumo/results/identity.py above"
             f" {RESULTS} first"
         )
-    golden = {"platform": platform_here(), "results": RESULTS, "studies": studies}
+    golden = {"platform": PLATFORM, "results": RESULTS, "studies": studies}
     FILE.write_text(json.dumps(golden, indent=2) + "\n", encoding="utf-8", newline="\n")

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from safevar_sumo.results.manifest import evaluation_keys
+from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import tables_of
 from tests.in_process import json_of, refused, run

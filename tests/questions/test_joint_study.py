@@ -22,7 +22,7 @@ from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
-from safevar_sumo.results.manifest import identity_digest, manifest_of
+from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, refused, run, searched

@@ -30,13 +30,13 @@ from safevar_sumo.results import (
     row_of_handle,
     solutions_frame,
 )
-from safevar_sumo.results.manifest import (
+from safevar_sumo.results.identity import (
     identity_digest,
     manifest_differences,
     manifest_of,
     packages_of,
-    read_manifest,
 )
+from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.study import Study, tables_of, write_study
 from tests.campaign.formulas import carried_out, with_search
 from tests.in_process import json_of, refused, run
@@ -59,8 +59,12 @@ def evaluations(*safety: float) -> Evaluations:
     )
 
 
+def results_directory(path: Path, study: Study) -> ResultsDirectory:
+    return ResultsDirectory(path, study, manifest_of(study, {}))
+
+
 def written(path: Path, study: Study) -> ResultsDirectory:
-    directory = ResultsDirectory(path, study)
+    directory = results_directory(path, study)
     directory.begin(evaluations(2.5))
     directory.finish({("nsga2", 0): wide(study)})
     return directory
@@ -117,12 +121,12 @@ def test_undefined_values_stay_undefined() -> None:
 
 def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
-    ResultsDirectory(tmp_path, study)
-    ResultsDirectory(tmp_path, with_search(study, runs=7))
+    results_directory(tmp_path, study)
+    results_directory(tmp_path, with_search(study, runs=7))
     with pytest.raises(InputError, match=r"search\.seed was 1 and is 2 now"):
-        ResultsDirectory(tmp_path, with_search(study, seed=2))
+        results_directory(tmp_path, with_search(study, seed=2))
     with pytest.raises(InputError, match="holds results of another study"):
-        ResultsDirectory(tmp_path, load_study("native"))
+        results_directory(tmp_path, load_study("native"))
 
 
 def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_not_continued(
@@ -132,14 +136,14 @@ def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_
         distance = {"unit": "m", "original": 12, "lower": 8, "upper": upper, "meaning": meaning}
         return load_study("smoke", scenario={"search": {"distance": distance}, "margin": margin})
 
-    ResultsDirectory(tmp_path, joint()).begin(evaluations(2.5))
-    ResultsDirectory(tmp_path, joint(meaning="gap at the start"))
+    results_directory(tmp_path, joint()).begin(evaluations(2.5))
+    results_directory(tmp_path, joint(meaning="gap at the start"))
     for other, message in (
         (joint(upper=21), "upper was 20.0 and is 21.0"),
         (joint(margin=1), r"scenario\.margin was None and is 1\.0 now"),
     ):
         with pytest.raises(InputError, match=message):
-            ResultsDirectory(tmp_path, other)
+            results_directory(tmp_path, other)
 
 
 def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
@@ -149,9 +153,9 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         with_search(study, time_limit=7, runs=3, evaluations=900),
         with_search(study, algorithms=["rs"]),
     ):
-        directory = ResultsDirectory(tmp_path, other)
+        directory = results_directory(tmp_path, other)
         assert identity_digest(directory.manifest) == identity_digest(
-            ResultsDirectory(tmp_path, study).manifest
+            results_directory(tmp_path, study).manifest
         )
 
 
@@ -204,7 +208,7 @@ def test_a_manifest_names_the_packages_that_its_study_uses(name: str, more: set[
 def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json"):
-        ResultsDirectory(tmp_path, study)
+        results_directory(tmp_path, study)
 
 
 def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_keys(

@@ -20,7 +20,7 @@ import pytest
 from safevar_sumo.api.running import load_for_search
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.results.manifest import evaluation_keys
+from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, Origin, Study, limits_of, study_names, tables_of, write_study

@@ -1,0 +1,141 @@
+"""The identity of results: the inputs that they depend on, as a manifest states them, its digest,
+and the differences from other inputs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from hashlib import sha256
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+from safevar_sumo.records import JsonObject
+from safevar_sumo.study import PYMOO, Study, tables_of, with_effect
+from safevar_sumo.study.schema import Tables
+
+FORMAT = 6
+"""Version number of the format of a manifest."""
+RESULTS = 11
+"""Version number of the package's results, raised whenever they change (enforced by tests/golden).
+"""
+PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")
+"""Packages that every study uses."""
+LIBRARIES = {"ad_rss": "ad-rss", "highway_idm": "highway-env", "fmu": "fmpy"}
+"""Packages of extras by the driving system, or the kind of one, that needs them."""
+SIMULATORS = ("libsumo", *LIBRARIES.values())
+"""Packages on whose versions a single simulation depends."""
+PYMOO_PACKAGES = ("pymoo", "cma")
+"""Packages on whose versions the searches of pymoo depend."""
+IDENTITY = {
+    "study": "the same study and options",
+    "files": "the file as it was",
+    "results": "that version",
+    "versions": "those versions",
+    "platform": "such a machine",
+}
+"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected:
+another `out` ..., or REMEDY".
+"""
+
+
+def manifest_of(study: Study, identity: Tables) -> JsonObject:
+    """The manifest of a study as it is run, without the original vehicle's evaluation.
+
+    Parameters
+    ----------
+    identity
+        Inputs of the results besides the study file, by `IDENTITY`; see
+        `safevar_sumo.campaign.identity.manifest_now`.
+    """
+    return {
+        "format": FORMAT,
+        "study": tables_of(study),
+        **identity,
+        "versions": {name: version(name) for name in packages_of(study)},
+    }
+
+
+def packages_of(study: Study) -> tuple[str, ...]:
+    """The packages that a study uses, and on whose versions its results depend; those of pymoo only
+    where it is installed, as no question about the study needs it.
+    """
+    has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
+    has_pymoo = has_pymoo and find_spec("pymoo") is not None
+    libraries = [LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES]
+    return (*PACKAGES, *libraries, *(PYMOO_PACKAGES if has_pymoo else ()))
+
+
+def evaluation_keys(tables: Tables) -> JsonObject:
+    """Those of a study's tables that affect evaluations."""
+    keys: JsonObject = with_effect(tables, Study)
+    return keys
+
+
+def identity_in(manifest: JsonObject) -> JsonObject:
+    """The inputs of a manifest, by `IDENTITY`."""
+    layers = {layer: manifest.get(layer, {}) for layer in IDENTITY}
+    return {**layers, "study": evaluation_keys(manifest["study"])}
+
+
+def identity_digest(manifest: JsonObject) -> str:
+    """The digest that identifies a manifest's study in its journals, whether or not it has searches
+    of pymoo.
+    """
+    layers = identity_in(manifest)
+    versions = {
+        name: value for name, value in layers["versions"].items() if name not in PYMOO_PACKAGES
+    }
+    return sha256(json.dumps({**layers, "versions": versions}, sort_keys=True).encode()).hexdigest()
+
+
+def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
+    """The differences between the inputs of two manifests: of stored results, and of now.
+
+    Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other
+    search libraries, other machines, other versions of this package with the same `RESULTS`, and
+    new keys of a study do not.
+    """
+    inputs_before = identity_in(stored)
+    for layer, inputs in identity_in(now).items():
+        for key, before, after in changed_values(inputs_before[layer], inputs):
+            if key in PYMOO_PACKAGES and None in (before, after):
+                continue
+            if layer == "files":
+                change = "is new" if before is None else "has changed since"
+                text = f"{key} no longer exists" if after is None else f"{key} {change}"
+            else:
+                name = (
+                    f"version of {key}"
+                    if layer == "versions"
+                    else key or "the version of the package's results"
+                )
+                text = f"{name} was {before!r} and is {after!r} now"
+            is_harmless = (
+                layer == "platform"
+                or (layer == "versions" and key not in SIMULATORS)
+                or (layer == "study" and before is None)
+            )
+            yield layer, text, not is_harmless
+
+
+def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
+    """Algorithms, runs and evaluations of a study: they decide which solutions the table of
+    solutions has.
+    """
+    search = manifest["study"]["search"]
+    return search["algorithms"], search["runs"], search["evaluations"]
+
+
+def changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0
+    are different.
+    """
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in sorted({*first, *second}):
+            yield from changed_values(
+                first.get(name), second.get(name), f"{key}.{name}" if key else name
+            )
+    elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
+        yield key, first, second
