@@ -203,9 +203,9 @@ class CommandCache:
         try:
             # Nobody continues what is older than a day.
             self._folder.mkdir(parents=True, exist_ok=True)
-            for folder in self._folder.iterdir():
-                if time.time() - folder.stat().st_mtime > DAY:
-                    shutil.rmtree(folder, ignore_errors=True)
+            for old in self._folder.iterdir():
+                if time.time() - old.stat().st_mtime > DAY:
+                    (shutil.rmtree if old.is_dir() else Path.unlink)(old)
 
             # One process at a time; its lock ends with it.
             lock_file = self._own_folder.with_suffix(".lock")
