@@ -141,8 +141,8 @@ def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
 
 def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
     """The minimal causes of a case's runs, which are simulated."""
+    from safevar_sumo.questions.causes import causes_of_runs
     from safevar_sumo.questions.evaluator import open_evaluator
-    from safevar_sumo.questions.explain.causes import causes_of_runs
 
     with open_evaluator(case.study, jobs=jobs) as evaluator:
         return causes_of_runs(case, evaluator, limit)
