@@ -50,9 +50,7 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
         )
     system_of = questions.system_of
     monkeypatch.setattr(
-        questions,
-        "system_of",
-        lambda study: smoke if study.name == "made-up" else system_of(study),
+        questions, "system_of", lambda study: smoke if study.name == "made-up" else system_of(study)
     )
 
 
