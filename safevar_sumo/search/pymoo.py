@@ -146,6 +146,10 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 
     def try_out(self, problem: Problem) -> None:
         """Refuse arguments that pymoo refuses before its first request."""
+        size = getattr(self, "pop_size", UNSET)
+        if size is not UNSET and size > problem.evaluations:
+            legal = f"at most the {problem.evaluations} evaluations of a run"
+            raise InputError(self.name, f"pop_size = {size}", legal)
         with _Randomness(self.name, np.random.default_rng(0)):
             self.begin(problem, 0)
 
@@ -166,11 +170,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         }
         if isinstance(defaults.get("pop_size"), int):
             given = {"pop_size": problem.population, **given}
-        if not LEAST_POPULATION <= given.get("pop_size", LEAST_POPULATION) <= problem.evaluations:
-            raise ValueError(
-                f"pop_size = {given['pop_size']} is below {LEAST_POPULATION}, or above the"
-                f" {problem.evaluations} evaluations of a run"
-            )
+        if given.get("pop_size", LEAST_POPULATION) < LEAST_POPULATION:
+            raise ValueError(f"pop_size = {given['pop_size']} is below {LEAST_POPULATION}")
 
         # Reference directions for as many objectives.
         if "ref_dirs" in defaults:
