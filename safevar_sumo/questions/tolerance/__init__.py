@@ -98,9 +98,8 @@ def tolerance(
         Joint limits, which hold all at the same time; they are always sought without `by`, and
         never beside it.
     quick
-        A rough answer within seconds: corners and a short search for counterexamples, with the
-        study's own parameter set. No limit is called kept, and with limits the exit code is 3. Not
-        with `by`.
+        A rough answer: the study's own parameter set, and the shortest search for counterexamples.
+        No limit is called kept, and with limits the exit code is 3. Not with `by`.
     """
     study = evaluator.study
     parameter = None if by is None else Parameter.parse(by, study)
