@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.bars import bars_of
+from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, models_of, with_points_between
@@ -21,7 +20,6 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.figure import draw_limits
 from safevar_sumo.questions.tolerance.left_out import contacts_left_out
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import (
@@ -222,7 +220,7 @@ def answer_limits(asked: Asked) -> Answer:
         },
         tables=_tables(found, rows.rows, nearest, wider),
         failures=(why_not_kept(asked),) if is_kept is None and asked.limits else failures,
-        draw=partial(draw_limits, scans=found.scans),
+        draw=draw_bars,
     )
 
 
