@@ -60,7 +60,7 @@ QUESTIONS = {
     "tables results": (
         rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}"
     ),
-    "simulate results --fewest": "In this encounter the original vehicle stops",
+    "simulate results --solution fewest": "In this encounter the original vehicle stops",
 }
 
 
