@@ -4,7 +4,6 @@ from collections.abc import Mapping
 
 from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.base import (
-    REACTION_PARAMETERS as REACTION_PARAMETERS,
     Ads as Ads,
     FullBrake as FullBrake,
     PerVehicleAds as PerVehicleAds,

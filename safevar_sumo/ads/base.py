@@ -22,10 +22,6 @@ PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
 """A driver's parameter that may be 0, in SI units."""
-REACTION_PARAMETERS = ("recognition_delay", "hesitation")
-"""Names of the parameters of an ADS that delay its reaction [s]; a study may raise them in bad
-weather.
-"""
 
 Memory = Any
 """What an ADS remembers of N vehicles: an object of its own class with named attributes."""

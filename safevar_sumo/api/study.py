@@ -111,7 +111,6 @@ def study(
     out: Path | None = None,
     jobs: Jobs = None,
     cluster: Annotated[str | None, "ADDRESS"] = None,
-    only: Annotated[str | None, "ALGORITHM:RUN"] = None,
     shard: Annotated[str | None, "K/N"] = None,
     retry_failed: bool = False,
     quiet: bool = False,
@@ -145,8 +144,6 @@ def study(
         Number of worker processes, by default one for each core.
     cluster
         Compute on the workers of this Dask scheduler instead.
-    only
-        Only this run; runs count from 0.
     shard
         Every N-th run, from the K-th (1..N): for job arrays that share the directory.
     retry_failed
@@ -176,7 +173,7 @@ def study(
         study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
     for remark in dict.fromkeys(system.remarks):
         warn(remark)
-    keys = _select_runs(all_runs(loaded), only, shard)
+    keys = _select_runs(all_runs(loaded), shard)
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
 
@@ -237,14 +234,8 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     return msgspec.structs.replace(study, search=msgspec.structs.replace(search, **changes))
 
 
-def _select_runs(keys: list[RunKey], only: str | None, shard: str | None) -> list[RunKey]:
-    """The runs that `only` and `shard` select."""
-    if only is not None:
-        algorithm, _, run = only.rpartition(":")
-        keys = [key for key in keys if key.algorithm == algorithm and str(key.run) == run]
-        if not keys:
-            legal = "ALGORITHM:RUN, an algorithm of the study and a run from 0 to less than --runs"
-            raise InputError("only", repr(only), legal)
+def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:
+    """The runs that `shard` selects."""
     if shard is not None:
         rank, _, count = shard.partition("/")
         if not (

@@ -1,14 +1,19 @@
-"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages and in blocks
-for the terminal.
+"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages, in blocks for
+the terminal, and as a figure.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pandas as pd
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from safevar_sumo.questions.answer import Answer
 
 CELLS = 16
 """Width of a bar on the terminal [characters]."""
@@ -93,3 +98,26 @@ def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> lis
         original = float(np.clip((row["original"] - lower) / (upper - lower), 0, 1))
         bars.append(Bar(original, **shares))
     return bars
+
+
+def draw_bars(answer: Answer) -> Figure:
+    """The bars of a table of limits, a row for each characteristic."""
+    from safevar_sumo.questions.figures import BLUE, SKY_BLUE, VERMILION, escape_dollars, new_figure
+
+    limits = answer.tables["limits"]
+    size = (6.4, 1.3 + 0.3 * len(limits))
+    figure, ((axis,),) = new_figure(f"{answer.study.name}: limits", 1, 1, size)
+    for place, bar in enumerate(limits.attrs["bars"]):
+        for ends, colour in ((bar.alone, SKY_BLUE), (bar.together, BLUE)):
+            if ends:
+                axis.barh(place, ends[1] - ends[0], height=0.6, left=ends[0], color=colour)
+        axis.plot(bar.original, place, "o", color="black", markersize=4)
+        axis.plot(bar.specified, [place] * len(bar.specified), "|", color=VERMILION, markersize=14)
+    axis.set_yticks(range(len(limits)), map(escape_dollars, limits["characteristic"]))
+    axis.invert_yaxis()
+    axis.set_xlim(-0.02, 1.02)
+    axis.set_xlabel(
+        "share of the domain; dark: limits of all together; light: limits alone (all others as new)"
+        ";\ndot: the original vehicle; line: specified"
+    )
+    return figure

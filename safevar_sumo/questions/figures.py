@@ -29,7 +29,6 @@ bytes.
 TRUETYPE = 42
 """matplotlib's number of the fonts in a pdf: publishers refuse its default, Type 3."""
 FONT_SIZE = 8
-DEGREE_LABEL = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
 """Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they
 differ in a print without colours too.

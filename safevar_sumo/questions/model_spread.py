@@ -4,29 +4,20 @@ published data equally well.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.progress import Phases
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
 from safevar_sumo.sumo.matrix import at_point, drive_and_score
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
 
-Found = TypeVar("Found")
-
-SETS_AT_ONCE = "parameter sets of the vehicle model"
-"""The phase of progress in which several parameter sets are asked at the same time."""
 BAND_SHARE = 0.9
 """Share of the predictions that lie in the band."""
 HALF_WIDTH = 1.645
@@ -145,46 +136,6 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
             )
         )
     return [drive_and_score(system, settings) for system in systems]
-
-
-def across(evaluator: Evaluator, sets: int, measure: Callable[[Evaluator], Found]) -> list[Found]:
-    """What `measure` finds with the study's own parameters, then with each other of the first
-    `sets` parameter sets; several at the same time, in threads. The others are not verified in
-    SUMO, because scene and equations are those of the study.
-    """
-    study = evaluator.study
-    others = studies_of_sets(study)[1:sets] if study.spread else []
-    evaluators = [evaluator, *(evaluator.for_study(other, verified=0) for other in others)]
-    return side_by_side(evaluators, measure, SETS_AT_ONCE)
-
-
-def side_by_side(
-    evaluators: Sequence[Evaluator], measure: Callable[[Evaluator], Found], stage: str = ""
-) -> list[Found]:
-    """What `measure` finds with each evaluator of one pool; as many at the same time as there are
-    workers. Progress is shown for `stage`, or by the evaluators if they have no company.
-    """
-    if len(evaluators) < 2:
-        return [measure(one) for one in evaluators]
-    pool = evaluators[0]._pool
-    phases = evaluators[0].phases
-    done = 0
-
-    def measure_on(evaluator: Evaluator, part: Pool) -> Found:
-        nonlocal done
-        evaluator._pool = part
-        evaluator.phases = Phases(show_no_progress)
-        try:
-            found = measure(evaluator)
-        finally:
-            evaluator._pool = pool
-            evaluator.phases = phases
-        done += 1
-        phases.show_part(stage, done, len(evaluators))
-        return found
-
-    phases.show_part(stage, done, len(evaluators))
-    return pool.share_out([partial(measure_on, evaluator) for evaluator in evaluators])
 
 
 def studies_of_sets(study: Study) -> list[Study]:

@@ -275,7 +275,7 @@ def export(
     # The solution's vehicle, and its simulation.
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
-    target = load_target(directory, solution, [], as_it_is_now, point)
+    target = load_target(directory, solution, as_it_is_now, point)
     system = assemble(target.study)
     setting = target.setting(system)
     vehicle = system.characteristics.vehicle

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import PointName, Range
+from safevar_sumo.questions.ask import PointName
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -31,7 +31,7 @@ from safevar_sumo.replay.comparison import comparison_of, list_differences, why_
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.safer import rises_again, why_safer
-from safevar_sumo.results import SOLUTIONS, SolutionId, choose_handle, row_of_handle
+from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -129,16 +129,12 @@ def show_simulation(
     source: str,
     *,
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
-    most_severe: bool = False,
-    fewest: bool = False,
-    smallest: bool = False,
     set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
     no_filter: bool = False,
     beyond: bool = False,
     trace: Path | None = None,
     animate: Path | None = None,
     gui: bool = False,
-    slower: Annotated[float, Range(0.01, 1000)] = 1.0,
     spread: bool = False,
     point: PointName = None,
     as_it_is_now: bool = False,
@@ -149,13 +145,9 @@ def show_simulation(
     Parameters
     ----------
     solution
-        Replay solution N of a run in a results directory; N counts from 0.
-    most_severe
-        Replay the most severe solution.
-    fewest
-        Replay the unsafe solution with the fewest changes.
-    smallest
-        Replay the unsafe solution with the smallest changes.
+        Replay solution N of a run in a results directory; N counts from 0. Or the unsafe solution
+        with the smallest or the fewest changes, or the most severe one: smallest, fewest,
+        most-severe.
     set
         A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it
         for others.
@@ -170,8 +162,6 @@ def show_simulation(
     gui
         Show both simulations in sumo-gui, one upon the other: the original blue, the changed one
         orange.
-    slower
-        How many times slower than real time sumo-gui plays.
     spread
         Add the vehicle model's own uncertainty: other parameters that fit published data as well.
     point
@@ -181,9 +171,7 @@ def show_simulation(
         say so.
     """
     # What is simulated: a study or a solution, with changes.
-    choices = {"most_severe": most_severe, "fewest": fewest, "smallest": smallest}
-    chosen = [name for name, given in choices.items() if given]
-    target = load_target(source, solution, chosen, as_it_is_now, point)
+    target = load_target(source, solution, as_it_is_now, point)
     system = assemble(target.study)
     filtered = not no_filter
     changes = set
@@ -220,7 +208,7 @@ def show_simulation(
     if animate is not None:
         animation.animate(comparison, animate)
     if gui:
-        show_in_gui(comparison, slower=slower)
+        show_in_gui(comparison)
     answer = _answer(target, system, simulation, with_spread=spread)
     return replace(answer, draw=lambda _: draw_comparison(comparison))
 
@@ -317,40 +305,32 @@ def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
                 )
 
 
-def load_target(
-    source: str, solution: str | None, chosen: list[str], as_it_is_now: bool, point: str | None
-) -> Target:
+def load_target(source: str, solution: str | None, as_it_is_now: bool, point: str | None) -> Target:
     """The study by name or path, or that of a results directory, at a point or as a whole, with the
     solution that is named or chosen.
 
     Raises
     ------
     InputError
-        If there is no such study, directory, solution or point, or two options choose a solution.
+        If there is no such study, directory, solution or point.
     """
-    # At most one solution is chosen.
-    wanted = [*chosen, *([] if solution is None else [f"solution {solution}"])]
-    if len(wanted) > 1:
-        raise InputError(
-            "solution", f"{' and '.join(wanted)} both choose a solution", "one of them"
-        )
-
     # The study, of results as it is recorded there, at a point.
-    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=bool(wanted))
+    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=solution is not None)
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
     whole = study_in(subject)
     study = whole if point is None else at_point(whole, point)
-    if isinstance(subject, Study) or not wanted:
+    if isinstance(subject, Study) or solution is None:
         return Target(study, source)
 
-    # The solution, by its handle or the choice.
+    # The solution, by a choice or its handle.
     subject.require_solutions()
+    choice = solution.replace("-", "_")
     with about(source):
         handle = (
-            choose_handle(subject.solutions, subject.unsafe, chosen[0])
-            if chosen
-            else SolutionId.parse(str(solution))
+            choose_handle(subject.solutions, subject.unsafe, choice)
+            if choice in CHOICES
+            else SolutionId.parse(solution)
         )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
     return Target(study, source, handle, {str(name): value for name, value in row.items()})

@@ -5,7 +5,6 @@ replays, then each answer, folded.
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -32,8 +31,6 @@ from safevar_sumo.questions.ask import (
 )
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
-from safevar_sumo.questions.research_questions.answer import answer_questions
-from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.questions.tolerance.by_parameter import usual_values
 from safevar_sumo.records import JsonObject
@@ -42,7 +39,6 @@ from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, re
 from safevar_sumo.report.sheet import sheet_of
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.scenarios import SPEED_DIMENSION
-from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
 if TYPE_CHECKING:
@@ -68,7 +64,6 @@ def report(
     *results: Results | str | Path,
     out: str | Path = "report.html",
     ask: tuple[str, ...] = (),
-    paper: bool = False,
     unsafe: Criterion = None,
     point: str | None = None,
     jobs: Jobs = None,
@@ -91,8 +86,6 @@ def report(
     ask
         Ask this question instead of the usual ones, with its options, such as "risk --samples
         4000"; may be repeated. The verdict of the first question leads the page.
-    paper
-        With the research questions of the paper, as tables and figures.
     unsafe
         What is unsafe, on the whole page: a collision, a safety degree below X, or a metric such as
         "drac > 6".
@@ -130,9 +123,6 @@ def report(
     """
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
-    if paper and point is not None:
-        problem = "the research questions are about whole studies"
-        raise InputError("point", problem, "no `paper`, or no `point`")
 
     # The questions: to each of the results alone, and to all together.
     sources = [getattr(source, "directory", source) for source in results]
@@ -172,12 +162,7 @@ def report(
             for number, path in enumerate(paths)
         ]
         shared = [next_answer(text, slice(None)) for text in joint]
-        pictures = list[JsonObject]()
-        if paper:
-            show("tables and figures", 0, 1)
-            pictures, tables = _research_questions(cases, paths)
-            shared.append(tables)
-        page = make_page(studies, shared, pictures, show)
+        page = make_page(studies, shared, show)
     write_whole(out, page)
     return out
 
@@ -201,18 +186,6 @@ def _later_changes(
             warn(f"{path}: {change}")
         later_changes.append(changes)
     return later_changes
-
-
-def _research_questions(
-    cases: Sequence[Case], paths: Sequence[Path]
-) -> tuple[list[JsonObject], Answer]:
-    """The figures and tables of the paper's research questions, if a run is finished."""
-    command = " ".join([PROGRAM_COMMAND, "tables", *(shlex.quote(str(path)) for path in paths)])
-    try:
-        pictures = [_picture(figure) for figure in draw_figures(cases).values()]
-        return pictures, replace(answer_questions(cases), command=command)
-    except InputError as error:
-        return [], _no_answer("tables", cases[0], error)
 
 
 def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = None) -> list[str]:
@@ -279,10 +252,9 @@ def _no_answer(question: str, case: Case, error: InputError) -> Answer:
 def make_page(
     studies: Sequence[ReportedStudy],
     shared: Sequence[Answer] = (),
-    pictures: Sequence[JsonObject] = (),
     progress: Progress = show_no_progress,
 ) -> str:
-    """The page about studies, with answers and pictures about all of them."""
+    """The page about studies, with answers about all of them."""
     # Commands that give the numbers of the page.
     of_studies = chain(*map(page_commands, studies))
     of_shared = [
@@ -293,7 +265,6 @@ def make_page(
         title=f"Safety report: {', '.join(study.case.name for study in studies)}",
         studies=[_study_parts(number, study, progress) for number, study in enumerate(studies, 1)],
         shared=list(_sections("all", shared)),
-        pictures=pictures,
         commands=[*of_studies, *of_shared],
         player=player_files(),
         css=_web_file("report.css"),

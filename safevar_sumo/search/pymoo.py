@@ -15,18 +15,10 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from safevar_sumo.errors import (
-    InputError,
-    SimulationError,
-    UserCodeError,
-    check_name,
-    describe_error,
-    missing_extra,
-)
-from safevar_sumo.plugins.time_limit import end_if_longer
-from safevar_sumo.records import Evaluations, FloatArray, Outcome
+from safevar_sumo.errors import InputError, check_name, describe_error, missing_extra
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
-from safevar_sumo.study import ORIGINAL_DEGREE, PYMOO, label_of
+from safevar_sumo.study import PYMOO, label_of
 
 MODULES = {
     "moo.age": "AGEMOEA",
@@ -91,12 +83,8 @@ TYPES: dict[str, Any] = {
 """Types of arguments whose default value in pymoo does not tell them."""
 HIDDEN = {"verb_log", "cmaes_verbose", "maxfevals", "n_diffs", "advance_after_initial_infill"}
 """Arguments that write files, print, or are no choice of the user's."""
-TRIAL = 300
-"""Number of settings of a formula that an algorithm with arguments is tried with."""
-TRIAL_TIME = 20.0
-"""The time that it may take [s]: with a population below 4, GDE3 and NSDE draw for ever."""
-SMALL_POPULATION = 10
-"""A study with a smaller one is tried without arguments, too."""
+LEAST_POPULATION = 4
+"""With fewer individuals GDE3 and NSDE draw for ever."""
 FAILED = 1e9
 """Objectives and violation, for pymoo, of a setting that could not be scored."""
 
@@ -157,60 +145,13 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         return result.take(problem.scoring.valid(result))
 
     def try_out(self, problem: Problem) -> None:
-        """Search a formula in place of simulations, if the study gives arguments or has a small
-        population.
-
-        Raises
-        ------
-        InputError
-            Naming the arguments without which pymoo would not fail.
-        """
-        # What the study gives.
-        given = {
-            name: value
-            for name in self.__struct_fields__
-            if (value := getattr(self, name)) is not UNSET
-        }
-        key = f"search.{self.name!r}"
-        size = given.get("pop_size", 0)
-        if size > problem.evaluations:
+        """Refuse arguments that pymoo refuses before its first request."""
+        size = getattr(self, "pop_size", UNSET)
+        if size is not UNSET and size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
-            raise InputError("", f"{key}.pop_size = {size}", legal)
-
-        # A search of a formula fails at once if a value is wrong.
-        is_tried = bool(given) or problem.population < SMALL_POPULATION
-        if not is_tried or not (failure := self._failure(problem)):
-            return
-
-        # Which value is to blame.
-        without = {name: msgspec.structs.replace(self, **{name: UNSET}) for name in given}
-        blamed = [name for name, other in without.items() if not other._failure(problem)] or list(
-            given
-        )
-        named = " and ".join(f"{key}.{name} = {given[name]!r}" for name in blamed)
-        named = named or f"{key} with search.population = {problem.population}"
-        raise InputError("", f"{named}: pymoo fails: {failure}", "another value, or none")
-
-    def _failure(self, problem: Problem) -> str:
-        """The error with which pymoo fails in a search of a formula, "" if it does not."""
-        try:
-            with end_if_longer(TRIAL_TIME):
-                search = self.search(problem, np.random.default_rng(0))
-                settings = next(search)
-                asked = len(settings)
-                while asked < TRIAL:
-                    settings = search.send(_formula(settings, problem))
-                    asked += len(settings)
-        except StopIteration:
-            pass
-        except (
-            SimulationError,
-            UserCodeError,
-        ):  # a script of the user's that calls the library is on the stack
-            return f"it does not end within {TRIAL_TIME:g} s"
-        except InputError as error:
-            return error.problem
-        return ""
+            raise InputError(self.name, f"pop_size = {size}", legal)
+        with _Randomness(self.name, np.random.default_rng(0)):
+            self.begin(problem, 0)
 
     def begin(self, problem: Problem, seed: int) -> Any:
         """pymoo's algorithm before its first request."""
@@ -229,6 +170,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         }
         if isinstance(defaults.get("pop_size"), int):
             given = {"pop_size": problem.population, **given}
+        if given.get("pop_size", LEAST_POPULATION) < LEAST_POPULATION:
+            raise ValueError(f"pop_size = {given['pop_size']} is below {LEAST_POPULATION}")
 
         # Reference directions for as many objectives.
         if "ref_dirs" in defaults:
@@ -264,29 +207,6 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
     values = population.get("X").astype(float).reshape(-1, len(characteristics))
     values = np.clip(values, characteristics.lower, characteristics.upper)
     return characteristics.filter(problem.repaired(values))
-
-
-def _formula(settings: FloatArray, problem: Problem) -> Evaluations:
-    """Made-up evaluations of settings, shape (k, n): the nearer to the lower ends of the domains,
-    the safer.
-    """
-    # A safety degree that is smooth over the domain.
-    characteristics = problem.characteristics
-    scoring = problem.scoring
-    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
-    degree = np.add.accumulate(share**2, axis=1)[:, -1]
-    names = [metric.name for metric in scoring.metrics]
-    return Evaluations(
-        settings=settings,
-        outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
-        collision_speed=np.full(len(settings), np.nan),
-        metrics={
-            **dict.fromkeys(names, degree),
-            ORIGINAL_DEGREE: np.full(len(settings), scoring.safe_original or 0.0),
-        },
-        f_diff=characteristics.largest_change(settings),
-        f_num_diff=characteristics.number_changed(settings),
-    )
 
 
 def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:

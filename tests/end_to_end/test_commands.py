@@ -94,7 +94,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
         "The search found no solution."
         in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
     )
-    study("--out", "alone", "--only", "nsga2:1")
+    study("--out", "alone", "--shard", "2/9")
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
     expected = (
         load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
@@ -271,7 +271,7 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
         )
         Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
-    for words in ("simulate ../out --most-severe", "explain ../out", "report ../out"):
+    for words in ("simulate ../out --solution most-severe", "explain ../out", "report ../out"):
         result = refusal(*words.split())
         assert "far.txt has changed since" in result
         assert "--as-it-is-now" in result

@@ -7,7 +7,6 @@ import re
 from itertools import combinations
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy
 from hypothesis import given, strategies as st
@@ -18,12 +17,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import across_sets, explain, failures
-from safevar_sumo.questions.explain.across_sets import are_causes, ranges_across_sets
-from safevar_sumo.questions.explain.causes import (
+from safevar_sumo.questions.causes import (
     BoundaryState,
     Limits,
+    are_causes,
     causes_of_runs,
     count_distinct_causes,
     count_needed,
@@ -31,6 +28,8 @@ from safevar_sumo.questions.explain.causes import (
     find_minimal_causes,
     select_affordable_rows,
 )
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
@@ -78,7 +77,7 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
                 == cause["changes"].keys()
             )
             assert cause["size"] == len(cause["changes"])
-            assert 0 <= cause["fits_holding"] <= answer["numbers"]["fits"] == FITS
+            assert 0 <= cause["holds"] <= cause["fits"] == FITS
             assert cause["avoided_by"] == row["avoided_by"]
         shares = [cause["robust_share"] for cause in causes]
         assert shares == sorted(shares, reverse=True)
@@ -137,7 +136,7 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
         rf"^With .* the vehicle collides\. The cause d.* exact values: .*{share} are unsafe, too\.",
         verdict,
     )
-    assert f"The cause holds in {leading['fits_holding']} of {FITS} parameter sets" in verdict
+    assert f"The cause holds in {leading['holds']} of {FITS} parameter sets" in verdict
     assert leading["solution"] not in verdict
     numbers = explained.numbers
     assert (
@@ -273,7 +272,7 @@ def test_needed_and_changed_over_failures() -> None:
     ]
 
 
-def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cause_is_one_with_some_fitted_models() -> None:
     """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the
     own, only wider.
     """
@@ -283,8 +282,7 @@ def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> No
         wider,
     ]
     settings = np.array([[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]])
-    evaluations = models[0].evaluate(settings, "settings")
-    rows = COLLISION.of(evaluations)
+    rows = COLLISION.of(models[0].evaluate(settings, "settings"))
     causes = [
         cause
         for of_one in find_minimal_causes(models[0], settings[rows], COLLISION)
@@ -292,21 +290,6 @@ def test_conclusions_across_fitted_models(monkeypatch: pytest.MonkeyPatch) -> No
     ]
     holding = [are_causes(model, causes, COLLISION).tolist() for model in models]
     assert holding == [[holds] * len(causes) for holds in (True, False, False, True)]
-    monkeypatch.setattr(
-        across_sets, "across", lambda evaluator, fits, measure: list(map(measure, models[:fits]))
-    )
-    nobody = pd.Series(dtype=float)
-    needed = pd.Series({"a": 1.0, "b": 1.0, "c": 0.0})
-    assert ranges_across_sets(models[0], 4, evaluations, COLLISION, needed, nobody) == {
-        ("unsafe", ""): (0.0, 0.5),
-        ("needed", "a"): (1.0, 1.0),
-        ("needed", "b"): (0.0, 1.0),
-        ("needed", "c"): (0.0, 0.0),
-    }
-    safe = ranges_across_sets(
-        models[0], 4, evaluations.take([3]), COLLISION, needed.head(0), nobody
-    )
-    assert safe == {("unsafe", ""): (0.0, 0.0)}, "safe with each"
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:

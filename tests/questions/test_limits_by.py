@@ -92,10 +92,6 @@ FITS = 3
         ),
         (("wear", "--by", "speed=20", "--point", "CPFA, speed 10, wet"), ("beside a point",)),
         (
-            ("wear", "--by", "speed=20", "--together"),
-            ("joint limits are not sought", "narrower domain"),
-        ),
-        (
             ("wear", "--by", "speed=20", "--fail-if", "limits.by_x > 3"),
             ("'limits.by_x'", "limits.by_speed"),
         ),

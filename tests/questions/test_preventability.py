@@ -17,9 +17,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import _avoided_in_words
-from safevar_sumo.questions.explain.causes import Cause
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
-from safevar_sumo.questions.explain.moved import find_moved_borders
 from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
 from safevar_sumo.questions.preventability import (
     DRIVERS,
@@ -291,43 +289,6 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     assert plain is not None
     assert runs.trace.gap[plain, 0] == pytest.approx(15.0)
     assert unbraked is None
-
-
-@pytest.mark.slow
-def test_what_a_late_sensor_costs_is_the_way_that_it_closes_meanwhile() -> None:
-    """A steady cut-in, 30 km/h slower: a competent driver whose sensors are 0.2 s older needs 0.2 s
-    of closing speed more; the sensors' range, far beyond, moves nothing.
-    """
-    parameters = {"vut_length": 4.7, "vut_width": 1.85, "speed": 80.0, "target_speed": 50.0}
-    study = load_study("wear", matrix=None, scenario={"model": "cut_in", "parameters": parameters})
-    cause = Cause({"sensorLatency": 0.25, "sensorRange": 70.0}, "collision", -1.0, {})
-    moved = find_moved_borders(Evaluator(study, InlinePool()), [cause])
-    assert moved["characteristic"].tolist() == ["sensorLatency"]
-    before, now = moved[["border_before", "border_now"]].iloc[0]
-    assert now - before == pytest.approx(0.2 * 30 / 3.6, abs=0.3)
-
-
-@pytest.mark.slow
-def test_behind_a_braking_leader_a_delay_moves_the_border_of_the_headway_by_itself() -> None:
-    """The border is below the study's headway of 2 s; far above it the leader stands, and he
-    collides, too. With a range of 15 m he avoids nothing. Where the border is the domain's lower
-    end, it is that.
-    """
-    study = load_study("alks", matrix={"point": "following, speed 60, wet"})
-    changes = {"sensorLatency": 0.35, "brakeResponse": 0.3, "sensorRange": 15.0}
-    moved = find_moved_borders(
-        Evaluator(study, InlinePool()), [Cause(changes, "collision", -1.0, {})]
-    )
-    by_name = moved.set_index("characteristic")
-    added = by_name["border_now"] - by_name["border_before"]
-    assert added["sensorLatency"] == pytest.approx(0.3, abs=0.02)
-    assert added["brakeResponse"] == pytest.approx(0.2, abs=0.02)
-    assert np.isnan(added["sensorRange"])
-    study = load_study("alks_joint_cut_out")
-    moved = find_moved_borders(
-        Evaluator(study, InlinePool()), [Cause({"brakeTorque": 0.5}, "collision", -1.0, {})]
-    )
-    assert moved["border_before"].tolist() == [1.0]
 
 
 @pytest.mark.slow

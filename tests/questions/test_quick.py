@@ -9,9 +9,8 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.questions.ask import quick_questions
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.report.page import report
-from tests.in_process import json_of, refused, run
+from tests.in_process import refused, run
 
 
 @pytest.mark.slow
@@ -24,8 +23,6 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     assert answer.numbers["rough"] is True
     assert answer.numbers["kept"] is None
     assert answer.table("limits")["kept"].isna().all()
-    assert answer.numbers["attacked"] == LEAST_SIMULATIONS
-    assert answer.numbers["samples"] is None
     assert answer.numbers["fits_tried"] == 1
     assert "no limit is called kept" in answer.failures[0]
 
@@ -36,21 +33,11 @@ def test_a_rough_tolerance_says_which_limit_fails() -> None:
     assert "Do not release" in answer.verdict
 
 
-@pytest.mark.slow
-def test_a_rough_tolerance_of_the_worn_car_searches_at_its_own_points() -> None:
-    """None of the points between, no wider scope, and no bound."""
-    numbers = json_of("tolerance", "wear", "--quick")["numbers"]
-    assert numbers["rough"]
-    assert numbers["box"]
-    assert numbers["attacked"] + numbers["attacked_at_worst_points"] == LEAST_SIMULATIONS
-    assert "between" not in numbers["scope"]
-    assert numbers["at_most"] is None
-
-
 def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
     answer = sv.explain("smoke", quick=True)
     assert answer.verdict.startswith("Rough answer (--quick)")
-    assert (answer.numbers["rough"], answer.numbers["fits"]) == (True, 0)
+    assert answer.numbers["rough"]
+    assert answer.tables["causes"]["fits"].isna().all()
 
 
 @pytest.mark.slow

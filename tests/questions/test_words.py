@@ -37,7 +37,7 @@ TYPED = (
     ("tolerance", "tiny.toml", "--attack", "200", *FEW),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW, "--limits", "tireFric >= 3"),
     ("repair", "tiny.toml", "--fits", "0", "--margin", "1"),
-    ("simulate", "results", "--most-severe"),
+    ("simulate", "results", "--solution", "most-severe"),
 )
 
 

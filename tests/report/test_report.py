@@ -328,7 +328,7 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
         tmp_path / "begun",
         ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"),
     )
-    page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1, paper=True)
+    page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1)
     assert "There is no solution to replay" in page
     assert "slippery: unfinished, nsga2 0 of " in page
     assert '<section class="front" ' in page, "nothing is unsafe"

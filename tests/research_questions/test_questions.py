@@ -15,14 +15,11 @@ import pandas as pd
 import pytest
 import scipy
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.case import UnanswerableError
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.changes import (
-    compare_weathers,
     count_collisions,
     critical_solutions,
-    find_weather_pairs,
     rq31,
     rq32,
     rq33,
@@ -30,7 +27,6 @@ from safevar_sumo.questions.research_questions.changes import (
 )
 from safevar_sumo.questions.research_questions.comparisons import (
     Choices,
-    first_collisions,
     median_runs,
     rq1,
     rq1_runs,
@@ -40,8 +36,7 @@ from safevar_sumo.questions.research_questions.comparisons import (
 from safevar_sumo.questions.research_questions.fronts import compute_convergence, count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import MetricsTable
-from tests.research_questions.cases import ORIGINAL, made_up, made_up_study, row, three_algorithms
+from tests.research_questions.cases import ORIGINAL, made_up, row, three_algorithms
 
 
 def only(frame: pd.DataFrame, **wanted: Any) -> JsonObject:
@@ -192,33 +187,6 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
     assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
 
 
-def test_runs_without_a_collision_have_needed_more_evaluations_than_they_requested() -> None:
-    """Two of three runs of one algorithm collide, in their third and tenth evaluation, and none of
-    the other.
-    """
-    seen = [
-        {
-            **row(name, run, sd=-1.0 if name == "nsga2" and i == (2, 9, None)[run] else 1.0),
-            "evaluation": i,
-        }
-        for name in ("nsga2", "rs")
-        for run in range(3)
-        for i in range(100)
-    ]
-    case = made_up(
-        *(row(name, run) for name in ("nsga2", "rs") for run in range(3)), evaluations=seen
-    )
-    ours, theirs = first_collisions(case, Choices(alpha=0.05)).to_dict("records")
-    assert (ours["runs"], ours["collided"], ours["median"]) == (3, 2, 10)
-    assert (theirs["runs"], theirs["collided"], math.isnan(theirs["median"])) == (3, 0, True)
-    assert math.isnan(ours["p_value"])
-    # At the collisions 3 of 6 and 2 of 5 runs at risk are of the algorithm.
-    chi_squared = (2 - (3 / 6 + 2 / 5)) ** 2 / (3 * 3 / 6**2 + 2 * 3 / 5**2)
-    assert (
-        theirs["p_value"] == theirs["p_holm"] == pytest.approx(scipy.stats.chi2.sf(chi_squared, 1))
-    )
-
-
 def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -> None:
     """The first collision of each run is in such an encounter, the second, in its fifth evaluation,
     is not.
@@ -235,12 +203,9 @@ def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -
         evaluations=case.evaluations.assign(original_safety_degree=degrees),
         scoring=msgspec.structs.replace(case.scoring, safe_original=0.5),
     )
-    for one, median in ((case, 2), (joint, 5)):
-        assert first_collisions(one)["median"].tolist() == [median] * 2
     none = dataclasses.replace(
         joint, evaluations=joint.evaluations.assign(original_safety_degree=0.1)
     )
-    assert first_collisions(none)["collided"].tolist() == [0, 0]
     assert (compute_convergence(none)["hypervolume"] == 0).all()
     assert (compute_convergence(joint)["hypervolume"] > 0).any()
 
@@ -373,46 +338,6 @@ def test_the_footer_of_rq33() -> None:
 def test_collisions_and_their_share() -> None:
     frame = count_collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
     assert frame.to_numpy().tolist() == [["nsga2", 3, 2, pytest.approx(2 / 3)], ["rs", 1, 0, 0]]
-
-
-def test_weather_compares_cases_that_differ_in_it_alone() -> None:
-    clear = made_up(row(values=HEAVY), row(values=GRIPLESS))
-    wet = made_up(row(values=BOTH), study=made_up_study(name="wet", weather="hard_rain"))
-    changes = {"metrics": MetricsTable(ttc_threshold=9), "step_length": 0.05}
-    other = made_up(
-        row(values=BOTH), study=made_up_study(name="other", weather="hard_rain", **changes)
-    )
-    assert [(one.name, two.name) for one, two in find_weather_pairs([wet, other, clear])] == [
-        ("made-up", "wet")
-    ]
-    result = only(compare_weathers(clear, wet), characteristic="mass")
-    assert (result["percent"], result["percent_other"], result["difference"]) == (50, 100, 50)
-    assert (result["increase"], result["increase_other"], result["decrease"]) == pytest.approx(
-        (100, 200, np.nan), nan_ok=True
-    )
-    assert (result["rank"], result["rank_other"]) == (1, 1)
-    with pytest.raises(
-        InputError,
-        match=(
-            r"differ in the weather alone; these two also differ in metrics\.ttc_threshold,"
-            r" step_length"
-        ),
-    ):
-        find_weather_pairs([clear, other])
-    remarks = answer_questions([clear, other]).only("weather").tables["remarks"]["remark"]
-    assert "differ in the weather alone" in " ".join(remarks)
-    with pytest.raises(InputError, match="these two have equally clear weather"):
-        find_weather_pairs([clear, clear])
-
-
-@pytest.mark.parametrize(
-    ("clearer", "other"), [("clear", "hard_rain"), ("fog", "wet"), ("clear", "night")]
-)
-def test_the_clearer_weather_comes_first(clearer: str, other: str) -> None:
-    (pair,) = find_weather_pairs(
-        [made_up(row(), study=made_up_study(name=name, weather=name)) for name in (other, clearer)]
-    )
-    assert [one.name for one in pair] == [clearer, other]
 
 
 @pytest.mark.slow

@@ -14,18 +14,15 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
+from safevar_sumo.questions.causes import BOUNDARIES, OTHER_SETS, SUBSETS, count_needed
 from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_sets import conclusions_across_sets
-from safevar_sumo.questions.explain.causes import BOUNDARIES, SUBSETS, count_needed
 from safevar_sumo.questions.explain.failures import (
     TO_EXPLAIN,
     Population,
     choose_failures,
     gather_failures,
 )
-from safevar_sumo.questions.explain.margins import MARGINS, margins_table
-from safevar_sumo.questions.explain.moved import BORDERS, COLUMNS as MOVED_COLUMNS
 from safevar_sumo.questions.explain.robustness import robustness_in_words
 from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
@@ -35,10 +32,8 @@ from safevar_sumo.questions.explain.tables import (
     causes_table,
     distinct_table,
     failures_frame,
-    moved_table,
     statistics_tables,
 )
-from safevar_sumo.questions.model_spread import SETS_AT_ONCE
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
@@ -48,7 +43,6 @@ from safevar_sumo.questions.preventability import (
     TITLES,
     assess_sample,
     avoided_shares,
-    drivers_frame,
 )
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import (
@@ -69,14 +63,7 @@ if TYPE_CHECKING:
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
-USUAL_SHARES = {
-    TO_EXPLAIN: 2,
-    SUBSETS: 2,
-    REFERENCE_DRIVERS: 1,
-    SETS_AT_ONCE: 17,
-    BOUNDARIES: 1,
-    BORDERS: 1,
-}
+USUAL_SHARES = {TO_EXPLAIN: 2, SUBSETS: 2, REFERENCE_DRIVERS: 1, OTHER_SETS: 1, BOUNDARIES: 1}
 """The phases of progress, with their usual shares of the time."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
 """What the settings are of which some are unsafe."""
@@ -93,13 +80,11 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over t
         "original_outcome",
         "original_degree",
     ),
-    *("rough", "analysed", "explained", *COLLISION_NUMBERS, "fits", "unsafe_in_fits"),
+    *("rough", "analysed", "explained", *COLLISION_NUMBERS),
     causes=CAUSE_COLUMNS,
     solutions=SOLUTION_COLUMNS,
-    characteristics=[*CHARACTERISTIC_COLUMNS, "needed_in_fits"],
-    drivers=[*DRIVER_COLUMNS, "share_in_fits"],
-    margins=MARGINS,
-    moved=MOVED_COLUMNS,
+    characteristics=CHARACTERISTIC_COLUMNS,
+    drivers=DRIVER_COLUMNS,
     distinct_causes=DISTINCT_COLUMNS,
 )
 def explain(
@@ -132,8 +117,8 @@ def explain(
         Approximate number of simulations for the minimal causes of all failures; if all would take
         more, a random sample is analysed.
     fits
-        Number of parameter sets of the vehicle model (those of [spread]) with which each conclusion
-        is checked again; 0 leaves this out.
+        Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
+        checked again; 0 leaves this out.
     quick
         A rough answer within seconds: the study's own parameter set alone, and causes of few
         failures.
@@ -159,31 +144,21 @@ def explain(
     is_assessed = runs.collided & (not is_rated(study))
     verdicts, collisions = assess_sample(evaluator, runs.take(is_assessed))
 
-    # The same conclusions with the other parameter sets of the vehicle model.
-    shares = needed.set_index("characteristic")["needed"], avoided_shares(verdicts)
-    holding, ranges = conclusions_across_sets(evaluator, fits, population, of_chosen, *shares)
-
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     tables = {
-        "causes": causes_table(population, evaluator, holding, solutions, of_chosen),
+        "causes": causes_table(population, evaluator, fits, solutions, of_chosen),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
-        **statistics_tables(
-            needed, drivers_frame(verdicts, collisions), ranges, len(sample), len(verdicts)
-        ),
-        "margins": margins_table(population, evaluator, limit),
-        "moved": moved_table(evaluator, of_chosen),
+        **statistics_tables(needed, len(sample), verdicts, collisions),
         "distinct_causes": distinct_table(evaluator, of_sample),
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
         **_collision_numbers(study, verdicts, collisions),
-        "fits": len(holding),
-        "unsafe_in_fits": ranges.get(("unsafe", "")),
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
     sentences = [
-        _verdict(evaluator, population, kind, len(holding), tables["causes"]),
+        _verdict(evaluator, population, kind, tables["causes"]),
         _avoided_in_words(verdicts),
         *_counted(study, population, kind),
     ]
@@ -200,7 +175,7 @@ def explain(
 def _counted(study: Study, population: Population, kind: str) -> Iterator[str]:
     """Which of the settings count, in sentences."""
     if kind == DRAWN:
-        yield from counted_in_words(study, len(population.left_out))
+        yield from counted_in_words(study, population.left_out)
     yield from constraints_in_words(study)
 
 
@@ -253,9 +228,7 @@ def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) ->
     )
 
 
-def _verdict(
-    evaluator: Evaluator, population: Population, kind: str, sets: int, causes: pd.DataFrame
-) -> str:
+def _verdict(evaluator: Evaluator, population: Population, kind: str, causes: pd.DataFrame) -> str:
     """How little is enough, how sure that is, and how many settings are unsafe."""
     unsafe = population.unsafe
     contact = evaluator.system.contact
@@ -310,8 +283,8 @@ def _verdict(
         f"The encounter has {encounter.partition(' with ')[2]}." if encounter else "",
         robustness_in_words(leading["robust_share"]),
     ]
-    if sets:
-        holding = f"{leading['fits_holding']} of {sets}"
+    if pd.notna(leading["holds"]):
+        holding = f"{leading['holds']} of {leading['fits']}"
         sentences.append(f"The cause holds in {holding} parameter sets of the vehicle model.")
     return " ".join([*filter(None, sentences), counts])
 

@@ -14,14 +14,14 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import (
+from safevar_sumo.questions.causes import (
     Cause,
     count_distinct_causes,
     directions,
     find_minimal_causes,
     select_affordable_rows,
 )
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure
 from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray
@@ -66,8 +66,8 @@ class Population(NamedTuple):
     otherwise
         Number of rows with another outcome than in the results.
     left_out
-        Settings in whose encounter the original vehicle does not keep its margin, which are no
-        rows: drawn ones, or the unsafe ones of a search; shape (L, n).
+        Number of drawn settings in whose encounter the original vehicle does not keep its margin,
+        which are no rows.
     """
 
     original: Evaluations
@@ -77,7 +77,7 @@ class Population(NamedTuple):
     rows: list[int]
     is_named: bool
     otherwise: int
-    left_out: FloatArray
+    left_out: int
 
 
 def gather_failures(
@@ -113,15 +113,14 @@ def gather_failures(
     unsafe = stated or Unsafe.default_among(evaluations, original)
     names = candidates.names
 
-    # Settings without a valid encounter do not count; a search leaves failures out, too.
+    # Settings without a valid encounter do not count.
+    left_out = otherwise = 0
     if isinstance(subject, Study):
-        left_out = candidates.settings[evaluations.infeasible]
+        left_out = int(evaluations.infeasible.sum())
         counts = np.flatnonzero(~evaluations.infeasible)
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
-        otherwise = 0
     else:
-        left_out = _left_out_of_search(subject, unsafe)
         recorded = candidates.recorded
         otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
 
@@ -165,18 +164,6 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
         [str(handles[row]) for row in chosen],
         table["outcome"].to_numpy(dtype=str)[chosen],
     )
-
-
-def _left_out_of_search(case: Case, unsafe: Unsafe) -> FloatArray:
-    """The unsafe settings of a search in whose encounter the original vehicle does not keep its
-    margin.
-    """
-    evaluations = case.evaluations
-    names = [*case.characteristics.names]
-    if "feasible" not in evaluations or not {*names} <= {*evaluations}:
-        return np.zeros((0, len(names)))
-    rows = evaluations[~evaluations["feasible"].to_numpy(dtype=bool) & unsafe.rows(evaluations)]
-    return rows[names].drop_duplicates().to_numpy(dtype=float)
 
 
 class Chosen(NamedTuple):

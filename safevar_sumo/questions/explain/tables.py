@@ -7,27 +7,30 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.across_sets import Ranges
-from safevar_sumo.questions.explain.causes import (
+from safevar_sumo.questions.causes import (
+    OTHER_SETS,
     Cause,
+    are_causes,
     count_distinct_causes,
     find_cause_limits,
     settings_of,
 )
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
     Population,
     Reasons,
     compare_at_cells,
     compare_at_points,
 )
-from safevar_sumo.questions.explain.moved import COLUMNS as MOVED_COLUMNS, find_moved_borders
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
+from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     assess_collisions,
     avoided_by,
+    drivers_frame,
 )
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import number_of
@@ -63,7 +66,8 @@ CAUSE_COLUMNS: Columns = {
     "robust_share": Column(
         "-", "share of vehicles with slightly different values that are unsafe, too", ".2f"
     ),
-    "fits_holding": "number of parameter sets with which these changes are a cause, too",
+    "holds": "number of parameter sets of the vehicle model with which these changes are a cause",
+    "fits": "number of parameter sets that were tried",
     "avoided_by": Column(
         "", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False
     ),
@@ -150,7 +154,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
 def causes_table(
     population: Population,
     evaluator: Evaluator,
-    holding: Sequence[BoolArray],
+    fits: int,
     solutions: pd.DataFrame,
     causes_of: Sequence[Sequence[Cause]],
 ) -> pd.DataFrame:
@@ -166,6 +170,9 @@ def causes_table(
     if causes and not is_rated(study):
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
+
+    # With how many parameter sets it is one.
+    holding = _holding(evaluator, fits, causes, unsafe)
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -185,44 +192,48 @@ def causes_table(
             "size": len(causes[index].changes),
             "elsewhere": bool(elsewhere[index]),
             "robust_share": robust[index],
-            "fits_holding": sum(int(is_cause[index]) for is_cause in holding) if holding else None,
+            "holds": sum(int(is_cause[index]) for is_cause in holding) if holding else None,
+            "fits": len(holding) or None,
         }
         for index in np.lexsort([-robust, solution_of]).tolist()
     ]
-    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"fits_holding": "Int64"})
+    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"holds": "Int64", "fits": "Int64"})
     omitted = () if study.scenario.search else OF_ENCOUNTER
     columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
     return tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
 
 
+def _holding(
+    evaluator: Evaluator, sets: int, causes: Sequence[Cause], unsafe: Unsafe
+) -> list[BoolArray]:
+    """Whether each cause is one, with each of the first `sets` parameter sets."""
+    if not (sets and causes and evaluator.study.spread):
+        return []
+    studies = studies_of_sets(evaluator.study)[:sets]
+    with evaluator.stage(
+        OTHER_SETS, len(studies) * sum(1 + len(cause.changes) for cause in causes)
+    ):
+        return [
+            are_causes(evaluator.for_study(study, verified=0), causes, unsafe) for study in studies
+        ]
+
+
 def statistics_tables(
-    needed: pd.DataFrame, drivers: pd.DataFrame, ranges: Ranges, failures: int, collisions: int
+    needed: pd.DataFrame, failures: int, verdicts: pd.DataFrame, collisions: int
 ) -> dict[str, pd.DataFrame]:
-    """The tables of characteristics and of drivers, with ranges over parameter sets."""
-    in_fits = Column("-", "range over parameter sets of the vehicle model", ".2f")
-    of_characteristics = [ranges.get(("needed", str(name))) for name in needed["characteristic"]]
-    of_drivers = [ranges.get(("avoided", str(name))) for name in drivers["driver"]]
+    """The tables of characteristics and of drivers."""
     return {
         "characteristics": tabulate(
             f"Characteristics changed, and necessary, in {number_of(failures, 'failure')}",
-            {**CHARACTERISTIC_COLUMNS, "needed_in_fits": in_fits},
-            needed.assign(needed_in_fits=pd.Series(of_characteristics, dtype=object)),
+            CHARACTERISTIC_COLUMNS,
+            needed,
         ),
         "drivers": tabulate(
-            f"Other drivers in the same vehicle: {number_of(collisions, 'collision')} again",
-            {**DRIVER_COLUMNS, "share_in_fits": in_fits},
-            drivers.assign(share_in_fits=pd.Series(of_drivers, dtype=object)),
+            f"Other drivers in the same vehicle: {number_of(len(verdicts), 'collision')} again",
+            DRIVER_COLUMNS,
+            drivers_frame(verdicts, collisions),
         ),
     }
-
-
-def moved_table(evaluator: Evaluator, causes_of: Sequence[Sequence[Cause]]) -> pd.DataFrame:
-    causes = [] if is_rated(evaluator.study) else [cause for group in causes_of for cause in group]
-    title = (
-        "Avoidable in the original vehicle, no longer in this one: a competent driver who reacts"
-        " to any braking of a leader"
-    )
-    return tabulate(title, MOVED_COLUMNS, find_moved_borders(evaluator, causes))
 
 
 def distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:

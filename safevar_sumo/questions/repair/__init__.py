@@ -28,8 +28,8 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
+from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.price import price_of

@@ -42,7 +42,6 @@ from safevar_sumo.questions.research_questions.tables import (
     OVER_RUNS,
     POOLED,
     TABLES,
-    WEATHER,
 )
 from safevar_sumo.questions.words import demanded_in_words, join_phrases, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -141,8 +140,8 @@ def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
 
 def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
     """The minimal causes of a case's runs, which are simulated."""
+    from safevar_sumo.questions.causes import causes_of_runs
     from safevar_sumo.questions.evaluator import open_evaluator
-    from safevar_sumo.questions.explain.causes import causes_of_runs
 
     with open_evaluator(case.study, jobs=jobs) as evaluator:
         return causes_of_runs(case, evaluator, limit)
@@ -169,21 +168,19 @@ def answer_questions(
         label = next(iter(columns))  # of the case
         if name == CAUSES and not choices.causes:
             continue
-        groups = [cases] if name == WEATHER else [[case] for case in cases]
         options = [choices] if name in CHOSEN else []
         parts = []
-        for group in groups:
+        for case in cases:
             try:
-                part = compute(*group, *options)
+                part = compute(case, *options)
             except UnanswerableError as error:
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
-                parts.append(part if name == WEATHER else part.assign(**{label: group[0].name}))
-                for case in group:
-                    of_case = f"{case.name}: " if len(cases) > 1 else ""
-                    notes = _remarks(name, case, part, choices.alpha)
-                    remarks += [(name, f"{of_case}{note}") for note in notes]
+                parts.append(part.assign(**{label: case.name}))
+                of_case = f"{case.name}: " if len(cases) > 1 else ""
+                notes = _remarks(name, case, part, choices.alpha)
+                remarks += [(name, f"{of_case}{note}") for note in notes]
         shown = {**columns, label: columns[label]._replace(is_shown=len(cases) > 1)}
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
         frames[name] = tabulate(title, shown, rows, wide=wide, words=words)

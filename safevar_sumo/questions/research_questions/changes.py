@@ -1,5 +1,5 @@
 """RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe,
-collisions, combinations, sun against rain.
+collisions, combinations.
 
 Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if
 solutions belong to no run.
@@ -9,23 +9,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from safevar_sumo.ads import REACTION_PARAMETERS
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions
 from safevar_sumo.records import FloatArray
-from safevar_sumo.results import changed_values, evaluation_keys
-from safevar_sumo.study import SAFETY_DEGREE, tables_of
+from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
-WEATHER_PARAMETERS = (*REACTION_PARAMETERS, "brake_place")
-"""Parameters of an ADS by which it reacts to a weather: its delays, and where World On Rails sees
-the pedestrian.
-"""
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
@@ -232,89 +226,3 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
             )
         )
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])
-
-
-def find_weather_pairs(cases: Sequence[Case]) -> list[tuple[Case, Case]]:
-    """Pairs of cases that differ only in the weather and the ADS's reaction to it, clearer weather
-    first (by friction, visibility, delays).
-
-    The reaction's parameters are the `WEATHER_PARAMETERS`.
-
-    Raises
-    ------
-    UnanswerableError
-        If there is no such pair.
-    """
-    pairs = [
-        (clearer, other)
-        for clearer, other in permutations(cases, 2)
-        if _clearness(clearer) > _clearness(other) and not _differences(clearer, other)
-    ]
-    if not pairs:
-        problem = "two cases are needed that differ in the weather alone"
-        if len(cases) == 2:
-            differences = ", ".join(_differences(*cases))
-            problem += (
-                f"; these two also differ in {differences}"
-                if differences
-                else "; these two have equally clear weather"
-            )
-        raise UnanswerableError(
-            ", ".join(case.name for case in cases), problem, "results such as those of sun and rain"
-        )
-    return pairs
-
-
-def compare_weathers(*cases: Case) -> pd.DataFrame:
-    """The weathers of the pairs of `find_weather_pairs`, characteristic by characteristic, over the
-    critical solutions.
-
-    The column setting names the clearer weather's case. Columns without the suffix "_other" belong
-    to this case. Columns: setting, other, characteristic; percent, percent_other (of the critical
-    solutions that change it); difference (percent_other - percent); rank, rank_other; increase,
-    increase_other, decrease, decrease_other (mean signed change in the characteristic's unit).
-    """
-    tables = [
-        _overall_changes(clearer)
-        .merge(_overall_changes(other), "left", "characteristic", suffixes=("", "_other"))
-        .assign(setting=clearer.name, other=other.name)
-        for clearer, other in find_weather_pairs(cases)
-    ]
-    table = pd.concat(tables, ignore_index=True)
-    return table.assign(difference=table["percent_other"] - table["percent"])
-
-
-def _overall_changes(case: Case) -> pd.DataFrame:
-    """How often and how far the critical solutions change each characteristic; columns
-    characteristic, percent, rank, increase, decrease.
-    """
-    shares, sizes = (frame[frame["j"] == ANY] for frame in (rq32(case), rq33(case)))
-    deltas = sizes.pivot(index="characteristic", columns="direction", values="delta")
-    return shares.drop(columns="j").join(deltas, "characteristic")
-
-
-def _clearness(case: Case) -> tuple[float, float, float]:
-    weather = case.weather
-    reaction_delays = [
-        float(case.study.ads.parameters.get(name, 0.0)) for name in REACTION_PARAMETERS
-    ]
-    return (
-        weather.road_friction,
-        weather.visibility,
-        -weather.recognition_delay - sum(reaction_delays),
-    )
-
-
-def _differences(*pair: Case) -> list[str]:
-    """Keys on which a simulation depends and in which two studies differ, without those of the
-    weather and of the ADS's reaction to it.
-    """
-    first, second = (evaluation_keys(tables_of(case.study)) for case in pair)
-    ignored = {
-        "name",
-        "weather",
-        "search",
-        *(f"ads.parameters.{name}" for name in WEATHER_PARAMETERS),
-    }
-    differences = (key for key, _, _ in changed_values(first, second))
-    return [key for key in differences if not {key, key.partition(".")[0]} & ignored]

@@ -15,7 +15,6 @@ that they compare is missing, and over runs if the solutions belong to no run.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
@@ -27,13 +26,7 @@ import pandas as pd
 from msgspec import structs
 
 from safevar_sumo.metrics import Measure
-from safevar_sumo.questions.case import (
-    NSGA2,
-    Case,
-    UnanswerableError,
-    are_collisions,
-    solutions_for_metric,
-)
+from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, solutions_for_metric
 from safevar_sumo.questions.research_questions.fronts import (
     INDICATOR_TITLES,
     MORE_IS_BETTER,
@@ -48,10 +41,8 @@ from safevar_sumo.questions.research_questions.statistics import (
     compare_samples,
     correct_by_holm,
     effect_interval,
-    log_rank_test,
     median_interval,
     signed_rank_test,
-    survival_median,
 )
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
@@ -224,40 +215,6 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         for (algorithm, metric), values in samples.items()
     ]
     return pd.DataFrame(rows, columns=["algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN])
-
-
-def first_collisions(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """How many evaluations a run needs to find a collision, in an encounter in which the original
-    vehicle is safe; a run without any has needed more than it requested.
-
-    Columns algorithm, runs, collided (runs with a collision), median with its interval, and against
-    the algorithm of `opponents_of`: p_value of the log-rank test and p_holm, corrected for the
-    other algorithms.
-    """
-    # The first collision of each run; a run without one has needed more.
-    ends = count_evaluations(case).set_index(["algorithm", "run"])["requested"]
-    collisions = case.evaluations[
-        are_collisions(case.evaluations) & case.scoring.feasible_rows(case.evaluations)
-    ]
-    first = collisions.groupby(["algorithm", "run"])["evaluation"].min().reindex(ends.index) + 1
-    runs = pd.DataFrame({"time": first.fillna(ends), "found": first.notna()}).groupby(
-        level="algorithm", sort=False
-    )
-    samples = {
-        str(name): (rows["time"].to_numpy(), rows["found"].to_numpy()) for name, rows in runs
-    }
-
-    # Medians with intervals, and tests against the reference algorithm.
-    reference = choices.algorithm or (NSGA2 if NSGA2 in samples else next(iter(samples)))
-    rows = []
-    for algorithm, (times, found) in samples.items():
-        median, interval = survival_median(times, found, choices.alpha)
-        is_other = algorithm != reference and reference in samples
-        p_value = log_rank_test((times, found), samples[reference]) if is_other else math.nan
-        rows.append((algorithm, len(times), int(found.sum()), median, *interval, p_value))
-    names = ["algorithm", "runs", "collided", *INTERVAL_OF_MEDIAN, "p_value"]
-    frame = pd.DataFrame(rows, columns=names)
-    return frame.assign(p_holm=correct_by_holm(frame["p_value"]))
 
 
 def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:

@@ -1,15 +1,13 @@
 """Statistics of samples and runs (docs/method.md, section 7): Mann-Whitney U, Wilcoxon's signed
-ranks, the log-rank test, effect sizes, medians, their intervals, and Holm's correction for many
-tests.
+ranks, effect sizes, medians, their intervals, and Holm's correction for many tests.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterable
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -179,36 +177,3 @@ def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
         scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5)
     )  # the first whose probability is not too small
     return (ordered[rank - 1], ordered[-rank]) if rank else (math.nan, math.nan)
-
-
-def survival_median(
-    times: ArrayLike, has_ended: ArrayLike, alpha: float = ALPHA
-) -> tuple[float, Interval]:
-    """The median time to an event, of which some are censored, by Kaplan and Meier, and its
-    interval by Brookmeyer and Crowley (log-log); NaN where half of the runs do not reach it.
-    """
-    curve = scipy.stats.ecdf(_censored(times, has_ended)).sf
-    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of undefined ends of the interval
-        ends = curve.confidence_interval(1 - alpha, method="log-log")
-
-    def time_below_half(curve: Any) -> float:
-        return next(iter(curve.quantiles[curve.probabilities <= 0.5]), math.nan)
-
-    return time_below_half(curve), (time_below_half(ends.low), time_below_half(ends.high))
-
-
-def log_rank_test(first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, ArrayLike]) -> float:
-    """The p-value of the log-rank test of two samples, each of times and of whether they have
-    ended; NaN where it is undefined, as without an event.
-    """
-    if not (np.any(first[1]) or np.any(second[1])):
-        return math.nan
-    with np.errstate(invalid="ignore"):  # undefined where all have an event at once
-        return float(scipy.stats.logrank(_censored(*first), _censored(*second)).pvalue)
-
-
-def _censored(times: ArrayLike, has_ended: ArrayLike) -> scipy.stats.CensoredData:
-    return scipy.stats.CensoredData.right_censored(
-        np.asarray(times, dtype=float), ~np.asarray(has_ended, dtype=bool)
-    )

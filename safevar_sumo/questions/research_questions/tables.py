@@ -17,19 +17,14 @@ from safevar_sumo.questions.research_questions.fronts import (
 )
 from safevar_sumo.shipped import shipped_table
 
-WEATHER, CAUSES = "weather", "causes"
-CHOSEN = (
-    *("rq1-runs", "rq2-runs", "rq2-common", "medians", "first-collision"),
-    *(CAUSES, "rq1", "rq2", "a12"),
-)
+CAUSES = "causes"
+CHOSEN = ("rq1-runs", "rq2-runs", "rq2-common", "medians", CAUSES, "rq1", "rq2", "a12")
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
 
 class PaperTable(NamedTuple):
-    """A table: its title, the function of a case (of the weather: of all cases) that computes it,
-    and its columns.
-    """
+    """A table: its title, the function of a case that computes it, and its columns."""
 
     title: str
     compute: Compute
@@ -59,7 +54,6 @@ FUNCTIONS: Mapping[str, Compute] = {
     "rq2-common": comparisons.rq2_common,
     "a12": comparisons.effects,
     "medians": comparisons.median_runs,
-    "first-collision": comparisons.first_collisions,
     CAUSES: comparisons.minimal_causes,
     "rq1": comparisons.rq1,
     "rq2": comparisons.rq2,
@@ -71,7 +65,6 @@ FUNCTIONS: Mapping[str, Compute] = {
     "rq3.3-safety": changes.rq33_safety,
     "collisions": changes.count_collisions,
     "combinations": changes.frequent_combinations,
-    WEATHER: changes.compare_weathers,
 }
 OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 POOLED = ("rq1", "rq2", "collisions")

@@ -59,7 +59,6 @@ def tolerance(
     fits: Annotated[int | None, Range(0, 1000)] = None,
     attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     by: Annotated[str | None, "NAME=V1,V2,..."] = None,
-    together: bool = False,
     quick: bool = False,
 ) -> Answer:
     """Find how far each characteristic may change: alone, and all at the same time.
@@ -94,17 +93,13 @@ def tolerance(
         A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits
         of each characteristic alone that hold up to each of these values, and the value up to which
         the specified limits hold.
-    together
-        Joint limits, which hold all at the same time; they are always sought without `by`, and
-        never beside it.
     quick
-        A rough answer within seconds: corners and a short search for counterexamples, with the
-        study's own parameter set. No limit is called kept, and with limits the exit code is 3. Not
-        with `by`.
+        A rough answer: the study's own parameter set, and the shortest search for counterexamples.
+        No limit is called kept, and with limits the exit code is 3. Not with `by`.
     """
     study = evaluator.study
     parameter = None if by is None else Parameter.parse(by, study)
-    check_by(by, unsafe, together, is_quick=quick)
+    check_by(by, unsafe, is_quick=quick)
     evaluator.plan(*_phases(study, parameter))
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)

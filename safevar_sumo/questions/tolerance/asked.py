@@ -35,8 +35,7 @@ class Asked(NamedTuple):
     budget
         Number of simulations that search for a counterexample.
     is_quick
-        Whether a rough answer is enough: corners and a short search for counterexamples at the
-        study's own points, with its own parameter set.
+        Whether the answer is rough, so that no limit is called kept.
     """
 
     subject: Study | Case

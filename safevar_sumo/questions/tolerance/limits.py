@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.bars import bars_of
+from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, models_of, with_points_between
@@ -21,7 +20,6 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.figure import draw_limits
 from safevar_sumo.questions.tolerance.left_out import contacts_left_out
 from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import (
@@ -141,12 +139,12 @@ def find_limits(asked: Asked) -> FoundLimits:
         models = models_of(evaluator, asked.unsafe, asked.fits)
     # Limits alone also hold at points between those of the study's matrix.
     judges = [*models.members]
-    if is_sought and asked.may_keep:
+    if is_sought and asked.budget:
         judges = [with_points_between(model, asked.unsafe, 0)[0] for model in models.members]
     search_alone = AloneSearch(scans, asked.columns, judges)
     encounters = 1 + len(evaluator.critical_encounters)
     with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(asked.columns) * encounters):
-        search_alone.run(asked.budget if asked.may_keep else 0)
+        search_alone.run(asked.budget)
     together = None
     if is_sought and is_safe:
         together = _find_together(asked, scans, models, search_alone)
@@ -169,8 +167,7 @@ def _find_together(
     for _ in range(MAX_REFUTED):
         unsafe_settings = np.concatenate([*known, search_alone.failures])
         together = find_limits_together(
-            *(models, columns, limits, scans, unsafe_settings, asked.budget),
-            is_quick=asked.is_quick,
+            models, columns, limits, scans, unsafe_settings, asked.budget
         )
         search_alone.meet(together.searched, together.failures_alone)
         if together.box is None or not together.box.holds(search_alone.failures).any():
@@ -186,14 +183,14 @@ def answer_limits(asked: Asked) -> Answer:
     models = found.models
     together = found.together
     contacts = None
-    if together is not None and asked.may_keep and len(evaluator.characteristics.scenario):
+    if together is not None and asked.budget and len(evaluator.characteristics.scenario):
         contacts = contacts_left_out(models.members, [together.box or together.specified])
-    scope = scope_of(study, between=asked.may_keep)
+    scope = scope_of(study, between=asked.budget > 0)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
     if not asked.may_keep:
         rows = rows.without_kept()
     nearest = []
-    if rows.broken and together is not None and not asked.is_quick:
+    if rows.broken and together is not None:
         nearest = nearest_limits(models, asked.limits)
     wider = wider_rows(asked, together) if found.is_safe else []
     refusal = demand = ""
@@ -223,7 +220,7 @@ def answer_limits(asked: Asked) -> Answer:
         },
         tables=_tables(found, rows.rows, nearest, wider),
         failures=(why_not_kept(asked),) if is_kept is None and asked.limits else failures,
-        draw=partial(draw_limits, scans=found.scans),
+        draw=draw_bars,
     )
 
 

@@ -431,27 +431,17 @@ def _draw_limits(axis: Axes, rows: pd.DataFrame, by: Parameter) -> None:
     axis.set_ylim(values[0], values[-1])
 
 
-def check_by(
-    by: str | None, unsafe: str | None, is_together: bool, *, is_quick: bool = False
-) -> None:
+def check_by(by: str | None, unsafe: str | None, *, is_quick: bool = False) -> None:
     """Refuse options that do not go together with limits up to values of a parameter.
 
     Raises
     ------
     InputError
-        If another criterion than the margin, joint limits or a rough answer are asked for beside
-        `by`.
+        If another criterion than the margin or a rough answer are asked for beside `by`.
     """
     if by is not None and is_quick:
         problem = f"a rough answer has no value of --by {by} up to which limits hold"
         raise InputError("quick", problem, "--quick without --by, or --by without --quick")
-    if by is not None and is_together:
-        legal = (
-            "--by for limits alone, or joint limits of a study with a narrower domain, without --by"
-        )
-        raise InputError(
-            "together", f"joint limits are not sought up to each value of --by {by}", legal
-        )
     if by is not None and unsafe is not None:
         legal = "limits that keep the margin (--margin), or the question without --by"
         raise InputError("by", f"{by!r} beside --unsafe {unsafe!r}", legal)

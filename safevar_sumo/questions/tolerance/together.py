@@ -151,8 +151,6 @@ def find_limits_together(
     scans: Sequence[OneAtATimeScan],
     unsafe_settings: FloatArray,
     budget: int,
-    *,
-    is_quick: bool = False,
 ) -> LimitsTogether:
     """The largest box by relative volume in which `columns` vary, in which those of `limits` reach
     their limits, and that holds none of `unsafe_settings`, shape (K, n).
@@ -166,15 +164,15 @@ def find_limits_together(
     boxes must survive, in that set; after `EXPLORED` boxes, failures are only cut off. Of a box
     that passes, each limit moves out as far as it can go, at most `MAX_GROWTHS` times, and what
     fails then is cut off until a box passes. The last box has to pass further searches for
-    counterexamples, all corners with each parameter set, and settings drawn at random; with
-    `is_quick` no limit moves out, and the corners alone are tested. After `MAX_BOXES` boxes or
-    `MAX_SIMULATIONS` simulations the largest that passed is the last, or none is found.
+    counterexamples, all corners with each parameter set, and settings drawn at random. After
+    `MAX_BOXES` boxes or `MAX_SIMULATIONS` simulations the largest that passed is the last, or none
+    is found.
     """
     search, nothing = _open_search(models, columns, limits, unsafe_settings)
     if models.own.fit in nothing.broken:
         return nothing
     boxes = _Boxes(search, _start_of(search, columns, scans), models.own.evaluator)
-    validator = Validator(nothing.members, enough(budget), models.own.evaluator, is_quick=is_quick)
+    validator = Validator(nothing.members, enough(budget), models.own.evaluator)
     for number in range(1, MAX_BOXES + 1):
         box = boxes.next(number)
         if box is None:
@@ -189,13 +187,11 @@ def find_limits_together(
             validation = validator.complete(passed, number)
         else:
             validation = validator.validate(box, number)
-            if is_quick and not validation.failures:
-                validation = validator.complete(validation, number)
         if validation.failures:
             boxes.refuse(validation)
             if is_over and boxes.passed is None:
                 break
-        elif is_last or is_quick:
+        elif is_last:
             return _result(nothing, boxes.extension, validation, number)
         else:
             boxes.accept(validation, may_grow=not is_over)

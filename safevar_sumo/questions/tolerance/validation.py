@@ -69,17 +69,13 @@ class Validation(NamedTuple):
 
 
 class Validator:
-    """Validates boxes in some models; `budget` simulations falsify each. With `is_quick` they do
-    so at the study's own points, and no vehicles are sampled. Progress is shown by the evaluator of
-    the question.
+    """Validates boxes in some models; `budget` simulations falsify each. Progress is shown by the
+    evaluator of the question.
     """
 
-    def __init__(
-        self, models: Sequence[Model], budget: int, evaluator: Evaluator, *, is_quick: bool = False
-    ) -> None:
+    def __init__(self, models: Sequence[Model], budget: int, evaluator: Evaluator) -> None:
         self.models = models
         self.budget = budget
-        self.is_quick = is_quick
         self.evaluator = evaluator
         self.seed = models[0].evaluator.study.search.seed
         self._proofs = 0
@@ -120,7 +116,7 @@ class Validator:
             failing = {*self._failing}
             tested = self._test_corners(first, failing)
             # Further searches for counterexamples.
-            if not tested.failures and not self.is_quick:
+            if not tested.failures:
                 validation = self._confirm(validation, attempt)
                 if validation.failures:
                     return validation
@@ -138,8 +134,6 @@ class Validator:
                 for number, model in enumerate(self.models)
             }
             validation = validation._replace(corners=least)
-            if self.is_quick:
-                return validation
             # Sampled vehicles, for the upper bound.
             return self._prove(validation, attempt)
 
@@ -239,8 +233,6 @@ class Validator:
         """The models with points between those of a matrix, too, and the number of these that do
         not count.
         """
-        if self.is_quick:
-            return [*self.models], 0
         own = self.models[0].unsafe
         found = [with_points_between(model, own, attempt) for model in self.models]
         return [model for model, _ in found], found[0][1]

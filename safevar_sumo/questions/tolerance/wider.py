@@ -69,7 +69,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     """
     evaluator = asked.evaluator
     budget = asked.budget
-    if not evaluator.study.wider or together is None or not asked.may_keep:
+    if not evaluator.study.wider or together is None or not asked.budget:
         return []
     study = wider_study(evaluator.study)
     other = evaluator.for_study(study)

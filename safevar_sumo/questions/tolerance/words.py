@@ -105,7 +105,7 @@ def verdict_sentences(
         yield "No single characteristic makes the vehicle unsafe on its own."
     if unsafe.remark:
         yield unsafe.remark
-    yield f"Scope: {scope_of(study, between=asked.may_keep)}."
+    yield f"Scope: {scope_of(study, between=asked.budget > 0)}."
 
 
 def tested_sentences(
@@ -175,13 +175,10 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
     decision = "All joint limits hold at the same time"
     if asked.limits:
         decision = "The joint limits below hold" if together.broken else "All limits hold"
-    if asked.is_quick and asked.budget:
-        decision = "The joint limits below hold at their corners and in the short search"
-    elif not asked.budget:
+    if not asked.budget:
         decision = "The joint limits below were tested at their corners alone, and hold there"
     yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
-    if not asked.is_quick:
-        yield from one_set_in_words(models.members, models.left_out)
+    yield from one_set_in_words(models.members, models.left_out)
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
 

@@ -28,6 +28,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 SUBSETS = "subsets of the changes"
 BOUNDARIES = "boundaries"
+OTHER_SETS = "other parameter sets"
 """Stages of progress."""
 MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call, which bounds the memory."""
@@ -90,6 +91,24 @@ def find_minimal_causes(
                     )
                     causes[row].append(cause)
     return causes
+
+
+def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> BoolArray:
+    """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe,
+    and safe if any one of them is left out.
+    """
+    characteristics = evaluator.characteristics
+    groups = []
+    for setting in settings_of(characteristics, causes):
+        is_changed = (setting != characteristics.original) & characteristics.of_vehicle
+        is_left_out = np.diag(is_changed)[is_changed]  # in a row for each change
+        groups.append(
+            np.vstack([setting, np.where(is_left_out, characteristics.original, setting)])
+        )
+    starts = np.cumsum([0, *map(len, groups[:-1])])
+    is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), OTHER_SETS))
+    # The first setting of a group, with all changes, is the only unsafe one.
+    return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
 
 
 def _subset_counts(numbers: Iterable[int], least: int = 0) -> list[int]:
