@@ -353,40 +353,6 @@ def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
             assemble(load_study(study.name, name="another", vehicle=tables))
 
 
-@pytest.mark.parametrize(
-    ("study", "tables", "message"),
-    [
-        (
-            "wear",
-            {"parameters": {"kerb_mass": 2.25}},
-            "vehicle.parameters.kerb_mass = 2.25 kg\nexpected: a plausible value, 50",
-        ),
-        ("wear", {"parameters": {"wheelbase": 270.0}}, "vehicle.parameters.wheelbase = 270 m\n"),
-        (
-            "wear",
-            {"parameters": {"brake_force": 16.5}},
-            "vehicle.parameters.brake_force = 16.5 N\n",
-        ),
-        (
-            "sun",
-            {"characteristics": {"radius": {"lower": 0.355}}},
-            "vehicle.characteristics.radius.lower = 0.355 cm\n",
-        ),
-        (
-            "sun",
-            {"characteristics": {"maxBrakeTorque": {"lower": 1.2}}},
-            "maxBrakeTorque.lower = 1.2 N m\n",
-        ),
-    ],
-)
-def test_what_is_implausible_is_named_with_its_unit(
-    study: str, tables: JsonObject, message: str
-) -> None:
-    with pytest.raises(InputError) as refusal:
-        assemble(load_study(study, name="another", vehicle=tables))
-    assert message in str(refusal.value)
-
-
 OWN = (
     "from safevar_sumo.vehicles.sensing import WornVehicle\n\nclass Own(WornVehicle, frozen=True,"
     " kw_only=True):\n    "
