@@ -25,6 +25,7 @@ from typing import Any
 
 import pytest
 
+from safevar_sumo.shipped import NETWORKS
 from tests.in_process import refused
 from tests.openscenario import writing
 from tests.openscenario.test_legal import write_all_actions
@@ -33,6 +34,7 @@ SCENES = Path(writing.__file__).parent / "files"
 FOLDERS: dict[str, Callable[..., object]] = {
     "scene": writing.write,
     "actions": write_all_actions,
+    "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine"),
     "files": lambda folder: shutil.copytree(SCENES, folder / "files"),
 }
 
