@@ -120,15 +120,17 @@ def json_of(*arguments: str) -> Any:
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:
-    """The command must end with exit code 2 and print, warnings and notes apart, all of `message`
-    in one or two lines, or a line for each mistake.
+    """The command must end with exit code 2 and print, warnings, notes and progress apart, all of
+    `message` in one or two lines that are not too long, or a line for each mistake.
     """
     output = run(*arguments, expect=2)
     for part in message:
         assert part in output.stderr, output.stderr
+    assert "Traceback" not in output.stderr
     lines = [
         line
         for line in output.stderr.strip().splitlines()
-        if not line.startswith(("warning: ", "note: "))
+        if not line.startswith(("warning: ", "note: ")) and " left" not in line
     ]
     assert len(lines) <= 2 or lines[0].endswith("mistakes"), output.stderr
+    assert max(map(len, lines)) < 1000, output.stderr

@@ -199,27 +199,6 @@ def test_what_user_code_imports_by_a_computed_name_counts_and_what_it_opens_is_n
     refused("rules", "out", "--samples", "20", message=("helper.py no longer exists",))
 
 
-@pytest.mark.parametrize(
-    ("files", "problem", "legal"),
-    [
-        (
-            "[]",
-            "ads.parameters.weights = 'weights.json': the study does not name this file",
-            "[ads]",
-        ),
-        ('["weight.json"]', "ads.files: there is no file 'weight.json'", "relative to"),
-    ],
-)
-def test_a_file_that_a_study_does_not_name_or_that_is_missing_is_refused(
-    files: str, problem: str, legal: str, place: Path
-) -> None:
-    (place / "mine.toml").write_text(STUDY.replace('["weights.json", "tiles"]', files))
-    with pytest.raises(InputError) as refused:
-        assemble(load_study(place / "mine.toml"))
-    assert problem in refused.value.problem
-    assert legal in refused.value.legal
-
-
 KINDS = (errno.EIO, errno.ENOSPC, errno.EINTR, 0)
 """Errors that a step fails with; 0 is a write of half of what was to be written, and no error
 elsewhere.

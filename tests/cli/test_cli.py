@@ -31,7 +31,6 @@ from safevar_sumo.terminal import Phase, open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, refused, run
 
-ROOT = Path(__file__).parents[2]
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
 
@@ -301,18 +300,6 @@ def test_what_user_code_prints_leaves_the_json_alone(
         out, err = capfd.readouterr()
         assert "writes" in err
         assert not out
-
-
-def test_a_question_with_one_parameter_is_refused(
-    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(str(in_tmp))
-    Path("asks.py").write_text(
-        "from safevar_sumo.questions.ask import question\n\n\n@question\ndef one(subject): ...\n"
-    )
-    refused(
-        "asks:one", "smoke", message=("question 'asks:one': takes (subject)", "(subject, evaluator")
-    )
 
 
 @pytest.mark.parametrize(

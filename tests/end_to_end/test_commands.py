@@ -21,7 +21,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import json_of, refused, run
+from tests.in_process import json_of, run
 
 pytestmark = pytest.mark.usefixtures("small")
 SLOW = pytest.mark.slow
@@ -152,25 +152,6 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
 def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
     """Half of its domain has encounters that cannot be driven."""
     assert "seconds" in run("study", "alks_joint_cut_out", "--dry-run").stdout
-
-
-def test_an_ads_that_always_fails_ends_the_study_with_that_fault() -> None:
-    Path("my_ads.py").write_text(
-        "from safevar_sumo.ads import ScalarAds\n\n\nclass Bad(ScalarAds):\n"
-        "    def drive(self, seen):\n        return 1 / 0\n"
-    )
-    Path("bad.toml").write_text(
-        'extends = "small.toml"\nname = "bad"\n[ads]\nmodel = "my_ads:Bad"\n'
-    )
-    for options, command in (([], "check bad.toml"), (["--dry-run"], "simulate bad.toml")):
-        refused(
-            "study",
-            "bad.toml",
-            "--out",
-            "out",
-            *options,
-            message=("ZeroDivisionError", f"it: python -m safevar_sumo {command}"),
-        )
 
 
 ADS = """

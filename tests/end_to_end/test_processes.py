@@ -17,7 +17,6 @@ import psutil
 import pytest
 
 from safevar_sumo.campaign.pool import open_pool
-from safevar_sumo.errors import InputError
 from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
@@ -275,11 +274,3 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     assert workers[1].poll() is None
     assert solutions("out") == solutions(whole)
     assert (load_runs("out").evaluations["outcome"] != "simulator-error").all()
-
-
-def test_an_encrypted_scheduler_needs_certificates_from_the_configuration() -> None:
-    with (
-        pytest.raises(InputError, match=r"certificates in Dask's configuration"),
-        open_pool(cluster="tls://127.0.0.1:9"),
-    ):
-        pass

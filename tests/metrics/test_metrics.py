@@ -242,12 +242,6 @@ def test_what_opens_or_lies_behind_has_no_time_to_collision(
     assert value("tet", run) == value("tit", run) == 0
 
 
-@pytest.mark.parametrize("interval", [STEP / 2, 1.5 * STEP, STEP / 1000, 1e-7])
-def test_a_sampling_interval_between_steps_is_refused(interval: float) -> None:
-    with pytest.raises(InputError, match="whole multiple"):
-        value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=interval))
-
-
 def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
     level = meeting(distance=2.0 * RUN.encounter.closing_speed)
     moving = np.count_nonzero(RUN.encounter.closing_speed[:, 0] > 0)

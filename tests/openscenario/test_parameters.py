@@ -12,13 +12,11 @@ from safevar_sumo.openscenario import play, read
 from safevar_sumo.scenarios import OpenScenario
 from tests.openscenario.writing import (
     AT_ONCE,
-    at,
     body,
     event,
     group,
     lane_change,
     speed,
-    teleport,
     trigger,
     watching,
     write,
@@ -93,22 +91,6 @@ def test_a_file_without_a_road_gets_a_straight_one(tmp_path: Path, network: str)
     assert driven(OpenScenario(str(file))).outcome[0] == "passed"
 
 
-@pytest.mark.parametrize(
-    ("place", "problem"),
-    [
-        (at(1000, 90), "road 1 has no lane 1000 at s = 90.0 m"),
-        (at(-2, 90).replace('roadId="1"', 'roadId="7"'), "no road file, but the roads 1, 7"),
-    ],
-)
-def test_a_file_without_a_road_names_one_road_of_some_lanes(
-    tmp_path: Path, place: str, problem: str
-) -> None:
-    file = Path(write(tmp_path, car=(teleport(place), speed(10))))
-    file.write_text(file.read_text().replace(NO_ROAD, ""))
-    with pytest.raises(InputError, match=problem):
-        play(str(file), {})
-
-
 VEHICLES = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="0"/><Catalog name="{}">{}</Catalog></OpenSCENARIO>"""
 PLACES = "<{0}Catalog><Directory path='.'/></{0}Catalog>"
 LOOP = '<CatalogReference catalogName="Cars" entryName="car"/>'
@@ -129,30 +111,15 @@ def test_a_catalog_is_found_by_its_name_or_its_file(tmp_path: Path, its_name: st
     assert read(file, {}).catalogs == [str(tmp_path / "Cars.xosc")]
 
 
-def test_a_catalog_that_refers_to_itself_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the entry car of the catalog Cars refers to itself"):
-        play(with_catalog(tmp_path, "Cars", ENTRY.format(LOOP)), {})
-
-
 @pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        ("<ScenarioObject name='Car'>{}</ScenarioObject>", "there is no catalog None in"),
-        (body("Car").replace("</ScenarioObject>", "{}</ScenarioObject>"), ""),
-        (body("Car").replace("</ScenarioObject>", "<ObjectController>{}</ObjectController></ScenarioObject>"), ""),
-    ],
-)  # fmt: skip
-def test_a_missing_catalog_is_refused_where_the_file_needs_it(
-    tmp_path: Path, place: str, message: str
+    "inner", ["{}</ScenarioObject>", "<ObjectController>{}</ObjectController></ScenarioObject>"]
+)
+def test_a_missing_catalog_that_the_file_does_not_need_is_no_fault(
+    tmp_path: Path, inner: str
 ) -> None:
     reference = '<CatalogReference catalogName="None" entryName="x"/>'
-    file = write(tmp_path, entities=body("Ego") + place.format(reference))
-    if message:
-        with pytest.raises(InputError, match=message) as caught:
-            play(file, {})
-        assert caught.value.legal
-    else:
-        assert play(file, {}).others[0].shape.length == 4
+    car = body("Car").replace("</ScenarioObject>", inner.format(reference))
+    assert play(write(tmp_path, entities=body("Ego") + car), {}).others[0].shape.length == 4
 
 
 CHANGES = {
@@ -262,31 +229,3 @@ def test_what_an_event_sets_ends_the_scene(tmp_path: Path) -> None:
     """At 5 s, and 4 s are played after that."""
     sets = setting("Sets", AT_ONCE.format(5), "V"), setting("Next", is_set("V"), "W")
     assert play(write_values(tmp_path, *sets, SLOWS, stops=(is_set("W"),)), {}).duration == 9
-    repeated = setting("Sets", AT_ONCE.format(5), "V", repeats=2)
-    with pytest.raises(InputError, match="the event Sets could begin again after 5"):
-        play(write_values(tmp_path, repeated, SLOWS, stops=(is_set("V"),)), {})
-
-
-LOGS = setting("Logs", COLLISION, "V")
-
-
-@pytest.mark.parametrize(
-    ("events", "act"),
-    [
-        ([LOGS, event(speed(5), is_set("V"))], AT_ONCE.format(0)),
-        ([LOGS, event(speed(5), is_set("V", "notEqualTo"))], AT_ONCE.format(0)),
-        ([LOGS, setting("Next", is_set("V"), "p"), event(speed(5), is_set("p"))], AT_ONCE.format(0)),
-        ([LOGS, setting("Next", is_set("V"), "p"), event(speed(5), ENDED.format("Next"))], AT_ONCE.format(0)),
-        ([LOGS, event(speed(5), ENDED.format("Logs"))], AT_ONCE.format(0)),
-        ([LOGS, SLOWS], is_set("V")),
-        ([LOGS, SLOWS], trigger(AT_ONCE.format(0)) + trigger(is_set("V"), "StopTrigger")),
-        ([LOGS.replace("</Event>", f"<Action name='Brakes'><PrivateAction>{speed(5)}</PrivateAction></Action></Event>")], AT_ONCE.format(0)),
-    ],
-    ids=["direct", "negated", "chain", "chain by a state", "state", "begin of an act", "end of an act", "moves, too"],
-)  # fmt: skip
-def test_what_a_motion_depends_on_may_not_wait_for_a_collision(
-    tmp_path: Path, events: list[str], act: str
-) -> None:
-    file = write_values(tmp_path, *events, act=act, stops=(is_set("V"),))
-    with pytest.raises(InputError, match="the event Logs waits for a CollisionCondition of Ego"):
-        play(file, {})

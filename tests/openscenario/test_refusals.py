@@ -1,4 +1,3 @@
-# ruff: noqa: E501 (lines of XML, and formulas)
 """What a reader of OpenSCENARIO refuses, and how it says so."""
 
 from __future__ import annotations
@@ -17,27 +16,16 @@ from tests.manual import ROOT
 from tests.openscenario.writing import (
     AT_ONCE,
     EGO,
-    PARAMETER,
-    STRAIGHT,
     at,
-    body,
     event,
-    group,
     lane_change,
     private,
     speed,
     teleport,
-    trigger,
-    watching,
     write,
 )
+from tests.refusals.test_refusals import prepare, rows
 
-CATALOG = '<CatalogReference catalogName="cars" entryName="mine"/>'
-SPLINE = STRAIGHT.replace("<line/>", "<bezier/>")
-TURN = '<geometry s="0" x="0" y="0" hdg="0" length="2000"><arc curvature="0.001"/></geometry>'
-ACTIVATE = "<ActivateControllerAction longitudinal='true'/>"
-BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]>'
-EXTERNAL = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
 LIMITED = (
     '<ParameterDeclaration name="v" parameterType="double" value="10"><ConstraintGroup>'
     '<ValueConstraint rule="lessThan" value="5"/></ConstraintGroup></ParameterDeclaration>'
@@ -48,63 +36,24 @@ TEMPLATES = [
     for _, message, _ in GENERATE["messages"](Path(openscenario.__path__[0]))
 ]
 """The refusals that a page of the manual lists."""
-TRAILER = body("Car").replace("</Vehicle>", "<Trailer>{}</Trailer></Vehicle>")
-STATE = trigger(
-    "<StoryboardElementStateCondition storyboardElementType='event' storyboardElementRef='{}' state='runningState'/>",
-    "",
-)
-BACKWARDS = """<SynchronizeAction masterEntityRef="Ego"><TargetPositionMaster><LanePosition roadId="1" laneId="-1" s="250"/></TargetPositionMaster>
-<TargetPosition><LanePosition roadId="1" laneId="-2" s="200"/></TargetPosition><FinalSpeed><AbsoluteSpeed value="-2"/></FinalSpeed></SynchronizeAction>"""
-COLLISION = "<CollisionCondition><EntityRef entityRef='Car'/></CollisionCondition>"
 
 
-@pytest.mark.parametrize(
-    ("parts", "problem"),
-    [
-        ({"geometry": SPLINE}, "the road 1 has a bezier"),
-        ({"geometry": TURN}, "Ego does not drive straight on: it turns by"),
-        ({"ego": private("Ego", teleport(at(-1, 50)), speed(-1.11))}, r"Ego drives backwards \(-1.11 m/s\)"),
-        ({"ego": private("Ego", teleport(at(-1, 50)))}, "Ego stands at the start"),
-        ({"ego": private("Ego", teleport(at(-1, 50)), speed(20), ACTIVATE), "groups": group(event(speed(5), AT_ONCE.format(3)), actor="Ego")}, "SpeedAction of Ego after the start"),
-        ({"events": group(event(speed(5), watching("Ego", COLLISION)))}, "the event Event waits for a CollisionCondition of Ego"),
-        ({"entities": body("Car1") + body("Car2"), "init": ""}, "no ScenarioObject is named 'Ego'; there are: Car1, Car2"),
-        ({"car": ("<LongitudinalAction><SpeedProfileAction/></LongitudinalAction>",)}, "SpeedProfileAction is not supported"),
-        ({"car": (teleport("<GeoPosition/>"),)}, "GeoPosition is not supported"),
-        ({"stop": "<ConditionGroup><Condition><ByValueCondition><UserDefinedValueCondition/></ByValueCondition></Condition></ConditionGroup>"}, "UserDefinedValueCondition is not supported"),
-        ({"entities": f'<ScenarioObject name="Ego">{CATALOG}</ScenarioObject>'}, "there is no catalog cars in"),
-        ({"car": (teleport(at(-2, 2010)), speed(1))}, "s = 2010.0 m is not on road 1, which is 2000 m long"),
-        ({"parameters": LIMITED}, "the file's constraints exclude v = 10"),
-        ({"entities": body("Ego"), "init": EGO}, "nobody but Ego is in the file"),
-        ({"road": "gone.xodr"}, "the road .*gone.xodr' is not there"),
-        ({"version": "2"}, "is no OpenSCENARIO XML 1.x"),
-        ({"prolog": BOMB}, "has a document type or entities"),
-        ({"prolog": EXTERNAL}, "has a document type or entities"),
-        ({"prolog": "<"}, "is no XML"),
-        ({"car": (speed(10),)}, "Car has no place in Init"),
-        ({"car": (teleport(at(-3, 100)), speed(10))}, "road 1 has no lane -3"),
-        ({"car": (teleport(at(-2, 100)), speed("$v"))}, "the file declares no parameter v"),
-        ({"car": (teleport(at(-2, 100)), speed("fast"))}, "value = 'fast'"),
-        ({"entities": body("Ego") + TRAILER.format('<TrailerRef entityRef="Cart"/>')}, "the Trailer of Car is not supported"),
-        ({"entities": body("Ego") + TRAILER.format('<Trailer name="Cart"/>')}, "the Trailer of Car is not supported"),
-        ({"entities": body("Ego") + 2 * body("Car")}, "2 entities are named 'Car'"),
-        ({"parameters": 2 * PARAMETER}, "2 parameters are named 'v'"),
-        ({"parameters": LIMITED.replace("lessThan", "below")}, "ValueConstraint: rule = 'below'"),
-        ({"stop": STATE.format("Evnt")}, "storyboardElementRef = 'Evnt'"),
-        ({"stop": STATE.format("Act::Other::Event")}, "storyboardElementRef = 'Act::Other::Event'"),
-        ({"events": group(event(BACKWARDS))}, r"Car drives backwards \(-2.00 m/s\)"),
-        ({"stop": trigger(watching("Ego", f'<DistanceCondition freespace="true" value="5" rule="lessThan"><Position>{at(-1, 100)}</Position></DistanceCondition>'), "")}, "DistanceCondition with freespace = true is not supported"),
-        ({"stop": trigger(watching("Ego", '<SpeedCondition direction="lateral" value="5" rule="lessThan"/>'), "")}, "SpeedCondition with direction = lateral is not supported"),
-    ],
-)  # fmt: skip
-def test_a_refusal_names_what_is_not_supported(
-    tmp_path: Path, parts: dict[str, str], problem: str
+def test_the_manual_lists_every_refusal_of_the_tables_and_none_is_the_guards(
+    tmp_path: Path,
 ) -> None:
-    with pytest.raises(InputError, match=problem) as caught:
-        play(write(tmp_path, **parts), {})  # type: ignore[arg-type]
-    assert str(caught.value).count("\n") <= 1
-    assert any(re.fullmatch(template, caught.value.problem) for template in TEMPLATES), (
-        caught.value.problem
-    )
+    problems = []
+    for number, row in enumerate(rows("openscenario")):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        prepare(folder, row.values[0])
+        try:
+            play(str(folder / "scenario.xosc"), {})
+        except InputError as error:
+            problems.append(error.problem)
+    assert len(problems) > 60
+    for problem in problems:
+        assert "cannot be played" not in problem
+        assert any(re.fullmatch(template, problem) for template in TEMPLATES), problem
 
 
 def test_what_happens_less_than_the_file_says_is_remarked(tmp_path: Path) -> None:
@@ -161,44 +110,6 @@ def test_expressions() -> None:
     ):
         with pytest.raises(InputError, match="has no value"):
             evaluate(wrong, values)
-
-
-LOGICAL = """<OpenSCENARIO><FileHeader revMajor="1" revMinor="2"/><ParameterValueDistribution>
-<ScenarioFile filepath="scenario.xosc"/>{}</ParameterValueDistribution></OpenSCENARIO>"""
-ROW = '<DeterministicSingleParameterDistribution parameterName="{}">{}</DeterministicSingleParameterDistribution>'
-RANGE = (
-    '<DistributionRange stepWidth="{}"><Range lowerLimit="{}" upperLimit="{}"/></DistributionRange>'
-)
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        ("<Stochastic/>", "Stochastic distributions are not supported"),
-        (
-            "<Deterministic>" + ROW.format("w", RANGE.format(1, 0, 5)) + "</Deterministic>",
-            "declares no parameter w",
-        ),
-        (
-            "<Deterministic>" + 2 * ROW.format("v", RANGE.format(1, 0, 5)) + "</Deterministic>",
-            "2 parameters with values",
-        ),
-        (
-            "<Deterministic>" + ROW.format("v", RANGE.format(0, 0, 5)) + "</Deterministic>",
-            "v: a range from 0 to 5 by 0",
-        ),
-        (
-            "<Deterministic>" + ROW.format("v", "<UserDefinedDistribution/>") + "</Deterministic>",
-            "UserDefinedDistribution",
-        ),
-    ],
-)
-def test_a_file_of_values_is_refused(tmp_path: Path, content: str, problem: str) -> None:
-    write(tmp_path, parameters=LIMITED)
-    path = tmp_path / "values.xosc"
-    path.write_text(LOGICAL.format(content))
-    with pytest.raises(InputError, match=problem):
-        open_file(str(path))
 
 
 def test_combinations_leave_out_what_constraints_exclude() -> None:

@@ -4,7 +4,6 @@ end.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import Command, differences
@@ -33,9 +32,9 @@ class Mine:
     def search(self, problem, rng):
         settings = problem.characteristics.filter(problem.uniform(10, rng))
         evaluated = yield settings
-        if {own}.best is None:
-            {own}.best = evaluated.settings[0].copy()
-        settings[1] = {own}.best
+        if self.best is None:
+            self.best = evaluated.settings[0].copy()
+        settings[1] = self.best
         evaluated = yield settings
         return evaluated.take([0])
 """
@@ -46,57 +45,11 @@ def search_all(folder: Path, out: Path) -> None:
     searched(load_study(str(folder / "mine.toml")), out)
 
 
-@pytest.mark.parametrize(("own", "shared"), [("Mine", True), ("self", False)])
-def test_an_algorithm_whose_runs_learn_from_each_other(
-    own: str, shared: bool, mine: Mine, folder: Path, tmp_path: Path
+def test_an_algorithm_whose_runs_do_not_learn_from_each_other_is_not_accused(
+    mine: Mine, folder: Path, tmp_path: Path
 ) -> None:
-    mine(
-        SEARCH.format(own=own), '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n'
-    )
-    learns = pytest.raises(
-        UserCodeError, match=r"repetition: setting 11 is .* in another run .*mine.py:2"
-    )
-    with learns if shared else nullcontext():
-        search_all(folder, tmp_path / "out")
-
-
-GREEDY = """
-class Mine:
-    def search(self, problem, rng):
-        problem.characteristics.lower[:] = 0
-        yield problem.characteristics.filter(problem.uniform(10, rng))
-"""
-IDLE = """
-class Mine:
-    def search(self, problem, rng):
-        {body}
-        return problem.original.take([])
-"""
-
-
-@pytest.mark.parametrize(
-    ("module", "problem"),
-    [
-        (GREEDY, "read-only"),
-        (
-            IDLE.format(body="if problem.evaluations == 0:\n            yield"),
-            "returned no settings from search",
-        ),
-        (
-            IDLE.format(body="yield problem.characteristics.original[None][:0]"),
-            "returned settings = .* from search",
-        ),
-        (IDLE.format(body="return iter([problem.original.settings])"), "returned <list_iterator"),
-        (IDLE.format(body="return None"), "returned None from search"),
-    ],
-    ids=["lower", "nothing", "empty", "iterator", "None"],
-)
-def test_an_algorithm_that_changes_its_problem_or_asks_for_nothing(
-    module: str, problem: str, mine: Mine, folder: Path, tmp_path: Path
-) -> None:
-    mine(module, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 10\nruns = 1\n')
-    with pytest.raises(UserCodeError, match=problem):
-        search_all(folder, tmp_path / "out")
+    mine(SEARCH, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
+    search_all(folder, tmp_path / "out")
 
 
 SIX = """

@@ -12,7 +12,7 @@ import pytest
 from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import tables_of
-from tests.in_process import json_of, refused, run
+from tests.in_process import json_of, run
 
 NAMES = {
     "wear sensorLatency": "perception latency",
@@ -52,9 +52,3 @@ def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) ->
     assert "mass: weighbridge; beyond its limit: leave the trailer" in printed
     keys = [evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file))]
     assert keys[0] == keys[1]
-
-
-def test_a_list_that_there_is_not_is_refused() -> None:
-    refused("list", "characteristics", message=("study: no study\nexpected: its name or file",))
-    refused("list", "studies", "wear", message=("a study after characteristics alone",))
-    refused("list", "characteristcs", message=("did you mean 'characteristics'?",))

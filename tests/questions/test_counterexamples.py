@@ -27,7 +27,7 @@ from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
-from tests.in_process import InlinePool, refused
+from tests.in_process import InlinePool
 from tests.questions.conftest import made_up_evaluator, made_up_study
 
 ONE_TEST = """
@@ -272,10 +272,6 @@ def test_values_are_rounded_towards_the_start_as_they_are_printed(
 ) -> None:
     item = SimpleNamespace(digits=2, unit=unit)
     assert rounded_towards(start, value, cast(Characteristic, item)) == expected
-
-
-def test_a_limit_on_the_wrong_side_is_refused_with_the_other_one() -> None:
-    refused("tolerance", "wear", "--limits", "treadDepth <= 3", message=("did you mean >= 3?",))
 
 
 def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:

@@ -29,7 +29,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import at_point, drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from tests.in_process import InlinePool, refused, run
+from tests.in_process import InlinePool, run
 from tests.manual import ROOT, files_of
 from tests.questions.conftest import made_up_study
 
@@ -46,64 +46,6 @@ impact_location = { unit = "%", original = 50, lower = 25, upper = 75, meaning =
 SPEEDS = (20, 30, 45, 60)
 FITS = 3
 """Fits of the vehicle in which limits are sought, and driven through."""
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ("wear", "--by", "speed=20,50"),
-            (
-                "speed=50 is beyond the points of CPFA, CPNA and CPNCO, which end at 40 km/h",
-                "values up to 40 km/h, or the study wear_joint, whose scope is wider",
-            ),
-        ),
-        (
-            ("wear", "--by", "speed=5"),
-            ("speed=5 is below every point of study 'wear'", "from 10 to 40 km/h"),
-        ),
-        (
-            ("wear_joint", "--by", "speed=20,61"),
-            ("outside the domain", "values above 10 and up to 60 km/h"),
-        ),
-        (
-            ("wear", "--by", "sped=20"),
-            ("study 'wear' does not vary 'sped'; did you mean 'speed'?",),
-        ),
-        (("rain", "--by", "speed=20"), ("study 'rain' does not vary 'speed'", "[scenario.search]")),
-        (("wear", "--by", "speed=fast"), ("'fast' is no number", "NAME=V1,V2,...")),
-        (("wear", "--by", "speed"), ("'speed'", "NAME=V1,V2,...")),
-        (("wear", "--by", "speed=20,20.0"), ("has a value twice", "each value once")),
-        (
-            ("wear", "--characteristics", "payload,payload"),
-            ("payload is given twice", "each name once"),
-        ),
-        (
-            ("wear", "--limits", "payload <= 200", "--limits", "payload <= 200"),
-            ("'payload <= 200' is given twice", "each value once"),
-        ),
-        (
-            ("wear", "--by", "speed=20", "--unsafe", "drac > 6"),
-            ("beside --unsafe 'drac > 6'", "keep the margin"),
-        ),
-        (
-            ("euro_ncap_rating", "--by", "speed=20"),
-            ("study 'euro_ncap_rating' is rated", "not rated"),
-        ),
-        (("wear", "--by", "speed=20", "--point", "CPFA, speed 10, wet"), ("beside a point",)),
-        (
-            ("wear", "--by", "speed=20", "--fail-if", "limits.by_x > 3"),
-            ("'limits.by_x'", "limits.by_speed"),
-        ),
-        (("wear", "--fail-if", "limits.by_speed > 3"), ("'limits.by_speed'", "limits.by_NAME")),
-    ],
-)
-def test_by_is_refused_in_words(arguments: tuple[str, ...], message: tuple[str, ...]) -> None:
-    refused("tolerance", *arguments, message=message)
-
-
-def test_compare_has_no_limits_by_a_parameter() -> None:
-    refused("compare", "wear", "wear", "--by", "speed=20", message=("--by",))
 
 
 def test_a_level_of_a_matrix_drives_what_the_one_below_did_not() -> None:

@@ -20,7 +20,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.measure import STAGE, study_by
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.records import Evaluations, FloatArray
-from tests.in_process import json_of, refused, run, searched
+from tests.in_process import json_of, run, searched
 
 METRIC = """
 import numpy as np
@@ -62,18 +62,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert str(Unsafe.parse(text)) == text
     assert Unsafe.parse(str(Unsafe.parse(text))) == Unsafe.parse(text)
-
-
-@pytest.mark.parametrize(
-    "text", ["drac", "drac >", "drac > x", "drac == 6", "> 6", "drac > inf", "a b > 6", "below<1"]
-)
-def test_a_criterion_that_is_none_is_refused(text: str) -> None:
-    if text == "below<1":  # a name of a metric like any other, which no study has
-        with pytest.raises(InputError, match="no metric 'below'"):
-            study_by(load_study("rain"), Unsafe.parse(text))
-    else:
-        with pytest.raises(InputError, match="unsafe"):
-            Unsafe.parse(text)
 
 
 @pytest.mark.slow
@@ -176,25 +164,6 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     assert json_of("verify", "pack.zip")["numbers"]["passed"]
 
 
-def test_a_study_refuses_a_criterion_before_it_searches(folder: Path) -> None:
-    refused(
-        "study",
-        "tiny.toml",
-        "--unsafe",
-        "hardness > 5",
-        message=("study 'tiny' has no metric 'hardness'",),
-    )
-    assert not (folder / "results").exists()
-    refused(
-        "study",
-        "tiny.toml",
-        "--status",
-        "--unsafe",
-        "drac > 5",
-        message=("--unsafe: beside --status",),
-    )
-
-
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
     (folder / "nowhere.py").write_text(
         METRIC.replace("return np.where", "return np.nan * np.where")
@@ -257,16 +226,3 @@ def test_limits_of_the_matrix_by_drac_are_obeyed_in_every_fit() -> None:
         found = sv.evaluate(fit, cars, filtered=False, jobs=1)
         assert (found["outcome"] != "collision").all()
         assert found["drac"].max() <= 8
-
-
-@pytest.mark.parametrize(
-    ("typed", "told"),
-    [
-        ("risk rain --unsafe", "study 'rain' has no metric 'hardness'"),
-        ("tolerance rain --margin 0.3 --unsafe", "0.3 m beside 'hardness > 5'"),
-        ("compare rain sun --margin 0.3 --unsafe", "0.3 m beside 'hardness > 5'"),
-    ],
-)
-def test_a_criterion_that_cannot_be_used_is_refused(typed: str, told: str) -> None:
-    criterion = "hardness > 5" if "margin" not in typed else "tet > 5"
-    refused(*typed.split(), criterion, message=(told.replace("hardness > 5", criterion),))

@@ -10,7 +10,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.questions.ask import quick_questions
 from safevar_sumo.report.page import report
-from tests.in_process import refused, run
+from tests.in_process import run
 
 
 @pytest.mark.slow
@@ -45,18 +45,6 @@ def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
     answer = sv.repair("wear", promise=("treadDepth >= 4",), quick=True)
     assert answer.verdict.startswith("Rough answer (--quick)")
     assert (answer.numbers["rough"], answer.numbers["fits_tried"]) == (True, 1)
-
-
-def test_a_rough_answer_gives_no_speed_and_writes_no_study(tmp_path: Path) -> None:
-    refused(
-        *("tolerance", "wear", "--by", "speed=20,30", "--quick"),
-        message=("--quick", "no value of --by speed=20,30", "--by without --quick"),
-    )
-    refused(
-        *("repair", "wear", "--promise", "all", "--quick", "--out", str(tmp_path / "own.toml")),
-        message=("--quick", "a rough repair is not written", "--out without --quick"),
-    )
-    assert not [*tmp_path.iterdir()]
 
 
 def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:

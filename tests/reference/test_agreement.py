@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations
 from safevar_sumo.reference.agreement import (
     agreement_counts,
@@ -21,10 +20,8 @@ from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.made_up import made_up_evaluations
-
-ONE = CharacteristicSet((Characteristic(name="c", unit="kg", original=5.0, lower=1.0, upper=9.0),))
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
@@ -153,52 +150,6 @@ def test_both_published_formats_are_read(
     assert data.metrics["ave_dece"].tolist() == [5.0, 3.0, 6.0]
     for undefined in (data.collided, np.isnan(data.metrics["tet"]), np.isnan(data.metrics["tit"])):
         assert undefined.tolist() == [False, True, False]
-
-
-PUBLISHED_HEADER = ",".join([*SUN_COLUMNS, "SaftyDegree", "TET", "TIT"])
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("mass,radius\n1,2\n", "lacks the columns max_rpm"),
-        (
-            ",".join(SUN_COLUMNS) + "\n" + ",".join(["1"] * 12) + "\n",
-            "lacks the columns SaftyDegree, TET, TIT",
-        ),
-        ("mass,radius\n1,2\n1,2,3\n", "is not CSV: .*line 3"),
-        *(
-            (
-                f"{PUBLISHED_HEADER},{name}\n{','.join(['1'] * 16)}\n",
-                f"more than one column for {column}\n",
-            )
-            for name, column in (
-                ("Mass", "Mass"),
-                ("SaftyDegree", "SaftyDegree"),
-                ("radius ", "radius"),
-            )
-        ),
-    ],
-)
-def test_a_file_in_another_format_is_refused(tmp_path: Path, text: str, expected: str) -> None:
-    (tmp_path / "data.csv").write_text(text)
-    with pytest.raises(InputError, match=expected):
-        read_reference(tmp_path / "data.csv", SUN)
-
-
-@pytest.mark.parametrize(
-    ("column", "cell"), [("mass", "heavy"), ("mass", "inf"), ("TET", "-5"), ("Dece", "1e9")]
-)
-def test_a_cell_that_cannot_be_used_is_told_with_row_and_column(
-    tmp_path: Path, column: str, cell: str
-) -> None:
-    """By its line in the file, though lines are blank."""
-    frame = table(SUN, SUN_COLUMNS)
-    frame.loc[1, column] = cell
-    lines = frame.to_csv(index=False).splitlines()
-    (tmp_path / "data.csv").write_text("\n".join([*lines[:2], "", "", *lines[2:]]) + "\n\n")
-    with pytest.raises(InputError, match=f"row 5, column {column} .*\nexpected: a.* number"):
-        read_reference(tmp_path / "data.csv", SUN)
 
 
 PUBLISHED_EFFECTS = {

@@ -258,22 +258,9 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
     assert vehicle.destroy.called
 
 
-def test_bad_input_is_refused(tmp_path: Path) -> None:
-    results, _, _ = results_of("rain", tmp_path)
-    out = tmp_path / "out"
-    common = ("export", str(results), "--to", "carla", "--out")
-    refused(
-        *common,
-        str(out),
-        "--solution",
-        "made:0:7",
-        message=("there is no solution made:0:7", "expected"),
-    )
-    refused(
-        *common, str(results), *HANDLE, message=("--out", f"{results} exists", "a new directory")
-    )
-    refused(*common, str(out), *HANDLE, "--point", "nowhere", message=("--point", "nowhere"))
-    worn, _, _ = results_of("wear", tmp_path / "worn")
+def test_what_carla_has_no_counterpart_of_is_refused(tmp_path: Path) -> None:
+    worn, _, _ = results_of("wear", tmp_path)
     message = ("treadDepth, brakeTorque", "no counterpart in CARLA", "--to openscenario")
+    out = tmp_path / "out"
     refused("export", str(worn), *HANDLE, "--to", "carla", "--out", str(out), message=message)
     assert not out.exists()

@@ -217,26 +217,6 @@ def test_answers_stand_on_the_page_as_they_are_with_their_commands(slippery: Pat
         assert answer.command in page
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("risks", "there is no 'risks'"),
-        ("risk --sample 3", "risk has no option '--sample'.*did you mean"),
-        ("risk --samples many", "ask: risk --samples: 'many'"),
-        ("risk --samples", "ask: risk --samples: None"),
-        ("risk --samples 0", "a whole number from 1"),
-        ("'risk", 'such as "risk --samples 4000"'),
-        ("", 'such as "risk --samples 4000"'),
-        ("compare", "compare cannot be asked about 1"),
-    ],
-)
-def test_a_question_that_cannot_be_asked_is_refused(
-    text: str, expected: str, slippery: Path
-) -> None:
-    with pytest.raises(InputError, match=expected):
-        page_of(slippery, ask=[text], jobs=1)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "text",

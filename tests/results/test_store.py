@@ -263,25 +263,6 @@ def test_rows_count_within_their_run() -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "nsga2",
-        "nsga2:0",
-        "nsga2:0:",
-        ":0:0",
-        "nsga2:-1:0",
-        "nsga2:0:0:0",
-        "nsga2:0:x",
-        "nsga2:0:" + "9" * 30,
-    ],
-)
-def test_a_text_that_is_no_handle_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match="ALGORITHM:RUN:N"):
-        SolutionId.parse(text)
-
-
-@pytest.mark.parametrize(
     ("handle", "legal"), [("nsga2:0:2", "nsga2:0:1"), ("nsga2:1:0", "nsga2:0:1, nsga2:3:0, rs:0:0")]
 )
 def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, legal: str) -> None:

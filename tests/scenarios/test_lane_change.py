@@ -12,7 +12,6 @@ import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.preventability import ANY
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
@@ -24,7 +23,6 @@ from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, poi
 
 WEAR = assemble(load_study("wear", matrix=None))
 IDEAL = ideal(WEAR)
-ORIGINAL = WEAR.characteristics.original[np.newaxis]
 LENGTH, WIDTH = 4.7, 1.85
 BODY: dict[str, Any] = {"vut_length": LENGTH, "vut_width": WIDTH}
 PATH = (WIDTH + CAR.width) / 2
@@ -149,33 +147,6 @@ def test_whose_collision_it_is() -> None:
         system=WEAR,
     )
     assert mirrored.contact.side[0] == "right"
-
-
-REFUSED = {
-    "closed": (
-        "cut_in",
-        {"speed": 130.0, "target_speed": 30.0, "gap": 10.0},
-        r"gap = 10 m is closed before",
-    ),
-    "fast": ("cut_in", {"target_speed": 140.0}, "target_speed = 140"),
-    "fast leader": ("car_to_car", {"test": "CCRb", "speed": 140.0}, "target_speed = 140 km/h"),
-    "through": (
-        "cut_out",
-        {"speed": 100.0, "gap": 20.0},
-        r"0\.72 m sideways when he drives through",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_is_refused_in_two_lines(name: str) -> None:
-    model, parameters, message = REFUSED[name]
-    scenario = {"model": model, "parameters": parameters}
-    with pytest.raises(InputError, match=message) as caught:
-        drive_worst(assemble(load_study("wear", matrix=None, scenario=scenario)), ORIGINAL)
-    lines = str(caught.value).splitlines()
-    assert lines[0].startswith("study 'wear': ")
-    assert len(lines) == 2
 
 
 @pytest.mark.slow

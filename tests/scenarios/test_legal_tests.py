@@ -95,29 +95,6 @@ def test_a_point_fails_by_the_criterion_of_its_study(in_tmp: Path) -> None:
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[[matrix.tests]]\nname = "it"\nallowed_impact_speed = -5', "allowed_impact_speed"),
-        ('[matrix]\naggregate = "worst"', "aggregate = 'worst', and a test allows an impact"),
-        ('[unsafe]\ncriterion = "impact_exces > 0"', "impact_exces"),
-        ('[unsafe]\ncriterion = "hard"', "'hard'"),
-    ],
-)
-def test_a_study_that_contradicts_itself_is_refused(text: str, message: str, in_tmp: Path) -> None:
-    (in_tmp / "own.toml").write_text(f'extends = "r152"\nname = "own"\n{text}\n')
-    told = run("explain", "own.toml", expect=2).stderr
-    assert message in told
-    assert "Traceback" not in told
-    assert len(told.strip().splitlines()) <= 2
-
-
-def test_another_metric_is_no_criterion_where_impacts_are_allowed(in_tmp: Path) -> None:
-    told = run("explain", "r152", "--unsafe", "drac > 6", expect=2).stderr
-    assert "tests of study 'r152' allow an impact" in told
-    assert len(told.strip().splitlines()) == 2
-
-
 @pytest.mark.slow
 def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> None:
     answer = sv.rules("r152", samples=40, pool=InlinePool())

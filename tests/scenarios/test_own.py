@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions import evaluator
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.scenarios import SCENARIOS
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_for_sumo
-from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run, verify_everywhere
 from tests.made_up import drawn
@@ -60,26 +59,6 @@ def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     folder.joinpath("own.py").write_text(MINE)
     scenario = {"model": "own:Mine", "search": search}
     return load_study("wear", matrix=None, scenario=scenario, **tables)
-
-
-def test_a_parameter_that_a_users_struct_does_not_have_is_refused_also_in_a_matrix(
-    in_tmp: Path,
-) -> None:
-    """A `msgspec.Struct` that does not forbid unknown fields takes no notice of them."""
-    (in_tmp / "own.py").write_text(MINE)
-    scenario = {"model": "own:Mine", "parameters": {"pase": 3}}
-    with pytest.raises(
-        InputError, match=r"scenario\.parameters\.pase: .*own:Mine' has no such parameter"
-    ):
-        assemble(load_study("wear", matrix=None, scenario=scenario))
-    with pytest.raises(InputError, match=r"test 'CPFA': .*own:Mine' has no such parameter"):
-        assemble(
-            load_study(
-                "wear",
-                scenario={"model": "own:Mine"},
-                matrix=tables_of(load_study("wear"))["matrix"],
-            )
-        )
 
 
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
@@ -199,26 +178,6 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
         assert drive_and_score(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "message"),
-    [
-        ("speed", {}, r"Mine has no such parameter to search"),
-        (
-            "scooter",
-            {"upper": 40},
-            r"scenario\.search\.scooter: .*\nexpected: a part of \[5, 30\] km/h",
-        ),
-        ("gap", {"unit": "km"}, r"scenario\.search\.gap\.unit = 'km'\nexpected: 'm'"),
-    ],
-)
-def test_what_a_class_does_not_declare_is_refused(
-    name: str, changes: dict[str, Any], message: str, in_tmp: Path
-) -> None:
-    domain = {"unit": "km/h", "original": 15, "lower": 8, "upper": 25, **changes}
-    with pytest.raises(InputError, match=message):
-        assemble(mine(in_tmp, {name: domain}))
-
-
 def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) -> None:
     (in_tmp / "own.py").write_text(MINE)
     printed = run("list", "own:Mine").stdout
@@ -232,52 +191,3 @@ def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
     rows = {row["name"]: row for row in answer["tables"]["scenarios"]["rows"]}
     assert {*rows} == {*SCENARIOS}
     assert "target_deceleration 0.5 to 10 m/s^2" in str(rows["car_to_car"])
-
-
-BODY = """from safevar_sumo.scenarios import Track
-import numpy as np
-
-
-class Mine:
-    speed, duration = 50.0, 3.0
-
-    def tracks(self, times):
-        return """
-CAR = "Track.of('car', 'car', {}, 0.0)"
-MISTAKES = {
-    "jump": (
-        CAR.format("60 + np.where(times > 1, 30.0, 0.0)"),
-        "at 1.05 s actor 'car' jumps, at 600 m/s",
-    ),
-    "no number": (
-        CAR.format("np.where(times > 1, np.nan, 50.0)"),
-        "at 1.05 s actor 'car' has x = nan",
-    ),
-    "short": (CAR.format("60.0 + times[:20]"), "actor 'car': x ends at 0.95 s"),
-    "flat": (CAR.format("60.0 + times[:, 0]"), r"x has the shape \(61,\)"),
-    "one name": (f"{CAR.format(60.0)}, {CAR.format(80.0)}", "at 0 s 2 actors are called 'car'"),
-    "each other": (
-        f"{CAR.format(60.0)}, Track.of('b', 'car', 62.0, 0.0)",
-        "at 0 s actor 'car' is 1.71 m inside actor 'b'",
-    ),
-    "vehicle": (CAR.format(0.0), "at 0 s actor 'car' is 1.92 m inside the vehicle under test"),
-    "direction": (
-        "Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 1.0, 0.0)",
-        "has a direction of length 1.41421",
-    ),
-    "fast": ("Track('car', 'car', 4.0, 2.0, 50.0, 0.0, 1.0, 0.0, 300.0)", "has a speed of 300 m/s"),
-    "size": ("Track.of('bus', 'bus', 60.0, 0.0)", "a body of the kind 'bus' has no size"),
-    "nobody": ("", r"returned \[\] from tracks"),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_bodies_that_cannot_move_so_are_refused_with_actor_time_and_what_is_expected(
-    mistake: str, in_tmp: Path
-) -> None:
-    body, message = MISTAKES[mistake]
-    (in_tmp / "own.py").write_text(f"{BODY}[{body}]\n")
-    system = assemble(load_study("wear", matrix=None, scenario={"model": "own:Mine"}))
-    with pytest.raises(InputError, match=message) as caught:
-        drive_worst(system, system.characteristics.original[np.newaxis])
-    assert len(str(caught.value).splitlines()) == 2

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import OpenScenario
 from safevar_sumo.study import Study, data_files
@@ -216,31 +215,6 @@ def test_who_is_deleted_is_not_hit(tmp_path: Path) -> None:
     car = (teleport(at(-1, 50 + 100 + 3.5 + 1)), speed(0))
     assert driven(OpenScenario(write(tmp_path, gone, car=car)), Hold()).outcome[0] == Outcome.PASSED
     assert driven(OpenScenario(write(tmp_path, car=car)), Hold()).outcome[0] == Outcome.COLLISION
-
-
-@pytest.mark.parametrize(
-    ("scenario", "problem"),
-    [
-        ({"file": "gone.xosc"}, "there is no file 'gone.xosc'"),
-        ({"model": "crossing"}, "scenario.model beside scenario.file"),
-        ({"values": {"gap": 3}}, "declares no parameter gap; did you mean 'gap_m'"),
-        ({"search": {"gap_m": {"upper": 90}}}, "gap_m: 5 to 90"),
-        ({"search": {"gap_m": {"lower": 25}}}, "the file's value 20 is not in its range"),
-        ({"search": {"body": {}}}, "body = 'hatchback' is no number"),
-        ({"search": {"gap_m": 3}}, "scenario.search.gap_m = 3"),
-        (
-            {"file": str(FILES / "cut_in.xosc"), "search": {"gap_m": {}}},
-            "gap_m has no range in the file",
-        ),
-        (
-            {"values": {"ego_kmh": 20, "slower_kmh": 15}},
-            "the file's constraints exclude every combination",
-        ),
-    ],
-)
-def test_refusals(scenario: dict[str, Any], problem: str) -> None:
-    with pytest.raises(InputError, match=problem):
-        load_study("wear", scenario={"file": LOGICAL, **scenario})
 
 
 def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path: Path) -> None:

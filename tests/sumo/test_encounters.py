@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study, simulate
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import tolerance
@@ -303,63 +302,3 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     assert [*answer.tables["causes"]["elsewhere"]] == [
         changes["brakes"] < at_original for changes in answer.tables["causes"]["changes"]
     ]
-
-
-TOO_WIDE = {**SPEED, "upper": 500}
-MISTAKES = {
-    "unknown": ({"headway": domain(1, 2, "s")}, r"scenario\.search\.headway: .* no such parameter"),
-    "nearest": ({"speeed": SPEED}, r"did you mean 'speed'"),
-    "reversed": (
-        {"speed": {**SPEED, "lower": 60, "upper": 30}},
-        r"scenario\.search\.speed: lower = 60",
-    ),
-    "empty": ({"speed": {**SPEED, "upper": 30}}, "lower < upper"),
-    "unit": ({"speed": {**SPEED, "unit": "m/s"}}, r"scenario\.search\.speed\.unit = 'm/s'"),
-    "wide": ({"speed": TOO_WIDE}, r"a part of \[10, 80\] km/h"),
-    "pure": ({"road_friction": domain(0, 1, "-", 1)}, r"a part of \[0\.1, 1\.2\]$"),
-    "fixed": (
-        {"impact_location": PLACE},
-        r"scenario\.parameters\.impact_location = 25\.0 fixes it",
-    ),
-    "impossible": ({"target_speed": domain(3, 8, "km/h")}, "needs .* s to the impact"),
-    "vehicle": ({"payload": domain(3, 8, "kg")}, "a characteristic of the vehicle"),
-    "key": ({"speed": {**SPEED, "weight": 2}}, "there is no such key"),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_of_a_search_are_refused(mistake: str) -> None:
-    search, message = MISTAKES[mistake]
-    parameters = {"test": "CPFA", "impact_location": 25.0, "time_to_impact": 3.5}
-    with pytest.raises(InputError, match=message) as caught:
-        assemble(
-            load_study(
-                "wear",
-                matrix=None,
-                scenario={"model": "crossing", "parameters": parameters, "search": search},
-            )
-        )
-    assert str(caught.value).count("\n") <= 1
-
-
-def test_a_matrix_and_a_search_over_one_parameter_are_refused() -> None:
-    with pytest.raises(
-        InputError, match=r"scenario\.search\.speed: test 'CPFA' of the matrix sets speed, too"
-    ):
-        load_study("wear", scenario={"search": {"speed": SPEED}})
-    with pytest.raises(InputError, match=r"ads: there is no such key|ads.search"):
-        load_study("wear", ads={"search": {"speed": SPEED}})
-    with pytest.raises(
-        InputError, match="weathers clear and night of the matrix set visibility, too"
-    ):
-        assemble(
-            load_study(
-                "euro_ncap_pedestrian", scenario={"search": {"visibility": WEATHER["visibility"]}}
-            )
-        )
-    with pytest.raises(InputError, match="Stop has no such parameter to search\nexpected: none"):
-        assemble(
-            load_study("stop", scenario={"search": {"road_friction": WEATHER["road_friction"]}})
-        )
-    with pytest.raises(InputError, match="the cells of euro_ncap_2026 are fixed"):
-        load_study("euro_ncap_rating", scenario={"search": {"speed": SPEED}})

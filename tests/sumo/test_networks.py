@@ -67,19 +67,6 @@ def test_without_sumos_programs_what_needs_them_says_so(
         open_drive(open_network(str(mine)))
 
 
-def test_sources_that_netconvert_refuses_are_an_error(tmp_path: Path) -> None:
-    mine = tmp_path / "mine"
-    shutil.copytree(NETWORKS / "lead_vehicle_stopped", mine)
-    (mine / "network.edg.xml").write_text(
-        '<edges><edge id="road" from="west" to="nowhere"/></edges>'
-    )
-    with pytest.raises(
-        InputError,
-        match="netconvert refuses the network: Edge's 'road' to-node 'nowhere' is not known",
-    ):
-        copied_network(open_network(str(mine)), 1)
-
-
 CAR = (
     '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
 )
@@ -152,98 +139,6 @@ def rewritten(file: Path, old: str, new: str) -> None:
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new))
-
-
-TRAFFIC = (
-    (
-        '<vTypeDistribution id="d"><vType id="x"/></vTypeDistribution>',
-        "has a 'vTypeDistribution', which",
-    ),
-    (
-        '<flow id="f" type="car" from="oncoming" begin="0" end="9" probability="0.5"/>',
-        "'f.0' moves at random",
-    ),
-    (
-        '<flow id="f" type="car" from="oncoming" begin="0" end="9" period="exp(0.5)"/>',
-        "'f.0' moves at random",
-    ),
-    (
-        '<trip id="t" type="car" from="oncoming" depart="0" departPos="random"/>',
-        "'t' moves at random",
-    ),
-    (
-        '<vType id="r" sigma="0"/><trip id="t" type="r" from="oncoming" depart="0"/>',
-        "vType 'r' drives at random",
-    ),
-    (
-        (
-            '<vType id="r" speedDev="0" carFollowModel="EIDM"/><trip id="t" type="r"'
-            ' from="oncoming" depart="0"/>'
-        ),
-        "vType 'r' drives at random",
-    ),
-    ('<trip id="t" type="car" from="nowhere" depart="0"/>', "The edge 'nowhere' within the route"),
-    ('<trip id="t" type="vut" from="oncoming" depart="0"/>', "'vut', a vType of its own"),
-    (
-        (
-            '<person id="w" type="walker" depart="0"><ride from="approach" to="departure"'
-            ' lines="vut"/></person>'
-        ),
-        "has a 'ride'",
-    ),
-)
-"""Illegal traffic, and what is said of it."""
-BAD = [
-    *(("traffic.rou.xml", "</routes>", f"{CAR}{more}</routes>", told) for more, told in TRAFFIC),
-    ("traffic.rou.xml", '<vehicle id="vut"', '<vehicle id="ego"', "has no vehicle 'vut'"),
-    (
-        "traffic.rou.xml",
-        'id="vut" type="vut" depart="0"',
-        'id="vut" type="vut" depart="3"',
-        "depart = '3'",
-    ),
-    (
-        "traffic.rou.xml",
-        'id="vut" type="vut" depart',
-        'id="vut" type="pedestrian" depart',
-        "type = 'pedestrian'",
-    ),
-    (
-        "traffic.rou.xml",
-        '<route edges="approach departure"/>',
-        '<route edges="approach departure"/><stop lane="departure_0" duration="9"/>',
-        "has a stop",
-    ),
-    (
-        "scenario.sumocfg",
-        "</configuration>",
-        '<traci_server><remote-port value="8813"/></traci_server></configuration>',
-        "scenario.sumocfg: remote-port = '8813'",
-    ),
-    (
-        "scenario.sumocfg",
-        'dawdling value="0"',
-        'dawdling value="0.2"',
-        "traffic.rou.xml: 'pedestrian' moves at random: two copies of it differ at ",
-    ),
-    ("network.nod.xml", 'x="80" y="0"', 'x="80" y="0" z="4"', "lane 'departure_0', which rises"),
-    (
-        "network.edg.xml",
-        'id="approach"',
-        'id="approach" friction="0.3"',
-        "lane 'approach_0', which rises 0.00 m and has friction 0.3",
-    ),
-]
-
-
-@pytest.mark.parametrize(("file", "old", "new", "told"), BAD)
-def test_what_no_network_may_have_is_refused_with_its_name(
-    mine: Path, file: str, old: str, new: str, told: str
-) -> None:
-    rewritten(mine / file, old, new)
-    with pytest.raises(InputError, match=r"mine(/[\w.]+)?: ") as caught:
-        check_network(str(mine))
-    assert told in str(caught.value)
 
 
 def on(study: str, network: Path) -> System:

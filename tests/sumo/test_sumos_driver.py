@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
@@ -228,16 +227,3 @@ def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
     assert remarks("krauss", reaction_time=2.0) == [
         "ads.parameters.reaction_time has no effect: the vehicle's tau takes its place"
     ]
-
-
-@pytest.mark.parametrize(
-    "of_older_studies", [{"tau": {"original": 0.2, "lower": 0.1, "upper": 0.6}}]
-)
-def test_a_tau_that_is_a_lag_is_refused_and_the_new_key_is_named(
-    of_older_studies: dict[str, Any],
-) -> None:
-    with pytest.raises(
-        InputError,
-        match=r"tau.original = 0.2: tau is the headway(.|\n)*characteristics.actuatorLag",
-    ):
-        assemble(load_study("native", vehicle={"characteristics": of_older_studies}))

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
-from tests.in_process import run
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 SCRIPT = """
@@ -171,114 +169,6 @@ class Reads:
 def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
     runs = system("Reads", SUBSCRIBES)
     drive_worst(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
-
-
-REFUSED = [
-    (
-        "traci.simulationStep()",
-        "traci.simulationStep: is not for a controller of 'vut': safevar_sumo itself starts",
-    ),
-    (
-        "traci.vehicle.setSpeed('parked_ahead', 3)",
-        "traci.vehicle.setSpeed: vehID = 'parked_ahead' is not the vehicle under test",
-    ),
-    ("traci.vehicle.setSpeed(v, speed=float('nan'))", "traci.vehicle.setSpeed: speed = nan"),
-    ("traci.vehicle.setSpeedMode(v, 1.5)", "traci.vehicle.setSpeedMode: mode = 1.5"),
-    (
-        "traci.vehicle.getNeighbors(v, 1)",
-        "traci.vehicle.getNeighbors: is not for a controller of 'vut'",
-    ),
-    (
-        "traci.vehicle.getRoute('parked_ahead')",
-        "traci.vehicle.getRoute: returns a value of 'parked_ahead' that no sensor",
-    ),
-    (
-        "traci.vehicle.moveTo(v, 'road_0', 50)",
-        "traci.vehicle.moveTo: is not for a controller of 'vut': it would bypass",
-    ),
-    ("traci.vehicle.setType(v, 'parked')", "traci.vehicle.setType: makes it another vehicle"),
-    (
-        "traci.vehicle.setLaneChangeMode(v, 1621)",
-        "traci.vehicle.setLaneChangeMode: mode = 1621: the vehicle keeps its",
-    ),
-    (
-        "traci.vehicle.setImperfection(v, 0.5)",
-        "traci.vehicle.setImperfection: imperfection = 0.5 makes results random",
-    ),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("line", "problem"), REFUSED)
-def test_illegal_calls_are_refused_even_if_the_controller_catches_the_error(
-    line: str, problem: str
-) -> None:
-    script = f"def step(traci, v):\n    try:\n        {line}\n    except Exception:\n        pass\n"
-    runs = system("step", script)
-    with pytest.raises(InputError) as caught:
-        drive_worst(runs, changed(runs))
-    assert problem in str(caught.value)
-    assert "my_controller.py:3" in str(caught.value)
-
-
-OWN_LOOP = """
-import traci
-
-
-def step(traci, v):
-    traci.simulationStep()
-
-
-def run():
-    while traci.simulation.getMinExpectedNumber() > 0:
-        traci.simulationStep()
-
-
-def main(traci, v):
-    traci.start(["sumo", "-c", "scenario.sumocfg"])
-    run()
-"""
-
-
-@pytest.mark.parametrize(
-    ("model", "problem"),
-    [
-        (
-            "my_script:step",
-            (
-                "raised in step: traci.simulationStep: is not for a controller of 'vut':"
-                " safevar_sumo itself starts"
-            ),
-        ),
-        (
-            "my_script:main",
-            (
-                "raised in main: traci.start: is not for a controller of 'vut': safevar_sumo itself"
-                " starts"
-            ),
-        ),
-        ("my_script:run", "cannot be called as step(traci, vehicle_id)"),
-        (
-            "my_loop:run",
-            (
-                "user code raised in main: traci.start: is called while no vehicle is driven:"
-                " safevar_sumo itself"
-            ),
-        ),
-    ],
-)
-def test_a_script_with_a_loop_of_its_own_is_told_once_what_to_change(
-    model: str, problem: str
-) -> None:
-    Path("my_script.py").write_text(OWN_LOOP)
-    Path("my_loop.py").write_text(f"{OWN_LOOP}\n\nmain(traci, 'vut')\n")
-    Path("mine.toml").write_text(
-        f'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "{model}"\n'
-    )
-    (error,) = run("simulate", "mine.toml", expect=2).stderr.split("safevar-sumo: ")[1:]
-    assert problem in error
-    assert len(error.splitlines()) == 2
-    assert error.count("expected: ") == 1
 
 
 @pytest.mark.parametrize(("mode", "acceleration"), [(0, 20.0), (1, 16.0), (2, 2.0), (4, 20.0)])

@@ -1,0 +1,92 @@
+"""What a user may type or write wrongly, and what the command then says in one or two lines before
+it ends with code 2, without a traceback, a changed file or a new one.
+
+Each `[[refused]]` of a table beside this file is one mistake:
+
+- `typed` is the command, and `told` what its message says: a text, or several;
+- a key with a dot or a slash is a file that the user has written; a folder, if it ends with a
+  slash;
+- `in` is a file that is there already, `adds` what is added to it, and `old` and `new` a change of
+  it; a message about a command that names the file has its name, too;
+- `folder` is what the user has begun with, a name of `FOLDERS`, and `parts` are parts of it that
+  differ;
+- `base` is what the row has in common with others, a table of the same keys above the rows;
+  `[default]` is in common to all.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from safevar_sumo.shipped import NETWORKS
+from tests.in_process import refused
+from tests.openscenario import writing
+from tests.openscenario.test_legal import write_all_actions
+
+SCENES = Path(writing.__file__).parent / "files"
+FOLDERS: dict[str, Callable[..., object]] = {
+    "scene": writing.write,
+    "actions": write_all_actions,
+    "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine"),
+    "files": lambda folder: shutil.copytree(SCENES, folder / "files"),
+}
+
+
+def rows(table: str = "*") -> Iterator[Any]:
+    for path in sorted(Path(__file__).parent.glob(f"{table}.toml")):
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        for row in tables["refused"]:
+            base = tables["base"][row["base"]] if "base" in row else {}
+            whole = {**tables.get("default", {}), **base, **row}
+            whole["parts"] = {**base.get("parts", {}), **row.get("parts", {})}
+            slow = [pytest.mark.slow] if whole.get("slow") else []
+            first = whole["told"] if isinstance(whole["told"], str) else whole["told"][0]
+            yield pytest.param(whole, id=f"{path.stem}: {first.strip()[:60]}", marks=slow)
+
+
+def prepare(folder: Path, row: dict[str, Any]) -> None:
+    """Write the files of a row."""
+    if "folder" in row:
+        FOLDERS[row["folder"]](folder, **row.get("parts", {}))
+    for name in (name for name in row if "." in name or "/" in name):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith("/"):
+            path.mkdir()
+        else:
+            path.write_text(row[name])
+    if "old" in row or "adds" in row:
+        text = (folder / row["in"]).read_text()
+        assert row.get("old", "") in text
+        changed = text.replace(row.get("old", ""), row.get("new", ""), 1) + row.get("adds", "")
+        (folder / row["in"]).write_text(changed)
+
+
+def files_in(folder: Path) -> dict[Path, bytes]:
+    paths = [path for path in folder.rglob("*") if "__pycache__" not in path.parts]
+    return {path: path.read_bytes() if path.is_file() else b"" for path in paths}
+
+
+@pytest.mark.parametrize("row", [*rows()])
+def test_what_is_wrong_is_refused(
+    row: dict[str, Any],
+    in_tmp: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> None:
+    monkeypatch.setattr("safevar_sumo.campaign.cluster.CONNECT_TIMEOUT", 0.5)
+    prepare(in_tmp, row)
+    before = files_in(in_tmp)
+    typed, told = row["typed"], row["told"]
+    if "{results}" in typed:
+        typed = typed.replace("{results}", str(request.getfixturevalue("slippery")))
+    named = [row["in"]] if "in" in row and row["in"] in typed else []
+    refused(*shlex.split(typed), message=(*named, *([told] if isinstance(told, str) else told)))
+    assert files_in(in_tmp) == before
