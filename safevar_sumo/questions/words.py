@@ -57,16 +57,6 @@ def change_texts(
     return texts
 
 
-def list_of_changes(
-    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
-) -> str:
-    """The values that differ from the original values in one line, as in `change_texts`."""
-    return (
-        ", ".join(change_texts(characteristics, values, are_printed=are_printed))
-        or "no change at all"
-    )
-
-
 def encounter_in_words(
     characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
 ) -> str:

@@ -22,7 +22,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
 from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
-from safevar_sumo.questions.words import list_of_changes
+from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, refused, run
 from tests.manual import files_of
@@ -300,8 +300,8 @@ def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
 
 def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     changes = {"recognition_delay": 0.1, "mass": 2644.4}
-    text = list_of_changes(CharacteristicSet.of(load_study("sun_joint")), changes)
-    assert text == "mass 2404 -> 2644 kg (+10.0 %), recognition_delay 0 -> 0.100 s"
+    texts = change_texts(CharacteristicSet.of(load_study("sun_joint")), changes)
+    assert texts == ["mass 2404 -> 2644 kg (+10.0 %)", "recognition_delay 0 -> 0.100 s"]
 
 
 def test_limits_are_rounded_to_the_safe_side() -> None:

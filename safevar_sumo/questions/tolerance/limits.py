@@ -16,12 +16,12 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Models, models_of, with_points_between
+from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.left_out import contacts_left_out
-from safevar_sumo.questions.tolerance.refusal import nearest_limits
 from safevar_sumo.questions.tolerance.rows import (
     CHARACTERISTIC,
     LIMITS,
