@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,23 @@ def _own_import_path() -> Iterator[None]:
 def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let pools start worker processes, as for a user."""
     monkeypatch.setattr(local, "ProcessWorker", WORKER_PROCESSES)
+
+
+@pytest.fixture
+def trusted_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """User code is not checked again for each variation of a study that a question simulates; the
+    tests of the check itself are in `plugins`.
+    """
+    monkeypatch.setattr("safevar_sumo.plugins.check.refuse_defects", lambda study: None)
+
+
+@pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Questions scan 21 values of a characteristic, and their indices come from 64 points: enough
+    where a test is about what is said, and with which settings.
+    """
+    monkeypatch.setattr("safevar_sumo.questions.tolerance.scans.SCAN_VALUES", 21)
+    monkeypatch.setattr(import_module("safevar_sumo.questions.risk"), "BASE_POINTS", 64)
 
 
 SLOW_STUDIES = ("wear_idm", "wear_rss")

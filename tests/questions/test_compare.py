@@ -134,6 +134,7 @@ VERSIONS = {
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("trusted_code")
 @pytest.mark.parametrize("version", VERSIONS)
 def test_none_of_three_worse_versions_is_called_better(
     version: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
@@ -195,7 +196,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
 def test_margin_and_rounding_are_those_of_tolerance() -> None:
     smoke, later = load_study("smoke"), load_study("smoke", name="later")
     answer = sv.compare(smoke, later, samples=8, pool=POOL)
-    of_tolerance = sv.tolerance(smoke, characteristics="tireFric", pool=POOL)
+    of_tolerance = sv.tolerance(smoke, characteristics="tireFric", attack=100, pool=POOL)
     ends = answer.tables["limits"].set_index("characteristic").loc["tireFric", ["b_low", "b_high"]]
     alone = of_tolerance.tables["limits"].loc[0, ["alone_low", "alone_high"]]
     assert ends.tolist() == alone.tolist()

@@ -49,7 +49,9 @@ runs = 1
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trusted_code: None, coarse: None
+) -> Path:
     (tmp_path / "hardest_braking.py").write_text(METRIC)
     (tmp_path / "tiny.toml").write_text(STUDY)
     monkeypatch.chdir(tmp_path)
@@ -141,7 +143,9 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     one question asks.
     """
     search = {"algorithms": ["rs"], "population": 10, "evaluations": 40, "runs": 1}
-    searched(load_study("wear", search=search), in_tmp / "results")
+    test = {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [10, 20, 40]}}
+    matrix = {"aggregate": "worst", "tests": [test]}
+    searched(load_study("wear", search=search, matrix=matrix), in_tmp / "results")
     stages = []
     evaluate = Evaluator.evaluate
 

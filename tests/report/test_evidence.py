@@ -147,9 +147,10 @@ def verified(*arguments: str) -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse")
 def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_path: Path) -> None:
     pack = tmp_path / "pack.zip"
-    ask = ("--ask", "explain --limit 4000 --fits 0", "--ask", "risk --samples 300")
+    ask = ("--ask", "explain --limit 500 --fits 0", "--ask", "risk --samples 300")
     run("evidence", str(slippery), "--out", str(pack), *ask)
     _, files = read_pack(pack)
     assert {name.removeprefix("1-slippery/") for name in files} == {
@@ -436,7 +437,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("planted")
+@pytest.mark.usefixtures("planted", "trusted_code")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
     study = study.replace("at_least = 5", "at_least = 7.9").replace(
@@ -446,8 +447,8 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
         re.sub(r"(always|colour) = \{ .*\n", "", study)
     )  # which it keeps already
     run("study", "planted.toml", "--out", "results", "--quiet", "--jobs", "1")
-    run("evidence", "results", "--out", "it.zip", "--ask", "repair")
-    assert "answer repair" in verified("it.zip", "--run-code")
+    run("evidence", "results", "--out", "it.zip", "--ask", "repair --quick")
+    assert "answer repair --quick" in verified("it.zip", "--run-code")
 
 
 @pytest.mark.slow

@@ -392,6 +392,7 @@ def commands_of(page: str) -> Iterator[list[str]]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse")
 def test_limits_up_to_each_speed_are_the_second_thing_of_a_page(tmp_path: Path) -> None:
     test = {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [20, 40]}}
     search = {"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]}

@@ -76,6 +76,7 @@ def bound(in_tmp: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse")
 def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     """The region is given in closed form; without constraints a fifth of the domain lies in it."""
     run("study", "bound.toml", "--quiet", "--out", "out")
@@ -84,7 +85,7 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     assert len(frame) > 150
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
     below = ("--unsafe", "below=2.5", "--fits", "0")
-    explained = json_of("explain", "out", *below, "--top", "2", "--limit", "500")
+    explained = json_of("explain", "out", *below, "--top", "2", "--limit", "200")
     tolerance = json_of(
         "tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque"
     )

@@ -229,6 +229,7 @@ VALUES = 'file = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, sideways_
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize(
     "tables",
     [
