@@ -10,12 +10,9 @@ from __future__ import annotations
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, BrokenExecutor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager, suppress
-from contextvars import copy_context
-from copy import copy
 from queue import Empty, SimpleQueue
-from threading import Event
 from typing import Any, Protocol, TypeVar
 
 from safevar_sumo.campaign import cluster as dask, local
@@ -39,10 +36,6 @@ class WorkerLostError(SafevarError):
         self.job = job
 
 
-class AbandonedError(SafevarError):
-    """Nobody waits for the results any more."""
-
-
 class Worker(Protocol):
     """An executor with one worker."""
 
@@ -64,8 +57,7 @@ class Pool:
     workers
         Number of jobs that are carried out at the same time.
     uses
-        What the user code of a study uses, by packed study; a study that it lacks is new to the
-        pool.
+        What the user code of studies uses, by its names and the folders in which it is looked up.
     inputs
         The inputs of a study's results when it was new to the pool, a manifest, by packed study.
     verified
@@ -77,10 +69,8 @@ class Pool:
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
         self.workers = workers
         self._start = start
-        self._places: Sequence[int] = range(workers)
-        self._is_abandoned = Event()
         self._started = dict[int, Worker]()
-        self.uses = dict[bytes, Use]()
+        self.uses = dict[tuple[frozenset[str], tuple[str, ...]], Use]()
         self.inputs = dict[bytes, JsonObject]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
@@ -106,13 +96,10 @@ class Pool:
         results = dict[int, Any]()
         deaths = Counter[int]()
         waiting = deque(range(len(jobs)))
-        idle = deque(self._places)
+        idle = deque(range(self.workers))
         ended = SimpleQueue[Future[Any]]()
         under_way = dict[Future[Any], tuple[int, int]]()
         while len(results) < len(jobs):
-            if self._is_abandoned.is_set():
-                raise AbandonedError
-
             # Every idle worker gets a job.
             while waiting and idle:
                 place = idle.popleft()
@@ -144,45 +131,6 @@ class Pool:
             else:
                 raise error
         return [results[number] for number in range(len(jobs))]
-
-    def share_out(self, functions: Sequence[Callable[[Pool], Result]]) -> list[Result]:
-        """The results of functions that give jobs to a pool, each in a thread with some of the
-        workers; when one raises an error, the others end.
-        """
-        # Each thread has a part of the workers.
-        count = min(len(functions), self.workers)
-        if count < 2:
-            return [function(self) for function in functions]
-        free = SimpleQueue[Pool]()
-        is_abandoned = Event()
-        for number in range(count):
-            free.put(self._part(self._places[number::count], is_abandoned))
-
-        def call(function: Callable[[Pool], Result]) -> Result:
-            part = free.get()
-            try:
-                return function(part)
-            finally:
-                free.put(part)
-
-        # The first error ends all of them.
-        with ThreadPoolExecutor(count) as threads:
-            futures = [threads.submit(copy_context().run, call, function) for function in functions]
-            try:
-                for future in wait(futures, return_when=FIRST_EXCEPTION).done:
-                    future.result()  # raises the error that ended the waiting
-                return [future.result() for future in futures]
-            finally:
-                is_abandoned.set()
-                threads.shutdown(cancel_futures=True)
-
-    def _part(self, places: Sequence[int], is_abandoned: Event) -> Pool:
-        """A pool of some of the workers, which knows what all of them know."""
-        part = copy(self)
-        part.workers = len(places)
-        part._places = places
-        part._is_abandoned = is_abandoned
-        return part
 
     def everywhere(self, function: Callable[..., Any], *arguments: Any) -> None:
         """Carry out a function in each worker that has started and lives."""

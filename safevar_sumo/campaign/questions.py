@@ -73,7 +73,7 @@ def evaluate_all(
     `selection`, nothing is verified in SUMO.
     """
     packed_study = msgspec.msgpack.encode(study)
-    use = _use_of(study, packed_study, pool)
+    use = _use_of(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
         pool.inputs[packed_study] = manifest_now(study, system, use.modules)
@@ -114,11 +114,16 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
         pool.everywhere(repeat_first_batch, study)
 
 
-def _use_of(study: Study, packed_study: bytes, pool: Pool) -> Use:
-    """What the user code of a study uses, which is checked once in a pool."""
-    if packed_study not in pool.uses:
-        pool.uses[packed_study] = check_code(study, pool)
-    return pool.uses[packed_study]
+def _use_of(study: Study, pool: Pool) -> Use:
+    """What the user code of a study uses. Code is checked once in a pool, whatever else of the
+    study questions vary.
+    """
+    names, places = frozenset(user_code_names(study)), study.origin.places
+    for (known, folders), use in pool.uses.items():
+        if names <= known and folders == places:
+            return use
+    pool.uses[names, places] = use = check_code(study, pool)
+    return use
 
 
 def _simulate(
@@ -215,7 +220,7 @@ def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lam
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
     "" if they do. `begin` is called before anything is simulated.
     """
-    use = _use_of(study, msgspec.msgpack.encode(study), pool)
+    use = _use_of(study, pool)
     cache = cache_of(study, use)
     key = b""
     if cache:

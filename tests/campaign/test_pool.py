@@ -8,7 +8,6 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -223,37 +222,3 @@ def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point
         reproduced(at_point(study, point), mass=original + 200)
         == f" --point '{point}' --set mass={original + 200}"
     )
-
-
-def half(number: float) -> float:
-    time.sleep(0.05)
-    return number / 2
-
-
-@pytest.mark.slow
-def test_functions_share_out_the_workers_of_a_pool_and_end_together() -> None:
-    """Each gives two jobs to one of two workers; one that fails ends the others, which would ask
-    for ever.
-    """
-    with open_pool(2) as pool:
-
-        def quarter(number: float, part: Pool) -> float:
-            assert part.workers == 1
-            return float(part.map(half, [(part.map(half, [(number,)])[0],)])[0])
-
-        numbers = [float(number) for number in range(5)]
-        assert pool.share_out([partial(quarter, number) for number in numbers]) == [
-            number / 4 for number in numbers
-        ]
-
-        def ask_for_ever(part: Pool) -> None:
-            while True:
-                part.map(half, [(1.0,)])
-
-        def fail(part: Pool) -> None:
-            part.map(half, [(1.0,)])
-            raise InputError("this", "fails")
-
-        with pytest.raises(InputError, match="fails"):
-            pool.share_out([ask_for_ever, fail])
-        assert pool.map(half, [(3.0,)]) == [1.5]
