@@ -7,11 +7,9 @@ from __future__ import annotations
 import configparser
 import importlib.util
 import json
-import os
 import re
 import runpy
 import shlex
-import shutil
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,18 +94,12 @@ def test_every_picture_has_its_command_and_its_page() -> None:
         "boundary.png",
         "stops.png",
         "encounters.png",
-        "report.png",
     ],
 )
 def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
     name: str, tmp_path: Path
 ) -> None:
-    if (
-        name == "report.png"
-        and not shutil.which("chromium")
-        and not os.environ.get("SAFEVAR_BROWSER")
-    ):
-        pytest.skip("chromium is not installed")
+    """That of a page of `report` takes minutes; tests/report/test_browser.py looks at pages."""
     drawn_anew = script_of_docs("pictures").draw(name, tmp_path)
     with Image.open(drawn_anew) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
         assert drawn.size == stored.size
