@@ -102,7 +102,7 @@ def report(
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
-        Rough answers within seconds, without limits by speed and without a line to sign.
+        Rough answers, without limits by speed and without a line to sign.
 
     Returns
     -------

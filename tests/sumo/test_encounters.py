@@ -277,7 +277,7 @@ def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> 
     of the brakes.
     """
     study = planted(step_length=0.01)
-    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0)
+    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0, attack=500)
     (limit,) = answer.tables["limits"].to_dict("records")
     border = 1 - (MARGIN - 0.1) / GAP  # it keeps 0.1 m
     assert limit["together_low"] == pytest.approx(border, rel=0.01)
@@ -290,7 +290,7 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     None
 ):
     study = planted()
-    answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=500, top=2)
+    answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=200, top=2)
     for cause in answer.tables["causes"].to_dict("records"):
         assert [*cause["changes"]] == ["brakes"]
         speed = cause["encounter"]["speed"] * KMH

@@ -120,8 +120,7 @@ def explain(
         Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
         checked again; 0 leaves this out.
     quick
-        A rough answer within seconds: the study's own parameter set alone, and causes of few
-        failures.
+        A rough answer: the study's own parameter set alone, and causes of few failures.
     """
     if quick:
         fits, limit = 0, min(limit, QUICK_LIMIT)
