@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.figures import BLUE, DEGREE_LABEL, VERMILION, new_figure
+from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -49,7 +49,8 @@ def draw_sawtooth(path: str) -> None:
     axis.annotate(
         "original car", (3.5, degrees[-1]), (-8, 10), textcoords="offset points", ha="right"
     )
-    axis.set(xlabel="tyre friction tireFric [-]", ylabel=DEGREE_LABEL)
+    degree = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
+    axis.set(xlabel="tyre friction tireFric [-]", ylabel=degree)
     figure.savefig(path, dpi=130)
 
 

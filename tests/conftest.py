@@ -120,7 +120,7 @@ def trusted_code(monkeypatch: pytest.MonkeyPatch) -> None:
     """User code is not checked again for each variation of a study that a question simulates; the
     tests of the check itself are in `plugins`.
     """
-    monkeypatch.setattr("safevar_sumo.plugins.check.refuse_defects", lambda study: None)
+    monkeypatch.setattr("safevar_sumo.check.refuse_defects", lambda study: None)
 
 
 @pytest.fixture

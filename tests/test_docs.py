@@ -87,14 +87,7 @@ def test_every_picture_has_its_command_and_its_page() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [
-        "failure.png",
-        "failure.gif",
-        "sawtooth.png",
-        "boundary.png",
-        "stops.png",
-        "encounters.png",
-    ],
+    ["failure.png", "failure.gif", "sawtooth.png", "boundary.png", "stops.png", "encounters.png"],
 )
 def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
     name: str, tmp_path: Path

@@ -210,6 +210,7 @@ def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse")
 def test_limits_of_the_matrix_by_drac_are_obeyed_in_every_fit() -> None:
     """500 cars within the limits together, in each fit, at all points of the matrix: the worst one
     by DRAC counts.

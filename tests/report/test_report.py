@@ -105,13 +105,7 @@ def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(
 ) -> None:
     front, _, details = page.partition('class="replays"')
     headings = re.findall(r'<dt><a href="#(.*?)">(.*?)</a></dt>', front)
-    assert [heading for _, heading in headings] == [
-        "Explain",
-        "Risk",
-        "Rules",
-        "Limits and trust",
-        "Tables",
-    ]
+    assert [heading for _, heading in headings] == ["Explain", "Risk", "Rules", "Limits and trust"]
     assert all(f'id="{anchor}"' in details for anchor, _ in headings)
     lead = re.findall(
         r'<div class="first">\s*<p>(.*?)</p>\s*<div class="wide".*?<caption>(.*?)</caption>', front
@@ -133,7 +127,6 @@ def test_the_first_answer_leads_and_all_verdicts_stand_before_the_replays(
         "Rules",
         "What was tested",
         "Limits and trust",
-        "Tables",
         "How to reproduce",
     ]
     places = [details.index(f">{name}") for name in order]
