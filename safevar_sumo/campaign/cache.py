@@ -341,5 +341,8 @@ def _environment() -> Any:
     """The versions of Python and of all installed distributions, and the digests of this package's
     files.
     """
-    versions = sorted((one.metadata["Name"] or "", one.version or "") for one in distributions())
+    # A distribution may lack a name or a version.
+    versions = sorted(
+        [one.metadata.get(field, "") for field in ("Name", "Version")] for one in distributions()
+    )
     return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])

@@ -143,8 +143,14 @@ def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_command_is_interrupted_by_ctrl_c(name: str, mine: Mine, folder: Path) -> None:
+    """Even if these tests were started in a background in which Ctrl-C is ignored."""
     mine(SCALAR + PRESSED.format(name))
-    assert "interrupted" in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+    number = signal.Signals[name]
+    handler = signal.signal(number, signal.default_int_handler)
+    try:
+        assert "interrupted" in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+    finally:
+        signal.signal(number, handler)
 
 
 def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
