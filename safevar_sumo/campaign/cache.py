@@ -343,6 +343,7 @@ def _environment() -> Any:
     """
     # A distribution may lack a name or a version.
     versions = sorted(
-        [one.metadata.get(field, "") for field in ("Name", "Version")] for one in distributions()
+        [one.metadata.get_all(field, []) for field in ("Name", "Version")]
+        for one in distributions()
     )
     return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])
