@@ -116,14 +116,6 @@ def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def trusted_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    """User code is not checked again for each variation of a study that a question simulates; the
-    tests of the check itself are in `plugins`.
-    """
-    monkeypatch.setattr("safevar_sumo.check.refuse_defects", lambda study: None)
-
-
-@pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Questions scan 21 values of a characteristic, and their indices come from 64 points: enough
     where a test is about what is said, and with which settings.

@@ -137,7 +137,7 @@ def study(
         the fastest.
     engine
         What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor
-        reacts to the vehicles; results are verified in SUMO. sumo: always SUMO.
+        reacts to the vehicles; some results are verified in SUMO. sumo: always SUMO.
     out
         Directory of the results, by default results/STUDY.
     jobs

@@ -213,7 +213,7 @@ def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]
     rows = np.flatnonzero(Unsafe.default(values, solutions.outcome).of(solutions))
     rows = rows[np.unique(solutions.settings[rows], axis=0, return_index=True)[1]]
 
-    # Others after them, in turns of all runs.
+    # Others after them, of all runs.
     rng = np.random.default_rng(study.search.seed)
     drawn = Evaluations.concatenate([run.sample for run in runs])
     drawn = drawn.take(rng.permutation(len(drawn)))

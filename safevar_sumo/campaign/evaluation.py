@@ -120,10 +120,8 @@ def carry_out(
     # Two workers died at the same work, probably in user code.
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
-        work = ", ".join(
-            f"{len(argument)} settings" if isinstance(argument, np.ndarray) else str(argument)
-            for argument in arguments
-        )
+        first = arguments[0] if arguments else ""
+        work = f"{len(first)} settings" if isinstance(first, np.ndarray) else str(first)
         names = user_code_names(task.study)
         problem = (
             f"two workers were lost at the same work, {work or function.__name__.strip('_')}:"

@@ -57,7 +57,8 @@ class Pool:
     workers
         Number of jobs that are carried out at the same time.
     uses
-        What the user code of studies uses, by its names and the folders in which it is looked up.
+        What the user code of studies uses, by the names of the code, and the study's name with the
+        folders in which code is looked up.
     inputs
         The inputs of a study's results when it was new to the pool, a manifest, by packed study.
     verified

@@ -115,10 +115,10 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
 
 
 def _use_of(study: Study, pool: Pool) -> Use:
-    """What the user code of a study uses. Code is checked once in a pool, whatever else of the
-    study questions vary.
+    """What the user code of a study uses. A study's code is checked once in a pool, whatever else
+    of the study questions vary.
     """
-    names, places = frozenset(user_code_names(study)), study.origin.places
+    names, places = frozenset(user_code_names(study)), (study.name, *study.origin.places)
     for (known, folders), use in pool.uses.items():
         if names <= known and folders == places:
             return use

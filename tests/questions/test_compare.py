@@ -134,7 +134,6 @@ VERSIONS = {
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("trusted_code")
 @pytest.mark.parametrize("version", VERSIONS)
 def test_none_of_three_worse_versions_is_called_better(
     version: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch

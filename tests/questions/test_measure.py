@@ -49,9 +49,7 @@ runs = 1
 
 
 @pytest.fixture
-def folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trusted_code: None, coarse: None
-) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Path:
     (tmp_path / "hardest_braking.py").write_text(METRIC)
     (tmp_path / "tiny.toml").write_text(STUDY)
     monkeypatch.chdir(tmp_path)

@@ -437,7 +437,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("planted", "trusted_code")
+@pytest.mark.usefixtures("planted")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
     study = study.replace("at_least = 5", "at_least = 7.9").replace(

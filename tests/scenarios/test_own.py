@@ -110,7 +110,6 @@ gap = { unit = "m", original = 50, lower = 35, upper = 55 }
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("trusted_code")
 @pytest.mark.parametrize(
     "typed",
     [
