@@ -80,7 +80,8 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
         If a place or a collision is another one in SUMO, with the first such setting and both
         values.
     """
-    # The other point: each test has one, and the settings take turns.
+    # The other point: each test has one, which the settings decide, and they take turns; where it
+    # is the worst point itself, the next one.
     points = system.points
     of_tests = dict[Any, list[int]]()
     for number, point in enumerate(points):
@@ -88,6 +89,7 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     digest = zlib.crc32(settings.tobytes())
     others = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
     other = np.resize(others, len(settings))
+    other = np.where(other == worst, (worst + 1) % len(points), other)
 
     # Those of a point drive together.
     remark = ""
