@@ -35,6 +35,12 @@ class VariedAds(Ads):
     values
         Their values, shape (m, number of names). N vehicles are N / m groups, and vehicle i of each
         group has row i.
+
+    Notes
+    -----
+    A driving system that steps all vehicles at once gets an array of N values where its field
+    declares a number, so it computes with its parameters value by value. What it says of itself by
+    constants, such as `max_vehicles`, is not asked here.
     """
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
@@ -71,7 +77,7 @@ class VariedAds(Ads):
 
 
 def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
-    """The ADS, with the headways `tau` of N vehicles [s] if it is SUMO's driver."""
+    """The ADS, with the headways `tau` of N vehicles [s] if it has a parameter for them."""
     if tau is None or not ads.tau_parameter:
         return ads
     if not isinstance(ads, VariedAds):

@@ -1,12 +1,13 @@
 """Conditions of triggers: each is a function with the standard's name that tells at which samples
-of a window it holds.
+of a window it holds. A window is the samples from one action to the next. Places and directions are
+complex numbers: x + i y on the map, and ahead + i left from an actor.
 
 The names are those of the classes in the class reference of ASAM OpenSCENARIO XML 1.3.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from safevar_sumo.errors import one_of
 from safevar_sumo.openscenario.actors import STEP, Actor, Array
 from safevar_sumo.openscenario.document import Element, attribute, number, part, truth, unsupported
 from safevar_sumo.openscenario.expressions import RULES, compare
-from safevar_sumo.openscenario.player import Player
+from safevar_sumo.openscenario.player import Key, Player
 from safevar_sumo.openscenario.ways import Way
 
 REACTIONS = (
@@ -29,13 +30,13 @@ LEFT_TO_RUNS = frozenset((*REACTIONS, "EndOfRoadCondition", "OffroadCondition"))
 """The same, and conditions that never hold for an Ego that drives straight on."""
 
 
-def compared(condition: Element, values: Array) -> Array:
+def satisfies_rule(condition: Element, values: Array) -> Array:
     """Where values satisfy the condition's rule."""
     return RULES[attribute(condition, "rule")](values, number(condition, "value"))
 
 
 def holds(player: Player, trigger: Element | None, window: slice) -> Array:
-    """At which samples of a window a trigger (class Trigger) holds; without a condition at all."""
+    """At which samples of a window a trigger (class Trigger) holds: always without conditions."""
     groups = [] if trigger is None else trigger.findall("ConditionGroup")
     found = np.full(window.stop - window.start, not groups)
     for group in groups:
@@ -52,6 +53,7 @@ def _condition(player: Player, condition: Element, window: slice) -> Array:
         player.seen[id(condition)] = window.start, np.zeros(len(player.times) + 1, bool)
     first, seen = player.seen[id(condition)]
     seen[window] = _value(player, condition, window)
+    # Samples before the first one wrap around to other values, which the masks leave out.
     delay = round(min(number(condition, "delay", 0.0) / STEP, len(player.times)))
     samples = np.arange(window.start, window.stop) - delay
     now = (samples >= first) & seen[samples]
@@ -101,7 +103,7 @@ def watched(player: Player, trigger: Element | None) -> list[str]:
 
 def simulation_time_condition(player: Player, condition: Element, window: slice) -> Array:
     """SimulationTimeCondition [s]."""
-    return compared(condition, player.times[window])
+    return satisfies_rule(condition, player.times[window])
 
 
 def storyboard_element_state_condition(player: Player, condition: Element, window: slice) -> Array:
@@ -109,17 +111,8 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
     kind = attribute(condition, "storyboardElementType").lower()
     name = attribute(condition, "storyboardElementRef")
     times = player.times[window]
-    began, ended = (
-        min(
-            (
-                time
-                for (of, path), time in states.items()
-                if of == kind and f"::{path}".endswith(f"::{name}")
-            ),
-            default=np.inf,
-        )
-        for states in (player.begun, player.ended)
-    )
+    began = _first_time(player.begun, kind, name)
+    ended = _first_time(player.ended, kind, name)
     has_begun = times >= began - 1e-9
     has_ended = times >= ended - 1e-9
     ends = np.abs(times - ended) < 1e-9
@@ -134,6 +127,18 @@ def storyboard_element_state_condition(player: Player, condition: Element, windo
     }[attribute(condition, "state")]
 
 
+def _first_time(times: Mapping[Key, float], kind: str, name: str) -> float:
+    """When the first element of a kind had a name, or a path that ends with it [s]."""
+    return min(
+        (
+            time
+            for (of_kind, path), time in times.items()
+            if of_kind == kind and f"::{path}".endswith(f"::{name}")
+        ),
+        default=np.inf,
+    )
+
+
 def parameter_condition(player: Player, condition: Element, window: slice) -> Array:
     """ParameterCondition, VariableCondition: both change by actions alone, so not in a window."""
     is_variable = condition.tag == "VariableCondition"
@@ -141,8 +146,10 @@ def parameter_condition(player: Player, condition: Element, window: slice) -> Ar
     name = attribute(condition, "variableRef" if is_variable else "parameterRef").lstrip("$")
     if name not in values:
         raise unsupported(f"the file declares no parameter {name}", one_of(values))
-    holds = compare(attribute(condition, "rule"), values[name], attribute(condition, "value"))
-    return np.full(window.stop - window.start, holds)
+    is_satisfied = compare(
+        attribute(condition, "rule"), values[name], attribute(condition, "value")
+    )
+    return np.full(window.stop - window.start, is_satisfied)
 
 
 # By entity
@@ -152,7 +159,7 @@ def relative_distance_condition(
     player: Player, condition: Element, actor: Actor, window: slice
 ) -> Array:
     """RelativeDistanceCondition [m]."""
-    return compared(condition, distance(condition, actor, player.other(condition), window))
+    return satisfies_rule(condition, distance(condition, actor, player.other(condition), window))
 
 
 def time_headway_condition(
@@ -160,7 +167,7 @@ def time_headway_condition(
 ) -> Array:
     """TimeHeadwayCondition: the distance over the triggering entity's speed [s]."""
     gap = distance(condition, actor, player.other(condition), window)
-    return compared(condition, _time(gap, actor.speed[window]))
+    return satisfies_rule(condition, _time(gap, actor.speed[window]))
 
 
 def time_to_collision_condition(
@@ -175,12 +182,12 @@ def time_to_collision_condition(
         )
     other = player.other(target)
     closing = actor.speed[window] - _along(actor, other, window)
-    return compared(condition, _time(distance(condition, actor, other, window), closing))
+    return satisfies_rule(condition, _time(distance(condition, actor, other, window), closing))
 
 
-def _time(way: Array, speed: Array) -> Array:
+def _time(gap: Array, speed: Array) -> Array:
     """The time for a distance at a speed, infinite if the speed is not above 0 [s]."""
-    return np.where(speed > 0, way / np.maximum(speed, 1e-9), np.inf)
+    return np.where(speed > 0, gap / np.maximum(speed, 1e-9), np.inf)
 
 
 def traveled_distance_condition(
@@ -207,19 +214,21 @@ def distance_condition(player: Player, condition: Element, actor: Actor, window:
     gap = (
         player.place(part(condition, "Position/*")).pose.place - actor.place[window]
     ) / actor.facing[window]
-    return compared(condition, _part(condition.get("relativeDistanceType", ""), gap))
+    return satisfies_rule(condition, _component(condition.get("relativeDistanceType", ""), gap))
 
 
 def speed_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
     """SpeedCondition [m/s]."""
-    return compared(condition, actor.speed[window])
+    return satisfies_rule(condition, actor.speed[window])
 
 
 def relative_speed_condition(
     player: Player, condition: Element, actor: Actor, window: slice
 ) -> Array:
     """RelativeSpeedCondition [m/s]."""
-    return compared(condition, actor.speed[window] - _along(actor, player.other(condition), window))
+    return satisfies_rule(
+        condition, actor.speed[window] - _along(actor, player.other(condition), window)
+    )
 
 
 def stand_still_condition(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
@@ -233,7 +242,7 @@ def acceleration_condition(
     """AccelerationCondition [m/s^2]: in the last step."""
     before = np.arange(window.start, window.stop) - 1
     change = actor.speed[window] - actor.speed[np.maximum(before, 0)]
-    return compared(condition, change / STEP)
+    return satisfies_rule(condition, change / STEP)
 
 
 def never(player: Player, condition: Element, actor: Actor, window: slice) -> Array:
@@ -270,11 +279,11 @@ def distance(condition: Element, actor: Actor, other: Actor, window: slice) -> A
         return _along_road(condition, actor, other, window, is_free)
     apart, reach = bodies_apart(actor, other, window)
     if is_free:
-        return np.maximum(_part(kind, apart) - _part(kind, reach), 0.0)
-    return _part(kind, (other.place[window] - actor.place[window]) / actor.facing[window])
+        return np.maximum(_component(kind, apart) - _component(kind, reach), 0.0)
+    return _component(kind, (other.place[window] - actor.place[window]) / actor.facing[window])
 
 
-def _part(kind: str, apart: Array) -> Array:
+def _component(kind: str, apart: Array) -> Array:
     """The size of what is ahead or aside of a distance, ahead + i left, or of all of it [m]."""
     if kind == "longitudinal":
         return np.abs(apart.real)

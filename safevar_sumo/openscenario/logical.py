@@ -126,7 +126,7 @@ def _choice(each: Element) -> Choice:
     content = part(each, "*")
     match content.tag:
         case "DistributionSet":
-            return _filled(
+            return _with_values(
                 Choice((_name(each),), tuple((attribute(one, "value"),) for one in content))
             )
         case "DistributionRange":
@@ -150,7 +150,9 @@ def _choice(each: Element) -> Choice:
                     "ValueSetDistribution: its sets name different parameters",
                     "the same parameters in each set",
                 )
-            return _filled(Choice(names, tuple(tuple(own[name] for name in names) for own in sets)))
+            return _with_values(
+                Choice(names, tuple(tuple(own[name] for name in names) for own in sets))
+            )
     raise unsupported(
         f"{content.tag} is not supported",
         "DistributionSet, DistributionRange or ValueSetDistribution",
@@ -165,7 +167,7 @@ def _reference(element: Element) -> str:
     return attribute(element, "parameterRef").lstrip("$")
 
 
-def _filled(choice: Choice) -> Choice:
+def _with_values(choice: Choice) -> Choice:
     if not (choice.names and choice.sets):
         raise unsupported("a distribution without values is not supported", "one value at least")
     return choice
@@ -214,20 +216,21 @@ def constraints_of(
     declarations = declared(root_of(file))
     bounds = []
 
-    def difference(name: str, limit: str, at: FloatArray) -> float:
+    def difference(name: str, text: str, at: FloatArray) -> float:
         own = {key: repr(float(value)) for key, value in zip(names, at, strict=True)}
         values = values_of(declarations, {**given, **own}, {})
-        return float(values[name]) - float(literal(limit, values))
+        return float(values[name]) - float(literal(text, values))
 
     middle = (low + high) / 2
     half = (high - low) / 2
     for name, _, _, groups in declarations:
-        for rule, limit in chain(*groups):
+        for rule, text in chain(*groups):
             if rule not in KINDS:
                 continue
-            base = difference(name, limit, middle)
+            # What the constraint leaves in the middle, and how it changes towards each end.
+            base = difference(name, text, middle)
             slopes = (
-                np.array([difference(name, limit, middle + step) - base for step in np.diag(half)])
+                np.array([difference(name, text, middle + step) - base for step in np.diag(half)])
                 / half
             )
             sign = 1 if KINDS[rule] == "at_least" else -1
@@ -237,15 +240,16 @@ def constraints_of(
             holds_everywhere = least > 0 or (least == 0 and rule.endswith("Equal"))
             if is_given or holds_everywhere:
                 continue
+            # A constraint is linear if its slopes also tell what it leaves elsewhere.
             elsewhere = [low, high, middle - half / 3]
             errors = [
-                difference(name, limit, at) - base - slopes @ (at - middle) for at in elsewhere
+                difference(name, text, at) - base - slopes @ (at - middle) for at in elsewhere
             ]
             if np.abs(errors).max() > 1e-6 * reach:
                 raise unsupported(
                     f"the constraint of {name} is not linear in {', '.join(names)}",
                     "other parameters to search",
                 )
-            bound = float(slopes @ middle - base + sign * INSIDE * reach)
-            bounds.append(Bound(slopes.tolist(), KINDS[rule], bound, f"{name} {rule} {limit}"))
+            limit = float(slopes @ middle - base + sign * INSIDE * reach)
+            bounds.append(Bound(slopes.tolist(), KINDS[rule], limit, f"{name} {rule} {text}"))
     return bounds

@@ -19,6 +19,8 @@ CELLS = 16
 """Width of a bar on the terminal [characters]."""
 WIDTH, HEIGHT = 120, 14
 """Size of a bar on a page [px]."""
+MARGIN = HEIGHT / 2
+"""Room for the dot of the original at either end [px]."""
 LEGEND = {
     "text": "bar: █ together, ▒ alone (all others as new), · domain, o original, | specified",
     "html": (
@@ -53,10 +55,10 @@ class Bar(NamedTuple):
     @property
     def svg(self) -> str:
         """The bar as inline SVG, whose colours are those of the page."""
-        inside = WIDTH - HEIGHT
+        inside = WIDTH - 2 * MARGIN
 
         def x(share: float) -> str:
-            return f"{HEIGHT / 2 + inside * share:.1f}"
+            return f"{MARGIN + inside * share:.1f}"
 
         def rectangle(ends: tuple[float, ...], name: str) -> str:
             if not ends:
@@ -101,7 +103,9 @@ def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> lis
 
 
 def draw_bars(answer: Answer) -> Figure:
-    """The bars of a table of limits, a row for each characteristic."""
+    """The bars of a table of limits, a row for each characteristic; `tolerance` keeps them in its
+    attribute `bars`.
+    """
     from safevar_sumo.questions.figures import BLUE, SKY_BLUE, VERMILION, escape_dollars, new_figure
 
     limits = answer.tables["limits"]

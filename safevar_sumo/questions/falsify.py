@@ -16,6 +16,8 @@ from safevar_sumo.records import FloatArray
 LEAST_SIMULATIONS = 1000
 """Fewest simulations that search for a counterexample before a value is printed as one that holds.
 """
+USUAL_BUDGET = 5000
+"""Simulations that search for a counterexample to a claim, unless an option says otherwise."""
 GENERATION, PARENTS = 512, 32
 """Settings of a generation; the worst ones so far, which are its parents."""
 STEP, PULL = 0.1, 0.5

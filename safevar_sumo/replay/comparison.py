@@ -131,6 +131,7 @@ class Comparison:
     def changes(self) -> list[str]:
         """Every change in words, with its unit and share."""
         characteristics = self.system.characteristics
+        # The changed vehicle follows the original, which is alone without a change.
         setting = self.evaluations.settings[-1].tolist()
         return change_texts(characteristics, dict(zip(characteristics.names, setting, strict=True)))
 
@@ -174,7 +175,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
         system=pair.system,
         point=pair.point,
         evaluations=pair.evaluations,
-        runs=_with_pedals_before_impacts(pair.runs),
+        runs=_hold_pedals_at_impact(pair.runs),
         # The points of a rating belong to all cells together.
         objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
     )
@@ -199,7 +200,7 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
     return tuple(lanes)
 
 
-def _with_pedals_before_impacts(runs: SimulationRuns) -> SimulationRuns:
+def _hold_pedals_at_impact(runs: SimulationRuns) -> SimulationRuns:
     """Runs with the pedals of the sample before an impact also at the impact, where a command has
     no effect any more.
     """

@@ -254,8 +254,8 @@ class Vehicle:
 
 
 def led_state(is_led: BoolArray, steady: State, state: State) -> State:
-    """The state of vehicles that move as in a steady state where `is_led` is true; what a signal
-    was before stays.
+    """The state of vehicles that move as in a steady state where `is_led` is true; a delayed
+    signal, the only part of a state with a method `where`, keeps what it was before.
     """
     if isinstance(state, tuple):
         columns = [led_state(is_led, *states) for states in zip(steady, state, strict=True)]
@@ -266,7 +266,7 @@ def led_state(is_led: BoolArray, steady: State, state: State) -> State:
 
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
-    of states.
+    of states, and a delayed signal selects by its own method `where`.
     """
     if hasattr(steady, "where"):
         return steady.where(is_rolling, rest)

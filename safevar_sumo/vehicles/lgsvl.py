@@ -354,6 +354,12 @@ def _roll(
 
     I dw/dt = T_drive - T_brake - d w - r K (r w - v)
     m dv/dt = K (r w - v) - (D_air v + D_tyre + D_corner) v - m g sin
+
+    With h for the substep, M = m + h (K + D_air v + D_tyre + D_corner) (`damped_mass`), p = h r K
+    (`pull`) and u = v - h g sin (`slope_speed`), the new speeds w' and v' are
+
+    w' (I + h d + p r - p^2 / M) = I w + h (T_drive - T_brake) + p m u / M    (`wheel_momentum`)
+    v' = (m u + p w') / M
     """
     # Engine speed and torque.
     h = p.substep

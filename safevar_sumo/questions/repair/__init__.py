@@ -30,15 +30,10 @@ from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.repair.price import price_of
-from safevar_sumo.questions.repair.problem import (
-    USUAL_BUDGET,
-    Promise,
-    RepairProblem,
-    parameters_of,
-)
+from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.repair.validation import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points

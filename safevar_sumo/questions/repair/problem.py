@@ -19,6 +19,7 @@ from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of
 from safevar_sumo.questions.sampling import sobol_points
@@ -33,8 +34,6 @@ DIGITS = 4
 """Significant digits of a parameter's changed value, more where its range is small beside it: the
 value that is printed is the one that has been tried.
 """
-USUAL_BUDGET = 5000
-"""Number of simulations of an attack over all parameter sets, unless a rough answer is enough."""
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
 DRAWS = 20

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
@@ -29,7 +29,6 @@ from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
-from safevar_sumo.questions.tolerance.words import USUAL_BUDGET
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:

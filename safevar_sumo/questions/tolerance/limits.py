@@ -15,6 +15,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Models, models_of, with_points_between
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
@@ -38,12 +39,7 @@ from safevar_sumo.questions.tolerance.scans import (
 )
 from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
 from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
-from safevar_sumo.questions.tolerance.words import (
-    USUAL_BUDGET,
-    tested_sentences,
-    verdict_sentences,
-    why_not_kept,
-)
+from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences, why_not_kept
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit

@@ -14,7 +14,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.counterexamples import Failure, describe
-from safevar_sumo.questions.falsify import enough
+from safevar_sumo.questions.falsify import USUAL_BUDGET, enough
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.reach import Reach
 from safevar_sumo.questions.tables import Column, Columns, Wide, tabulate
@@ -25,7 +25,6 @@ from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.levels import Level, LevelSearch
 from safevar_sumo.questions.tolerance.rows import ALONE, LIMITS, NOWHERE
 from safevar_sumo.questions.tolerance.words import (
-    USUAL_BUDGET,
     contacts_in_words,
     one_set_in_words,
     rough_in_words,

@@ -11,6 +11,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
@@ -20,9 +21,6 @@ from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, share_in_words
 from safevar_sumo.study import unit_text
-
-USUAL_BUDGET = 5000
-"""Number of simulations that search for a counterexample unless an option says otherwise."""
 
 
 def why_not_kept(asked: Asked) -> str:
