@@ -137,7 +137,7 @@ def where_in_words(
     speed = texts.pop(SPEED_DIMENSION, "")
     if not speed and scenario.test_speed is not None:
         speed = f"{KMH_PER_MS * scenario.test_speed:.4g} km/h"
-    test = own.get("test", "") if len(points) > 1 else ""
+    test = own.get("test", "")
     at = f" at {speed}" if speed else ""
     rest = [f"{name.replace('_', ' ')} {text}" for name, text in texts.items()]
     if len({each.weather.name for each in points}) > 1:

@@ -7,11 +7,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise, product
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
-from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
@@ -19,14 +17,9 @@ from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.scenarios import searchable_in
-from safevar_sumo.study import MatrixTest, Study
-from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
@@ -35,8 +28,6 @@ SEARCHED_MARGIN = 0.1
 """Distance to keep in a study that searches its scenario [m]: where the original keeps just its
 margin, wear may use up the rest, and contact is no limit to release.
 """
-BETWEEN_DECIMALS = 2
-"""Decimals of a parameter between two values of a matrix."""
 
 
 class Model(NamedTuple):
@@ -49,12 +40,15 @@ class Model(NamedTuple):
         Its number among the sets of [spread]; the study's own is 0.
     points
         Numbers of the points of the study's matrix that count; all if empty.
+    new_car
+        What the original must not be in an encounter that counts, where it has not been tried.
     """
 
     fit: int
     evaluator: Evaluator
     unsafe: Unsafe
     points: tuple[int, ...] = ()
+    new_car: Unsafe | None = None
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
         """The evaluations of M settings, shape (M, n), at the points that count."""
@@ -66,11 +60,18 @@ class Model(NamedTuple):
         """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
         where it does not count.
         """
-        return np.where(
+        robustness = np.where(
             self.evaluator.region.feasible(settings),
             self.robustness_by(self.evaluate(settings, stage)),
             np.inf,
         )
+        failing = np.flatnonzero(robustness < 0)
+        if self.new_car is not None and len(failing):
+            members = self.evaluator.characteristics
+            originals = self.evaluate(members.with_original_vehicle(settings[failing]), stage)
+            counts = originals.valid & ~self.new_car.of(originals)
+            robustness[failing[~counts]] = np.inf
+        return robustness
 
     def robustness_by(self, evaluations: Evaluations) -> FloatArray:
         """What evaluated settings leave; see `left`."""
@@ -101,12 +102,12 @@ def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
 
 
 class Models(NamedTuple):
-    """The parameter sets in which a claim is tested, the study's own first, and the numbers of
-    those left out, in which the original itself is unsafe, or keeps less than the margin.
+    """The parameter sets in which a claim is tested, the study's own first, and those left out, in
+    which the original itself is unsafe, or keeps less than the margin.
     """
 
     members: tuple[Model, ...]
-    left_out: tuple[int, ...]
+    left_out: tuple[Model, ...]
 
     @classmethod
     def own_alone(cls, evaluator: Evaluator, unsafe: Unsafe) -> Self:
@@ -170,92 +171,17 @@ def models_of(
     studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
     in_fits = replace(unsafe, keep=0.0)
     members = [Model(0, evaluator, unsafe)]
-    left_out = list[int]()
+    left_out = list[Model]()
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(
             evaluator.characteristics.original[np.newaxis], "original with each parameter set"
         )
         if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
-            left_out.append(number)
+            left_out.append(model._replace(unsafe=unsafe))
         else:
             members.append(model)
     return Models(tuple(members), tuple(left_out))
-
-
-def with_points_between(
-    model: Model, unsafe: Unsafe, count: int, cells: Sequence[MatrixTest] | None = None
-) -> tuple[Model, int]:
-    """A model whose study also has points between those of its matrix, or of other `cells`, drawn
-    at random, and the number of those left out: points at which the original itself is unsafe, by a
-    criterion that may be stricter than the model's. For another `count` the points are others.
-    """
-    study = model.evaluator.study
-    rng = Stream.TESTS_BETWEEN.generator(study.search.seed, count)
-    tests = tests_between(study, rng, cells)
-    if not tests:
-        return model, 0
-    original = model.evaluator.characteristics.original[np.newaxis]
-    results = simulate_all_points(assemble(_with_tests(study, tests)), original)
-    kept = [
-        test
-        for test, result in zip(tests, results, strict=True)
-        if result.evaluations.valid[0] and not unsafe.of(result.evaluations)[0]
-    ]
-    if not kept:
-        return model, len(tests)
-    assert study.matrix is not None
-    denser = _with_tests(study, [*study.matrix.tests, *kept])
-    return model._replace(evaluator=model.evaluator.for_study(denser, verified=0)), len(
-        tests
-    ) - len(kept)
-
-
-def _with_tests(study: Study, tests: Sequence[MatrixTest]) -> Study:
-    assert study.matrix is not None
-    return replace_in(study, matrix=replace_in(study.matrix, tests=[*tests]))
-
-
-def tests_between(
-    study: Study, rng: np.random.Generator, cells: Sequence[MatrixTest] | None
-) -> list[MatrixTest]:
-    """A test at one random point in each cell of each test's grid: between neighbouring values of
-    every axis that a study may search, at all values of other axes; none without such an axis.
-    `cells` are tests in place of the study's.
-    """
-    if study.matrix is None or study.matrix.protocol or study.matrix.point:
-        return []
-    if study.scenario.search or cells == []:
-        return []
-    if cells:
-        study = _with_tests(study, cells)
-    tests = list[MatrixTest]()
-    for test, points in points_of_tests(study, assemble(study).points):
-        searchable = searchable_in(points[0].scenario)
-        pairs = {
-            name: _cells(values) if name in searchable else [] for name, values in test.over.items()
-        }
-        if not any(pairs.values()):
-            continue
-        for cell in product(
-            *(pairs[name] or [(value,) for value in values] for name, values in test.over.items())
-        ):
-            drawn = [_draw(ends, rng) for ends in cell]
-            over = {name: [value] for name, value in zip(test.over, drawn, strict=True)}
-            tests.append(replace_in(test, over=over))
-    return tests
-
-
-def _cells(values: Sequence[Any]) -> list[tuple[float, ...]]:
-    """The pairs of neighbours among the numbers of an axis; none if they are not numbers."""
-    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        return []
-    return list(pairwise(sorted(values)))
-
-
-def _draw(ends: tuple[Any, ...], rng: np.random.Generator) -> Any:
-    """A value between two ends, or the only one."""
-    return ends[0] if len(ends) == 1 else round(float(rng.uniform(*ends)), BETWEEN_DECIMALS)
 
 
 def fit_names(fits: Sequence[int]) -> str:

@@ -25,13 +25,15 @@ class NarrowedJudge:
 
     Attributes
     ----------
+    model
+        The model; its matrix may gain points.
     at_all_points
         Number of settings that met all points.
     """
 
     def __init__(self, model: Model, stage: str) -> None:
         self.at_all_points = 0
-        self._model = model
+        self.model = model
         self._stage = stage
         self._worst = set[int]()
         self._may_narrow = not len(model.evaluator.characteristics.scenario)
@@ -41,10 +43,10 @@ class NarrowedJudge:
         all points may leave less.
         """
         # Two calls cost more than one if the worst points are most of them.
-        is_narrow = 2 * len(self._worst) < len(self._model.evaluator.system.points)
+        is_narrow = 2 * len(self._worst) < len(self.model.evaluator.system.points)
         if not self._worst or not is_narrow:
             return self._judge_at_all_points(settings)
-        narrowed = self._model._replace(points=tuple(sorted(self._worst)))
+        narrowed = self.model._replace(points=tuple(sorted(self._worst)))
         robustness = narrowed.robustness(settings, self._stage)
 
         # Those that leave least, and some others, meet all points.
@@ -57,9 +59,9 @@ class NarrowedJudge:
     def _judge_at_all_points(self, settings: FloatArray) -> FloatArray:
         """What settings leave at all points; the worst ones are known from now on."""
         self.at_all_points += len(settings)
-        is_feasible = self._model.evaluator.region.feasible(settings)
-        evaluations = self._model.evaluate(settings, self._stage)
+        is_feasible = self.model.evaluator.region.feasible(settings)
+        evaluations = self.model.evaluate(settings, self._stage)
         worst = evaluations.worst_points
         if self._may_narrow and worst is not None:
             self._worst |= {*worst[is_feasible & evaluations.valid].tolist()}
-        return np.where(is_feasible, self._model.robustness_by(evaluations), np.inf)
+        return np.where(is_feasible, self.model.robustness_by(evaluations), np.inf)

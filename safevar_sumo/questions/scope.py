@@ -11,7 +11,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
 from safevar_sumo.sumo.system import assemble
 
@@ -34,6 +34,23 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
             count *= len(values)
         tests.append((test, [*islice(rest, count)]))
     return tests
+
+
+def moving_axes(study: Study, test: MatrixTest, scenario: Scenario) -> list[str]:
+    """The axes of a test that its scenario can move between their values. A study that searches its
+    scenario, or is at one point, moves none.
+    """
+    assert study.matrix is not None
+    if study.scenario.search or study.matrix.point:
+        return []
+    searchable = searchable_in(scenario)
+    return [
+        name
+        for name, values in test.over.items()
+        if name in searchable
+        and len(values) > 1
+        and all(type(value) in (int, float) for value in values)
+    ]
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:
@@ -88,10 +105,11 @@ def _parameters_in_words(
     # Axes of the matrix, and searched parameters.
     over = {} if test is None else test.over
     searchable = searchable_in(points[0].scenario)
+    moving = moving_axes(study, test, points[0].scenario) if test and between else []
     phrases = {}
     for name, values in over.items():
         unit = unit_text(searchable[name].unit) if name in searchable else ""
-        phrases[name] = f"{_values_in_words(values, between and name in searchable)}{unit}"
+        phrases[name] = f"{_values_in_words(values, name in moving)}{unit}"
     for name, domain in study.scenario.search.items():
         phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
 
@@ -100,8 +118,8 @@ def _parameters_in_words(
         {point.scenario.test_speed for point in points if point.scenario.test_speed is not None}
     )
     if SPEED_DIMENSION not in phrases and speeds:
-        ends = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in (speeds[0], speeds[-1]))
-        phrases = {SPEED_DIMENSION: f"{' to '.join(ends)} km/h", **phrases}
+        driven = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in speeds)
+        phrases = {SPEED_DIMENSION: f"{join_phrases(driven)} km/h", **phrases}
     return ", ".join(
         f"at {text}" if name == SPEED_DIMENSION else f"{name.replace('_', ' ')} {text}"
         for name, text in phrases.items()
@@ -109,7 +127,7 @@ def _parameters_in_words(
 
 
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
-    if is_range and len(values) > 1:
+    if is_range:
         return f"{min(values):g} to {max(values):g}"
     return join_phrases(
         f"{value:g}" if isinstance(value, float) else str(value) for value in values

@@ -90,6 +90,7 @@ def compare(
     limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
     margin: Margin = None,
     unsafe: Criterion = None,
+    at_tests: bool = False,
 ) -> Answer:
     """Compare two studies or results, A and B: what is better in B, and what is worse.
 
@@ -110,6 +111,8 @@ def compare(
         the two studies.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    at_tests
+        Limits that hold at the points of the study's tests alone, as in `tolerance`.
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
@@ -132,7 +135,7 @@ def compare(
     titles = _titles(evaluators)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
-    limits_table = limits_of_both(evaluators, criteria, within)
+    limits_table = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
     of_originals, difference = compare_originals(evaluators, originals, criteria, titles[0])
     differences = (
         compare_counts(counts, titles[0]),

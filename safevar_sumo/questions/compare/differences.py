@@ -15,14 +15,17 @@ import pandas as pd
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Column, tabulate, with_interval
+from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.counterexamples import where_in_words
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
+from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
+from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
@@ -98,38 +101,46 @@ def compare_values(quantity: str, p: float, a12: float) -> Difference:
 
 
 def limits_of_both(
-    evaluators: Sequence[Evaluator], criteria: Sequence[Unsafe], limits: Mapping[str, Limit]
+    evaluators: Sequence[Evaluator],
+    criteria: Sequence[Unsafe],
+    limits: Mapping[str, Limit],
+    *,
+    at_tests: bool,
 ) -> pd.DataFrame:
-    """The table of limits alone with the study's own set, rounded as `tolerance` rounds them,
-    within the user's limits; no interval where the original is unsafe.
+    """The table of limits alone with the study's own set, as in `tolerance`, within the user's
+    limits; no interval where the original is unsafe.
     """
     # Limits of each characteristic alone, in both.
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
-    scans = [scan(side, columns, unsafe) for side, unsafe in zip(evaluators, criteria, strict=True)]
+    alone = list[Sequence[AloneLimit]]()
+    for side, unsafe in zip(evaluators, criteria, strict=True):
+        own = Model(0, side, unsafe)
+        search = AloneSearch(scan(side, columns, unsafe), columns, own)
+        if tests := [] if at_tests else moving_tests(own, unsafe):
+            search.add(own, tests)
+        alone.append(search.limits())
     domains = [side.study.domains for side in evaluators]
     rows = []
-    for a, b in zip(*scans, strict=True):
+    for a, b in zip(*alone, strict=True):
         name = a.characteristic.name
         in_a, in_b = (
-            _within(scan_of_side, within(limits, name, of[name]))
-            for scan_of_side, of in zip((a, b), domains, strict=True)
+            _within(limit_of_side.safe, within(limits, name, of[name]))
+            for limit_of_side, of in zip((a, b), domains, strict=True)
         )
         ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
         ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
         rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
+    where = " at the points of the tests alone" if at_tests else ""
     return tabulate(
-        f"Limits of each characteristic alone {OF_OWN_FIT}, rounded to the safe side",
+        f"Limits of each characteristic alone {OF_OWN_FIT}{where}, rounded to the safe side",
         LIMIT_COLUMNS,
         rows,
     )
 
 
-def _within(limits_alone: OneAtATimeScan, ends: Interval) -> Interval | None:
-    """What is safe alone and between the ends, rounded inwards."""
-    if limits_alone.safe is None:
-        return None
-    low, high = limits_alone.characteristic.rounded_inwards(limits_alone.safe)
-    return max(low, ends[0]), min(high, ends[1])
+def _within(safe: Interval | None, ends: Interval) -> Interval | None:
+    """What is safe alone and between the ends."""
+    return None if safe is None else (max(safe[0], ends[0]), min(safe[1], ends[1]))
 
 
 def _change_of(a: Interval | None, b: Interval | None) -> str:

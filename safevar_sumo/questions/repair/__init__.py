@@ -121,6 +121,7 @@ def repair(
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
     fits: Annotated[int | None, Range(0, 1000)] = None,
     out: Annotated[str | None, "FILE.toml"] = None,
+    at_tests: bool = False,
     quick: bool = False,
 ) -> Answer:
     """Find the smallest change of the driving system that keeps worn vehicles safe, and its price.
@@ -148,6 +149,9 @@ def repair(
         study's own alone.
     out
         Study file to write with the first repair; it extends the study.
+    at_tests
+        A repair for the points of the study's tests alone: nothing is simulated between the values
+        of a matrix.
     quick
         A rough answer: the study's own parameter set alone, and a short search for counterexamples.
         Not with `out`.
@@ -186,6 +190,7 @@ def repair(
         for model in models.members
     ]
     problem = problems[0]
+    between = [each for one in problems for each in ([] if at_tests else one.between(unsafe_today))]
     first = _first_vehicles(problem, subject)
     if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
@@ -203,7 +208,7 @@ def repair(
     survivors = Survivors([], len(problems), ())
     worst = vehicles[0]
     if is_repairable.any():
-        survivors = find_survivors(problems, vehicles[is_repairable])
+        survivors = find_survivors(problems, between, vehicles[is_repairable])
         worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
     answer = _answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
@@ -348,7 +353,8 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
         f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
     )
     left_out = (
-        f"; left out: {fit_names(models.left_out)}, where the original is unsafe"
+        f"; left out: {fit_names([model.fit for model in models.left_out])}, where the original is"
+        " unsafe"
         if models.left_out
         else ""
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -17,9 +17,11 @@ from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import USUAL_BUDGET
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of
 from safevar_sumo.questions.sampling import sobol_points
@@ -128,7 +130,9 @@ class Promise(Box):
 
     @property
     def in_words(self) -> str:
-        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, and the encounters."""
+        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, what is as new, and the
+        encounters.
+        """
         ends = self.to_dict()
         characteristics = self.region.characteristics
         whole_domain = all(
@@ -143,6 +147,13 @@ class Promise(Box):
             if end != member.original
         )
         worn = "the whole domain" if whole_domain else worn
+        as_new = [
+            f"{member.name} {member.original:.5g}{member.suffix}"
+            for member in characteristics.vehicle
+            if member.name not in ends
+        ]
+        if as_new:
+            worn += f"; all others as in the original: {', '.join(as_new)}"
         encounters = [
             f"{member.name} {ends[member.name][0]:.5g} to {ends[member.name][1]:.5g}{member.suffix}"
             for member in characteristics.scenario
@@ -227,6 +238,18 @@ class RepairProblem:
     @property
     def study(self) -> Study:
         return self.evaluator.study
+
+    def between(self, new_car: Unsafe) -> list[RepairProblem]:
+        """The same problem in each test of its matrix that moves, with its axes as ranges."""
+        tests = moving_tests(Model(self.fit, self.evaluator, self.unsafe), new_car)
+        return [
+            replace(
+                self,
+                evaluator=test.model.evaluator,
+                promise=Promise(**vars(test.box(self.promise))),
+            )
+            for test in tests
+        ]
 
     @cached_property
     def today(self) -> FloatArray:

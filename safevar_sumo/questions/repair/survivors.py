@@ -32,29 +32,37 @@ class Survivors(NamedTuple):
     broken: tuple[int, ...]
 
 
-def find_survivors(problems: Sequence[RepairProblem], vehicles: FloatArray) -> Survivors:
-    """The smallest changes that survive in all parameter sets; where none does, those of the
-    study's own set, and the sets in which a falsification breaks one of them.
+def find_survivors(
+    problems: Sequence[RepairProblem], between: Sequence[RepairProblem], vehicles: FloatArray
+) -> Survivors:
+    """The smallest changes that survive in all parameter sets, also `between` the tests of a
+    matrix; where none does, those of the study's own set, and the sets in which a falsification
+    breaks one of them.
     """
-    changes = _survivors_in(problems, vehicles)
+    changes = _survivors_in(problems, between, vehicles)
     if changes or len(problems) == 1:
         return Survivors(changes, len(problems), ())
-    changes = _survivors_in(problems[:1], vehicles)
+
+    def between_of(problem: RepairProblem) -> list[RepairProblem]:
+        return [each for each in between if each.fit == problem.fit]
+
+    changes = _survivors_in(problems[:1], between_of(problems[0]), vehicles)
 
     def breaks_one(problem: RepairProblem) -> bool:
-        return any(find_failures([problem], change, vehicles, 0) for change, _ in changes)
+        tests = between_of(problem)
+        return any(find_failures([problem], tests, change, vehicles, 0) for change, _ in changes)
 
     broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
     return Survivors(changes, len(problems) - len(broken), broken)
 
 
 def _survivors_in(
-    problems: Sequence[RepairProblem], vehicles: FloatArray
+    problems: Sequence[RepairProblem], between: Sequence[RepairProblem], vehicles: FloatArray
 ) -> list[tuple[FloatArray, Proof]]:
     """Search, attack and prove in turns until the smallest changes survive everything; none if no
     change does.
     """
-    search = Search(problems, vehicles)
+    search = Search([*problems, *between], vehicles)
     proofs = dict[bytes, Proof]()
     attacks = 0
     failed_proofs = 0
@@ -66,7 +74,7 @@ def _survivors_in(
             return [(change, proofs[change.tobytes()]) for change in changes]
         for change in unproved:
             attacks += 1
-            failures = find_failures(problems, change, search.settings, attacks)
+            failures = find_failures(problems, between, change, search.settings, attacks)
             if not failures:
                 proof, failures = prove_change(problems, change, attacks, failed_proofs)
                 if failures:
@@ -74,7 +82,7 @@ def _survivors_in(
                 else:
                     proofs[change.tobytes()] = proof
             for number, settings in failures.items():
-                if number not in search.settings_of:
+                if number not in search.settings_of and number < len(problems):
                     search.add(number, _worst_with_fit(problems[number], vehicles))
                 search.add(number, settings)
     return []

@@ -7,8 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from safevar_sumo.questions.between import PLACES
 from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
-from safevar_sumo.questions.falsify import falsify
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
@@ -16,6 +17,8 @@ from safevar_sumo.records import FloatArray
 KNOWN = 256
 """Number of the worst known settings with which a falsification begins; with each other
 parameter set an eighth."""
+KNOWN_BETWEEN = 64
+"""Number of the worst known vehicles with which an attack between the tests begins."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
 SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = (
@@ -28,10 +31,15 @@ Failures = dict[int, FloatArray]
 
 
 def find_failures(
-    problems: Sequence[RepairProblem], change: FloatArray, known: FloatArray, number: int
+    problems: Sequence[RepairProblem],
+    between: Sequence[RepairProblem],
+    change: FloatArray,
+    known: FloatArray,
+    number: int,
 ) -> Failures:
     """Attack a change in all fits: promised settings that it does not keep safe, and a driving
-    system could; `number` counts the attacks, for their random numbers.
+    system could; then `between` the tests of a matrix, whose problems are numbered after the
+    others. `number` counts the attacks, for their random numbers.
     """
     own = problems[0]
     # These numbers are of no `Stream`: repairs depend on them.
@@ -39,8 +47,19 @@ def find_failures(
     judges = [partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
     with own.evaluator.stage(ATTACK_STAGE, own.budget):
-        found = falsify(own.promise, judges, starts, own.budget, rng)
-    return {row: np.unique(settings, axis=0) for row, settings in found.failures.items()}
+        failures = falsify(own.promise, judges, starts, own.budget, rng).failures
+        for row, problem in enumerate(between, len(problems)):
+            if failures:
+                break
+            # The worst known vehicles, each at some random places on the axes.
+            vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
+            start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
+            start[:, : vehicles.shape[1]] = vehicles
+            judge = partial(problem.robustness, change, stage=ATTACK_STAGE)
+            found = falsify(problem.promise, [judge], [start], LEAST_SIMULATIONS, rng)
+            if found.failures:
+                failures = {row: found.failures[0]}
+    return {row: np.unique(settings, axis=0) for row, settings in failures.items()}
 
 
 def prove_change(

@@ -58,6 +58,7 @@ def tolerance(
     fits: Annotated[int | None, Range(0, 1000)] = None,
     attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     by: Annotated[str | None, "NAME=V1,V2,..."] = None,
+    at_tests: bool = False,
     quick: bool = False,
 ) -> Answer:
     """Find how far each characteristic may change: alone, and all at the same time.
@@ -92,6 +93,9 @@ def tolerance(
         A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits
         of each characteristic alone that hold up to each of these values, and the value up to which
         the specified limits hold.
+    at_tests
+        Limits that hold at the points of the study's tests alone: nothing is simulated between the
+        values of a matrix.
     quick
         A rough answer: the study's own parameter set, and the shortest search for counterexamples.
         No limit is called kept, and with limits the exit code is 3. Not with `by`.
@@ -115,6 +119,7 @@ def tolerance(
         fits=0 if quick else fits,
         budget=min(attack, LEAST_SIMULATIONS) if quick else attack,
         is_quick=quick,
+        at_tests=at_tests,
     )
     return answer_limits(asked) if parameter is None else answer_by(asked, parameter)
 

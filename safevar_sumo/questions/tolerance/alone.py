@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.boundary import Failing, last_safe_values
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify_all
-from safevar_sumo.questions.models import Model, Models, judges_of
+from safevar_sumo.questions.models import Model, judges_of
 from safevar_sumo.questions.sampling import Interval, Stream
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.records import FloatArray
@@ -101,45 +102,56 @@ class _Ends:
 
 
 class AloneSearch:
-    """The search for limits alone that hold in all models, each at some `values`, from scans with
-    the study's own parameter set, the first model.
+    """The search for limits alone, from scans with the study's own parameter set: one model after
+    another moves them in, each at some `values` between them.
     """
 
     def __init__(
         self,
         scans: Sequence[OneAtATimeScan],
         columns: Sequence[int],
-        models: Sequence[Model],
+        own: Model,
         values: int = VALUES,
     ) -> None:
         self.scans = scans
-        self.models = models
+        self.models = list[Model]()
         self.values = values
+        evaluator = own.evaluator
+        self._encounters = np.concatenate(
+            [[evaluator.characteristics.original], evaluator.critical_encounters]
+        )
         self.ends = list[_Ends]()  # none where the original is unsafe
         if all(scan.safe is not None for scan in scans):
             self.ends = [_Ends(scan, column) for scan, column in zip(scans, columns, strict=True)]
-            _find_beyond(self.ends, models[0])
+            _find_beyond(self.ends, own)
 
-    def run(
-        self, budget: int, further: Sequence[Model] = (), attacked: Models | None = None
-    ) -> None:
-        """Try values in all models, in the encounters that the scans met and in those of an attack
-        on the limits; the ends alone in `further` models, which have other points between those of
-        a matrix. The attack may be in models with more encounters.
+    def add(self, model: Model, tests: Sequence[MovingTest] = ()) -> None:
+        """Move limits in before what fails in a further model: in the encounters that the scans
+        met, and between the points of some tests.
         """
-        evaluator = self.models[0].evaluator
-        encounters = np.concatenate(
-            [[evaluator.characteristics.original], evaluator.critical_encounters]
-        )
-        for model in self.models if self.ends else ():
-            _move_before(self.ends, model, encounters, self.values)
+        self.models.append(model)
+        if not self.ends:
+            return
+        has_moved = _move_before(self.ends, model, self._encounters, self.values)
+        has_moved |= any([_move_between(self.ends, test) for test in tests])
         # The ends as they are printed, until all are safe in all models: where one moves, it is new
         # to the others.
-        all_models = [*self.models, *further] if self.ends else []
-        while any([_move_before(self.ends, model, encounters, 2) for model in all_models]):
-            pass
-        if len(evaluator.characteristics.scenario) and budget:
-            models = self.models if attacked is None else attacked.members
+        while has_moved:
+            has_moved = self.recheck(self.models)
+            has_moved |= any([_move_between(self.ends, test) for test in tests])
+
+    def recheck(self, models: Sequence[Model]) -> bool:
+        """Move ends in before what fails in some models at the ends themselves; whether one has
+        moved.
+        """
+        ends = self.ends
+        return any([_move_before(ends, each, self._encounters, 2) for each in models if ends])
+
+    def attack(self, models: Sequence[Model], budget: int) -> None:
+        """Move ends in before what a falsification in some models finds in other encounters, in a
+        study that searches its scenario.
+        """
+        if self.ends and budget and len(models[0].evaluator.characteristics.scenario):
             _falsify_alone(self.ends, models, budget_alone(budget))
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
@@ -153,7 +165,7 @@ class AloneSearch:
     def failures(self) -> FloatArray:
         """Settings beyond the limits that failed in some model, shape (K, n)."""
         rows = [failure for each in self.ends for failure in each.failures]
-        return np.array(rows).reshape(-1, len(self.models[0].evaluator.characteristics))
+        return np.array(rows).reshape(-1, self._encounters.shape[1])
 
     def limits(self) -> list[AloneLimit]:
         return [each.limit() for each in self.ends] or [
@@ -190,6 +202,23 @@ def _move_before(ends: Sequence[_Ends], model: Model, encounters: FloatArray, nu
     of_each = np.split(robustness, np.cumsum([*map(len, settings)])[:-1])
     failures = [rows[values < 0] for rows, values in zip(settings, of_each, strict=True)]
     return _move(ends, model, failures)
+
+
+def _move_between(ends: Sequence[_Ends], test: MovingTest) -> bool:
+    """Move ends before what fails between a test's points at the ends themselves; whether one has
+    moved.
+    """
+    vehicles = [_settings_within(each, test.original[np.newaxis], 2) for each in ends]
+    rng = Stream.TESTS_BETWEEN.generator(test.model.evaluator.study.search.seed)
+    settings = [test.spread(rows, rng) for rows in vehicles]
+    robustness = test.robustness(np.concatenate(settings), ALONE_STAGE)
+    is_unsafe = np.split(robustness < 0, np.cumsum([*map(len, settings)])[:-1])
+    has_moved = False
+    for each, rows, fails in zip(ends, settings, is_unsafe, strict=True):
+        if fails.any():
+            model, failures = test.failures(rows[fails])
+            has_moved |= _move([each], model, [failures])
+    return has_moved
 
 
 def _settings_within(ends: _Ends, encounters: FloatArray, number: int) -> FloatArray:

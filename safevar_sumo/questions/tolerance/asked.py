@@ -36,6 +36,8 @@ class Asked(NamedTuple):
         Number of simulations that search for a counterexample.
     is_quick
         Whether the answer is rough, so that no limit is called kept.
+    at_tests
+        Whether limits hold at the points of the study's tests alone, and not between them.
     """
 
     subject: Study | Case
@@ -49,6 +51,12 @@ class Asked(NamedTuple):
     fits: int | None
     budget: int
     is_quick: bool = False
+    at_tests: bool = False
+
+    @property
+    def drives_between(self) -> bool:
+        """Whether limits are falsified between the tests of a matrix."""
+        return self.budget > 0 and not self.at_tests
 
     @property
     def may_keep(self) -> bool:

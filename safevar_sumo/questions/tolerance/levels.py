@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.questions.between import with_random_places
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, enough
-from safevar_sumo.questions.models import Model, Models, judges_of, models_of, with_points_between
+from safevar_sumo.questions.models import Model, Models, judges_of, models_of
 from safevar_sumo.questions.reach import Reach, falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch, Beyond
@@ -184,12 +185,15 @@ class LevelSearch:
             return Level(value, None, models)
         judges, *further = [self._judges(models, low, value, count) for count in range(POINT_SETS)]
         inside = self._inside(known, own.evaluator)
-        search = AloneSearch(scans, self.columns, judges, numbers[1])
+        search = AloneSearch(scans, self.columns, judges[0], numbers[1])
         search.meet([own], inside)
+        for model in judges:
+            search.add(model)
         whole = self.models(None, value) if self.is_searched else None
-        search.run(
-            self.budget, [model for each in further for model in each if model not in judges], whole
-        )
+        others = [model for each in further for model in each if model not in judges]
+        while search.recheck([*judges, *others] if others else []):
+            pass
+        search.attack(judges if whole is None else whole.members, self.budget)
         alone = search.limits()
         if before is not None and before.alone is not None:
             alone = [
@@ -232,9 +236,7 @@ class LevelSearch:
         if not self.budget or self.whole is not None:
             return models.members
         cells = cells_between(self.evaluator.study, self.by, low, high)
-        return [
-            with_points_between(model, self.unsafe, count, cells)[0] for model in models.members
-        ]
+        return [with_random_places(model, self.unsafe, cells, count) for model in models.members]
 
     def up_to(self, value: float, settings: FloatArray) -> FloatArray:
         """Those of M settings, shape (M, n), whose encounter is up to a value of the searched

@@ -13,10 +13,11 @@ from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
+from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import USUAL_BUDGET
-from safevar_sumo.questions.models import Models, models_of, with_points_between
+from safevar_sumo.questions.models import Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
@@ -37,7 +38,7 @@ from safevar_sumo.questions.tolerance.scans import (
     OneAtATimeScan,
     scan,
 )
-from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether
 from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
 from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences, why_not_kept
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
@@ -76,7 +77,8 @@ POINTS: Columns = {
 }
 OF_BOX = (
     *("box", "samples", "failures", "at_most", "not_simulated"),
-    *("fits", "fits_tried", "attacked", "attacked_at_worst_points", "least_attacked"),
+    *("fits", "fits_tried", "attacked", "attacked_at_worst_points", "attacked_between"),
+    "least_attacked",
 )
 """Numbers about joint limits."""
 MAX_REFUTED = 4
@@ -133,17 +135,12 @@ def find_limits(asked: Asked) -> FoundLimits:
     models = Models.own_alone(evaluator, asked.unsafe)
     if is_sought and is_safe:
         models = models_of(evaluator, asked.unsafe, asked.fits)
-    # Limits alone also hold at points between those of the study's matrix.
-    judges = [*models.members]
-    if is_sought and asked.budget:
-        judges = [with_points_between(model, asked.unsafe, 0)[0] for model in models.members]
-    search_alone = AloneSearch(scans, asked.columns, judges)
-    encounters = 1 + len(evaluator.critical_encounters)
-    with evaluator.stage(ALONE_STAGE, len(judges) * VALUES * len(asked.columns) * encounters):
-        search_alone.run(asked.budget)
+    search_alone = AloneSearch(scans, asked.columns, models.own)
     together = None
     if is_sought and is_safe:
         together = _find_together(asked, scans, models, search_alone)
+    else:
+        search_alone.add(models.own)
     return FoundLimits(scans, models, search_alone.limits(), together)
 
 
@@ -152,23 +149,37 @@ def _find_together(
 ) -> LimitsTogether:
     """The joint limits, which hold nothing that the search of limits alone met, and the other way
     round: limits alone end before failures that the search of joint limits met.
+
+    One parameter set after another moves both in, so that they do not depend on those that follow.
     """
     members = asked.evaluator.characteristics
     columns = [*asked.columns, *np.flatnonzero(~members.of_vehicle).tolist()]
     everywhere = {
         item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
     }
-    limits = {**asked.limits, **everywhere}
-    known = [asked.unsafe_solutions, _unsafe_alone(asked, scans)]
-    for _ in range(MAX_REFUTED):
-        unsafe_settings = np.concatenate([*known, search_alone.failures])
-        together = find_limits_together(
-            models, columns, limits, scans, unsafe_settings, asked.budget
-        )
-        search_alone.meet(together.searched, together.failures_alone)
-        if together.box is None or not together.box.holds(search_alone.failures).any():
-            return together
-    return together._replace(box=None)
+    tests = {
+        model.fit: moving_tests(model, asked.unsafe) if asked.drives_between else []
+        for model in models.members
+    }
+    joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget)
+    known = np.concatenate([asked.unsafe_solutions, _unsafe_alone(asked, scans)])
+    encounters = 1 + len(asked.evaluator.critical_encounters)
+    for model in models.members:
+        with asked.evaluator.stage(ALONE_STAGE, VALUES * len(asked.columns) * encounters):
+            search_alone.add(model, tests[model.fit])
+            search_alone.attack([model], asked.budget)
+        for _ in range(MAX_REFUTED):
+            if model.fit == 0:
+                joint.find(scans, np.concatenate([known, search_alone.failures]))
+            else:
+                joint.cut(model, search_alone.failures)
+            search_alone.meet(joint.met, joint.found.failures_alone)
+            box = joint.found.box
+            if box is None or not box.holds(search_alone.failures).any():
+                break
+        else:
+            joint.give_up()
+    return joint.found
 
 
 def answer_limits(asked: Asked) -> Answer:
@@ -181,7 +192,7 @@ def answer_limits(asked: Asked) -> Answer:
     contacts = None
     if together is not None and asked.budget and len(evaluator.characteristics.scenario):
         contacts = contacts_left_out(models.members, [together.box or together.specified])
-    scope = scope_of(study, between=asked.budget > 0)
+    scope = scope_of(study, between=asked.drives_between)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
     if not asked.may_keep:
         rows = rows.without_kept()
@@ -311,10 +322,13 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
 def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
     """A row of `FITS` for each parameter set."""
     states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
-    states |= dict.fromkeys(models.left_out, "left out")
-    return [
-        (fit, state, together.corners.get(fit, np.nan)) for fit, state in sorted(states.items())
-    ]
+    states |= {model.fit: "left out" for model in models.left_out}
+    corners = {
+        model.fit: model.unsafe.value(together.validations[model.fit].corners)
+        for model in together.members
+        if model.fit in together.validations
+    }
+    return [(fit, state, corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
 
 
 def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:

@@ -206,9 +206,8 @@ def _broken_in_words(
         value = end if failure is None else failure.setting[members.names.index(item.name)]
         return f"{item.name} {limit_text(item, value)}: {words} (outside by {limit_text(item, by)})"
     assert together is not None
-    fits = {model.fit: model for model in models}
-    fit, setting = next(iter(together.broken.items()))
-    found = describe(fits[fit], {item.name: setting}, together.specified)
+    model, setting = next(iter(together.broken.values()))
+    found = describe(model, {item.name: setting}, together.specified)
     words = found[item.name].words if found else "the car is unsafe"
     specified_value = next(value for value in specified if value is not None)
     return f"{item.name} {limit_text(item, specified_value)}: with all specified limits, {words}"

@@ -1,5 +1,5 @@
-"""Joint limits: a box that holds in all parameter sets, under falsification, and of which no limit
-can move out.
+"""Joint limits: the largest box that holds with the study's own parameter set, under falsification,
+which each other set in turn cuts.
 """
 
 from __future__ import annotations
@@ -9,14 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import Falsification, enough, falsify
-from safevar_sumo.questions.models import Model, Models, judges_of
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, enough
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
-from safevar_sumo.questions.tolerance.validation import Validation, Validator
+from safevar_sumo.questions.tolerance.validation import KNOWN_BETWEEN, Validation, Validator
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
@@ -27,6 +29,16 @@ box that passes.
 MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that
 limits move out.
+"""
+MAX_CUTS = 40
+"""Largest number of times that the failures with one parameter set are cut off a box."""
+OTHER_SHARE = 0.2
+"""Share of a falsification's simulations with which one meets another parameter set, and each test
+that moves, though never less than `LEAST_SIMULATIONS`.
+"""
+CONFIRMATIONS, CONFIRMATIONS_OF_SET = 3, 1
+"""Number of further falsifications of the box that is to be printed with the study's own parameter
+set, and with another one.
 """
 SPECIFICATION_POINTS = 256
 """Number of Sobol points, and of corners, at which specified limits are tested, all others as in
@@ -45,58 +57,60 @@ class LimitsTogether(NamedTuple):
     members
         The models in which the box holds.
     broken
-        Numbers of the parameter sets in which the specified limits themselves are unsafe, and the
-        worst setting of each.
+        By the number of a parameter set in which the specified limits themselves are unsafe, the
+        worst setting and the model at the points where it is.
     room
         Which characteristics could have room, shape (n,): those that vary and have no limit on both
         sides.
     searched
-        The models that the search of the box had to survive, then all others in which it was
-        tested.
+        The models that the search of the box had to survive.
     failures_alone
         Unsafe settings that were met, in which one characteristic is changed, shape (K, n).
     box
         The limits as printed; None if none were found.
-    proof, falsification, at_all_points
-        Of the box; the last is the number of simulations of the falsification that met all points
-        of a matrix.
-    least
-        The least that the falsification found [m]: over all parameter sets, and with the study's
-        own.
-    between, between_left_out
-        Numbers of points between those of the study's matrix that the falsification met, and of
-        those that do not count.
+    proof
+        The upper bound of the box's unsafe share, with the study's own parameter set.
+    validations
+        What the box passed with each parameter set, by the set's number.
     boxes
         Number of boxes that were tried.
     beyond
         By side and column, an unsafe setting just beyond the box; all its other values are in the
         box.
-    corners
-        The least that the corners keep with each parameter set [m].
     """
 
     specified: Box
     members: tuple[Model, ...]
-    broken: Mapping[int, FloatArray]
+    broken: Mapping[int, tuple[Model, FloatArray]]
     room: BoolArray
     searched: tuple[Model, ...]
     failures_alone: FloatArray
     box: Box | None = None
     proof: Proof | None = None
-    falsification: Falsification | None = None
-    at_all_points: int = 0
-    least: tuple[float, float] = (np.nan, np.nan)
-    between: int = 0
-    between_left_out: int = 0
+    validations: Mapping[int, Validation] = {}
     boxes: int = 0
     beyond: Mapping[tuple[int, int], FloatArray] = {}
-    corners: Mapping[int, float] = {}
+
+    @property
+    def least(self) -> tuple[float, float]:
+        """The least that the falsification found [m]: over all parameter sets, and with the study's
+        own; undefined without one.
+        """
+        own = self.members[0].unsafe
+        values = {
+            model.fit: model.unsafe.value(self.validations[model.fit].least)
+            for model in self.members
+            if model.fit in self.validations and np.isfinite(self.validations[model.fit].least)
+        }
+        return own.worst(values.values(), default=np.nan), values.get(0, np.nan)
 
     @property
     def numbers(self) -> JsonObject:
         """What an answer says of them in numbers."""
         proof = self.proof
-        found = self.falsification
+        passed = [*self.validations.values()] if self.box is not None else []
+        attacked = sum(each.attacked for each in passed) if passed else None
+        at_all_points = sum(each.at_all_points for each in passed)
         return {
             "box": self.box is not None,
             "samples": None if proof is None else proof.samples,
@@ -104,32 +118,43 @@ class LimitsTogether(NamedTuple):
             "at_most": None if proof is None else proof.at_most,
             "not_simulated": None if proof is None else proof.not_simulated,
             "fits": len(self.members),
-            "attacked": None if found is None else self.at_all_points,
-            "attacked_at_worst_points": (
-                None if found is None else found.simulated - self.at_all_points
-            ),
-            "least_attacked": None if found is None else self.least[0],
+            "attacked": None if attacked is None else at_all_points,
+            "attacked_at_worst_points": None if attacked is None else attacked - at_all_points,
+            "attacked_between": None if not passed else sum(each.between for each in passed),
+            "least_attacked": self.least[0] if passed else None,
             "boxes": int(self.box is not None),
         }
 
 
-def broken_specification(specified: Box, models: Sequence[Model]) -> dict[int, FloatArray]:
-    """The worst setting of specified limits in each parameter set in which they are unsafe."""
+def broken_specification(
+    specified: Box, models: Sequence[Model], tests: Mapping[int, Sequence[MovingTest]]
+) -> dict[int, tuple[Model, FloatArray]]:
+    """The worst setting of specified limits in each parameter set in which they are unsafe, and the
+    model at the points where it is: those of the study, or between those of its `tests`.
+    """
+    stage = "specified limits with each parameter set"
     seed = models[0].evaluator.study.search.seed
-    settings = np.concatenate(
-        [
-            specified.corners(seed, 0)[:MAX_CORNERS],
-            specified.spread_and_corners(SPECIFICATION_POINTS, seed),
-        ]
-    )
+    corners = specified.corners(seed, 0)[:MAX_CORNERS]
+    settings = np.concatenate([corners, specified.spread_and_corners(SPECIFICATION_POINTS, seed)])
     settings = np.unique(settings, axis=0)
-    models = [model for model in models if not _keeps_its_margin(specified, model)]
-    judges = judges_of(models, "specified limits with each parameter set")
-    # Every setting meets each model once.
-    known = [settings] * len(models)
-    total = len(models) * len(settings)
-    found = falsify(specified, judges, known, total, np.random.default_rng(seed))
-    return {models[judge].fit: rows[0] for judge, rows in found.failures.items()}
+    broken = dict[int, tuple[Model, FloatArray]]()
+    for model in models:
+        if _keeps_its_margin(specified, model):
+            continue
+        robustness = model.robustness(settings, stage)
+        if robustness.min() < 0:
+            broken[model.fit] = model, settings[np.argmin(robustness)]
+            continue
+        worst = settings[np.argsort(robustness, kind="stable")[:KNOWN_BETWEEN]]
+        rng = Stream.SPECIFIED_BETWEEN.generator(seed, model.fit)
+        for test in tests[model.fit]:
+            between = test.spread(worst, rng)
+            robustness = test.robustness(between, stage)
+            if robustness.min() < 0:
+                at_encounter, vehicles = test.failures(between[[np.argmin(robustness)]])
+                broken[model.fit] = at_encounter, vehicles[0]
+                break
+    return broken
 
 
 def _keeps_its_margin(specified: Box, model: Model) -> bool:
@@ -144,59 +169,202 @@ def _keeps_its_margin(specified: Box, model: Model) -> bool:
     return model.unsafe.is_collision and model.unsafe.keep <= model.evaluator.study.scenario.margin
 
 
-def find_limits_together(
-    models: Models,
-    columns: Sequence[int],
-    limits: Mapping[str, Limit],
-    scans: Sequence[OneAtATimeScan],
-    unsafe_settings: FloatArray,
-    budget: int,
-) -> LimitsTogether:
-    """The largest box by relative volume in which `columns` vary, in which those of `limits` reach
-    their limits, and that holds none of `unsafe_settings`, shape (K, n).
+class JointSearch:
+    """The search for the largest box by relative volume in which `columns` vary, in which those of
+    `limits` reach their limits: it is found with the study's own parameter set, and each further
+    set cuts it.
+
+    Attributes
+    ----------
+    found
+        What was found so far.
+    met
+        The models that the last search had to survive.
 
     Notes
     -----
     A random search seeks the largest box that is safe at known corners, within what is safe alone.
     Causes of what is unsafe, as few changes as possible, are further corners, and the box is sought
-    anew until no search finds anything. Then some corners, and a search for counterexamples with
-    `budget` simulations over all parameter sets, test it. What they find becomes part of what later
-    boxes must survive, in that set; after `EXPLORED` boxes, failures are only cut off. Of a box
-    that passes, each limit moves out as far as it can go, at most `MAX_GROWTHS` times, and what
-    fails then is cut off until a box passes. The last box has to pass further searches for
-    counterexamples, all corners with each parameter set, and settings drawn at random. After
-    `MAX_BOXES` boxes or `MAX_SIMULATIONS` simulations the largest that passed is the last, or none
-    is found.
+    anew until no search finds anything. Then some corners, and a search for counterexamples, test
+    it: between the tests of a matrix and at them. What they find becomes part of what later boxes
+    must survive; after `EXPLORED` boxes, failures are only cut off. Of a box that passes, each
+    limit moves out as far as it can go, at most `MAX_GROWTHS` times, and what fails then is cut off
+    until a box passes. The last box has to pass further searches for counterexamples, all corners,
+    and settings drawn at random. After `MAX_BOXES` boxes or `MAX_SIMULATIONS` simulations the
+    largest that passed is the last, or none is found.
+
+    A further parameter set meets the box with corners and searches of its own, and what fails is
+    cut off. Nothing moves out any more, and nothing depends on sets that follow: with more sets,
+    limits are never wider.
     """
-    search, nothing = _open_search(models, columns, limits, unsafe_settings)
-    if models.own.fit in nothing.broken:
-        return nothing
-    boxes = _Boxes(search, _start_of(search, columns, scans), models.own.evaluator)
-    validator = Validator(nothing.members, enough(budget), models.own.evaluator)
-    for number in range(1, MAX_BOXES + 1):
-        box = boxes.next(number)
-        if box is None:
-            break
-        simulated = sum(model.evaluator.simulated for model in nothing.members)
-        is_over = number == MAX_BOXES or simulated > MAX_SIMULATIONS
-        # A box that is no larger than the one that passed ends the search, if that one passes all
-        # other tests.
-        passed = boxes.passed
-        is_last = passed is not None and (is_over or boxes.is_no_larger(box))
-        if passed and is_last:
-            validation = validator.complete(passed, number)
-        else:
-            validation = validator.validate(box, number)
-        if validation.failures:
-            boxes.refuse(validation)
-            if is_over and boxes.passed is None:
+
+    def __init__(
+        self,
+        models: Models,
+        tests: Mapping[int, Sequence[MovingTest]],
+        columns: Sequence[int],
+        limits: Mapping[str, Limit],
+        budget: int,
+    ) -> None:
+        self.own = models.own._replace(
+            evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0)
+        )
+        self._tests = tests
+        self._columns = columns
+        self._limits = limits
+        self._budget = enough(budget)
+        self._search = BoxSearch(self.own, columns, limits, _nothing(self.own))
+        specified = self._search.printed(self._search.fixed)
+        self.found = LimitsTogether(
+            specified,
+            (self.own,),
+            broken_specification(specified, models.members, tests),
+            np.asarray(self._search.is_free.any(axis=0)),
+            (self.own,),
+            self._search.failures_alone,
+        )
+        self.met: Sequence[Model] = ()
+        self._validators = list[Validator]()
+        """Of the study's own set, then of those in which something failed."""
+
+    def find(self, scans: Sequence[OneAtATimeScan], unsafe_settings: FloatArray) -> None:
+        """Search the largest box with the study's own set that holds none of `unsafe_settings`,
+        shape (K, n).
+        """
+        nothing = self.found._replace(box=None)
+        if self.own.fit in nothing.broken:
+            return
+        # Points at which nothing fails cost as much as the others; the test of a box adds those at
+        # which it fails.
+        first = self.own
+        if len(unsafe_settings):
+            first = self.own.at_worst_points(unsafe_settings, "worst points")
+        search = BoxSearch(first, self._columns, self._limits, unsafe_settings)
+        self._search = search
+        boxes = _Boxes(search, _start_of(search, self._columns, scans), self.own.evaluator)
+        validator = self._validator(self.own, self._budget)
+        self._validators = [validator]
+        for number in range(1, MAX_BOXES + 1):
+            box = boxes.next(number)
+            if box is None:
                 break
-        elif is_last:
-            return _result(nothing, boxes.extension, validation, number)
+            is_over = number == MAX_BOXES or self.own.evaluator.simulated > MAX_SIMULATIONS
+            # A box that is no larger than the one that passed ends the search, if that one passes
+            # all other tests.
+            passed = boxes.passed
+            is_last = passed is not None and (is_over or boxes.is_no_larger(box))
+            if passed and is_last:
+                validation = validator.complete(passed, number, CONFIRMATIONS)
+                if not validation.failures:
+                    validation = validator.prove(validation, number)
+            else:
+                validation = validator.validate(box, number)
+            if validation.failures:
+                boxes.refuse(validation)
+                if is_over and boxes.passed is None:
+                    break
+            elif is_last:
+                nothing = nothing._replace(
+                    box=validation.box, proof=validation.proof, validations={0: validation}
+                )
+                break
+            else:
+                boxes.accept(validation, may_grow=not is_over)
+        self.found = nothing._replace(boxes=number)
+        self._note(search.models)
+
+    def cut(self, model: Model, unsafe_settings: FloatArray) -> None:
+        """Cut the box until it holds with a further parameter set, too, and holds none of
+        `unsafe_settings`, shape (K, n).
+        """
+        outer = self.found.box
+        if model.fit in self.found.broken or outer is None:
+            return
+        search = self._search
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_settings])
+        validator = self._validator(model, budget_of_set(self._budget))
+        extension = Extension(search)
+        met = list[Model]()
+        for attempt in range(MAX_CUTS):
+            box = extension.cut(outer, attempt)
+            validation, proof = self._pass(validator, box, attempt)
+            if not validation.failures:
+                passed = {**self.found.validations, model.fit: validation}
+                members = self.found.members
+                if model.fit not in [member.fit for member in members]:
+                    members = (*members, model)
+                self.found = self.found._replace(
+                    members=members, box=box, proof=proof, validations=passed
+                )
+                break
+            met += [failures.model for failures in validation.failures]
+            _learn(search, validation, self.own.evaluator)
+            if validator not in self._validators:
+                self._validators.append(validator)
         else:
-            boxes.accept(validation, may_grow=not is_over)
-    searched = (*nothing.members, *search.models)
-    return nothing._replace(boxes=number, searched=searched, failures_alone=search.failures_alone)
+            self.found = self.found._replace(box=None)
+        self.found = self.found._replace(boxes=self.found.boxes + attempt + 1)
+        self._note([validator.model, *met])
+
+    def give_up(self) -> None:
+        """Leave no joint limits."""
+        self.found = self.found._replace(box=None)
+
+    def _pass(
+        self, validator: Validator, box: Box, attempt: int
+    ) -> tuple[Validation, Proof | None]:
+        """Test a box with a further parameter set; where it is smaller than the one before, also in
+        the sets in which something failed: its corners are new to them.
+        """
+        validation = validator.validate(box, attempt)
+        if not validation.failures:
+            validation = validator.complete(validation, attempt, CONFIRMATIONS_OF_SET)
+        proof = self.found.proof
+        if validation.failures or box is self.found.box:
+            return validation, proof
+        for other in self._validators:
+            rechecked = other.recheck(box, attempt)
+            if rechecked.failures:
+                return rechecked, proof
+        proved = self._validators[0].prove(Validation(box), attempt)
+        return validation._replace(failures=proved.failures), proved.proof
+
+    def _validator(self, model: Model, budget: int) -> Validator:
+        budgets = budget, budget_of_set(budget) if model.fit == 0 else budget
+        return Validator(model, self._tests[model.fit], budgets, self.own.evaluator)
+
+    def _note(self, models: Sequence[Model]) -> None:
+        """Note what was met, and what is beyond the box."""
+        self.met = models
+        box = self.found.box
+        search = self._search
+        if box is not None and not _has_room(search, box):
+            self.found = self.found._replace(box=None)
+        self.found = self.found._replace(
+            searched=(*self.found.searched, *models),
+            failures_alone=search.failures_alone,
+            beyond={} if box is None else Extension(search).beyond(box),
+        )
+
+
+def budget_of_set(budget: int) -> int:
+    """Number of simulations of a falsification with another parameter set, or in a test that
+    moves.
+    """
+    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS) if budget else 0
+
+
+def _nothing(model: Model) -> FloatArray:
+    return np.zeros((0, len(model.evaluator.characteristics)))
+
+
+def _learn(search: BoxSearch, validation: Validation, evaluator: Evaluator) -> None:
+    """Take failures, and the models in which they are, into a search."""
+    with evaluator.stage(SEARCH_STAGE):
+        for failures in validation.failures:
+            search.join(failures.model)
+            search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+            search.learn(failures.settings, failures.model)
 
 
 class _Boxes:
@@ -244,11 +412,7 @@ class _Boxes:
     def refuse(self, validation: Validation) -> None:
         """Take failures, and the models in which they are, into the search."""
         search = self.search
-        with self._evaluator.stage(SEARCH_STAGE):
-            for failures in validation.failures:
-                search.join(failures.model)
-                search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
-                search.learn(failures.settings, failures.model)
+        _learn(search, validation, self._evaluator)
         if self.passed and len(search.unsafe_inside(search.sides_of(self.passed.box))):
             self.passed = None
         self._failed += 1
@@ -262,27 +426,6 @@ class _Boxes:
             self._growths -= 1
             with self._evaluator.stage(SEARCH_STAGE):
                 self._outer = self.extension.of(validation.box)
-
-
-def _open_search(
-    models: Models, columns: Sequence[int], limits: Mapping[str, Limit], unsafe_settings: FloatArray
-) -> tuple[BoxSearch, LimitsTogether]:
-    """The search for a box, and the answer before it: the specified limits, and the parameter sets
-    in which they are unsafe.
-    """
-    own = models.own._replace(
-        evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0)
-    )
-    # Points at which nothing fails cost as much as the others; the test of a box adds those at
-    # which it fails.
-    first = own.at_worst_points(unsafe_settings, "worst points") if len(unsafe_settings) else own
-    search = BoxSearch(first, columns, limits, unsafe_settings)
-    specified = search.printed(search.fixed)
-    broken = broken_specification(specified, models.members)
-    members = tuple(model for model in (own, *models.members[1:]) if model.fit not in broken)
-    room = np.asarray(search.is_free.any(axis=0))
-    nothing = LimitsTogether(specified, members, broken, room, members, search.failures_alone)
-    return search, nothing
 
 
 def _start_of(
@@ -305,47 +448,6 @@ def _start_of(
         corner[column] = -1.0 if low_degree < high_degree else 1.0
     search.corners.append(corner)
     return start
-
-
-def _result(
-    nothing: LimitsTogether, extension: Extension, validation: Validation, number: int
-) -> LimitsTogether:
-    """The joint limits from a box that passed its validation; a box that leaves no characteristic
-    any room is none.
-    """
-    search = extension.search
-    box = validation.box
-    least = [np.nan, np.nan]
-    if validation.falsification is not None:
-        found = validation.falsification
-        models = [validation.models[judge] for judge in found.judges]
-        values = [
-            model.unsafe.value(robustness)
-            for model, robustness in zip(models, found.robustness.tolist(), strict=True)
-        ]
-        of_own = [value for value, model in zip(values, models, strict=True) if model.fit == 0]
-        worst = nothing.members[0].unsafe.worst
-        least = [worst(values, default=np.nan), worst(of_own, default=np.nan)]
-    points = [
-        len(model.evaluator.study.matrix.tests)
-        for model in validation.models[:1]
-        if model.evaluator.study.matrix
-    ]
-    own_tests = nothing.members[0].evaluator.study.matrix
-    return nothing._replace(
-        box=box if _has_room(search, box) else None,
-        proof=validation.proof,
-        falsification=validation.falsification,
-        at_all_points=validation.at_all_points,
-        least=(least[0], least[1]),
-        between=sum(points) - (len(own_tests.tests) if own_tests else 0),
-        between_left_out=validation.left_out,
-        boxes=number,
-        beyond=extension.beyond(box),
-        corners=validation.corners,
-        searched=(*nothing.members, *search.models, *validation.models),
-        failures_alone=search.failures_alone,
-    )
 
 
 def _has_room(search: BoxSearch, box: Box) -> bool:

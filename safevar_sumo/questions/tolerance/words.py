@@ -4,12 +4,12 @@ which scope.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
-from safevar_sumo.questions.counterexamples import limit_text
+from safevar_sumo.questions.counterexamples import describe, limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
@@ -117,11 +117,6 @@ def tested_sentences(
             f"Of the encounters over the domain {share} do not count, because the original vehicle"
             f" itself keeps less than {study.scenario.margin:g} m in them."
         )
-    if models.left_out:
-        yield (
-            f"These parameter sets were left out, because the original vehicle itself is unsafe in"
-            f" them or keeps too little: {fit_names(models.left_out)}."
-        )
     if together is not None and together.box is not None:
         yield validation_in_words(together, budget)
         if together.proof is not None:
@@ -176,12 +171,17 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
     if not asked.budget:
         decision = "The joint limits below were tested at their corners alone, and hold there"
     yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
+    for model in models.left_out:
+        # Its words name the test and the parameter set.
+        described = describe(model, {"": model.evaluator.characteristics.original})
+        words = described[""].words if described else f"parameter set {model.fit} is unsafe"
+        yield f"With the original vehicle itself {words}: there no limit is claimed."
     yield from one_set_in_words(models.members, models.left_out)
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
 
 
-def one_set_in_words(members: Sequence[Model], left_out: Collection[int]) -> Iterator[str]:
+def one_set_in_words(members: Sequence[Model], left_out: Sequence[Model]) -> Iterator[str]:
     """That limits hold in one parameter set alone though the study has others, in a sentence."""
     if len(members) == 1 and not left_out and members[0].evaluator.study.spread:
         yield (
@@ -221,15 +221,20 @@ def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
     """The falsification: `20,000 simulations that search for a counterexample (smallest clearance
     0.36 m)`.
     """
-    if together.falsification is None or not budget:
+    passed = [*together.validations.values()]
+    if not passed or not budget:
         return "no search for a counterexample"
-    number = together.falsification.simulated
+    number = sum(each.attacked for each in passed)
+    at_all_points = sum(each.at_all_points for each in passed)
     simulated = f"{number:,} simulations that search for a counterexample"
-    if together.at_all_points < number:
+    if at_all_points < number:
         simulated += (
-            f", {together.at_all_points:,} of them at all points and the others at those that"
-            " were the worst for some vehicle"
+            f", {at_all_points:,} of them at all points and the others at those that were the worst"
+            " for some vehicle"
         )
+    between = sum(each.between for each in passed)
+    if between:
+        simulated += f", and {between:,} between the points of the tests"
     least, own = together.least
     unsafe = together.members[0].unsafe
     if not abs(least) < float("inf"):
@@ -242,15 +247,7 @@ def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
         of_own = (
             f", {unsafe.value_in_words(own).partition(' ')[2]} with the study's own parameter set"
         )
-    between = ""
-    if together.between:
-        between = f", also at {number_of(together.between, 'point')} between those of the study"
-        if together.between_left_out:
-            between += (
-                f" ({together.between_left_out} more left out, where the original vehicle keeps too"
-                " little)"
-            )
-    return f"{simulated} (the worst {worst}{of_own}){between}"
+    return f"{simulated} (the worst {worst}{of_own})"
 
 
 def _sampled_in_words(together: LimitsTogether) -> str:
