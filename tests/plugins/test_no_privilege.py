@@ -38,8 +38,11 @@ FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 """Those that are copied in every run of the tests; all others are slow together."""
 
 
-def each(names: Iterable[str]) -> list[Any]:
-    return [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in names]
+def each(names: Iterable[str], *others: str) -> list[Any]:
+    return [
+        pytest.param(name, *others, marks=() if name in FAST else pytest.mark.slow)
+        for name in names
+    ]
 
 
 def copied(model: Any, folder: Path) -> str:
@@ -141,31 +144,23 @@ def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_
     assert names[0] == names[1] != []
 
 
-@pytest.mark.parametrize("name", each(VEHICLES))
-def test_a_vehicle_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
+@pytest.mark.parametrize(("name", "table"), [*each(VEHICLES, "vehicle"), *each(ADS, "ads")])
+def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
+    name: str, table: str, in_tmp: Path
+) -> None:
     base = next(
-        study
-        for study in ("sun", "lgsvl", "native", "wear")
-        if load_study(study).vehicle.model == name
-    )
-    ours = load_study(base, matrix=None)
-    vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES[name], in_tmp))
-    assert_equal(ours, msgspec.structs.replace(ours, vehicle=vehicle))
-
-
-@pytest.mark.parametrize("name", each(ADS))
-def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
-    base = next(
-        (one for one in ("sun", "lgsvl", "native", "wear") if load_study(one).ads.model == name),
+        (
+            one
+            for one in ("sun", "lgsvl", "native", "wear")
+            if getattr(load_study(one), table).model == name
+        ),
         None,
     )
-    parameters = {} if base is None else load_study(base).ads.parameters
-    own = copied(ADS[name], in_tmp)
-    ours, theirs = (
-        load_study(base or "wear", matrix=None, ads={"model": model, "parameters": parameters})
-        for model in (name, own)
+    ours = load_study(base or "wear", matrix=None, **{} if base else {table: {"model": name}})
+    own = msgspec.structs.replace(
+        getattr(ours, table), model=copied({**VEHICLES, **ADS}[name], in_tmp)
     )
-    assert_equal(ours, theirs)
+    assert_equal(ours, msgspec.structs.replace(ours, **{table: own}))
 
 
 @pytest.mark.slow

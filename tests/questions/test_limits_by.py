@@ -29,7 +29,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import at_point, drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
-from tests.in_process import InlinePool, run
+from tests.in_process import InlinePool, json_of
 from tests.manual import ROOT, files_of
 from tests.questions.conftest import made_up_study
 
@@ -211,23 +211,11 @@ def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(
 ) -> None:
     study = load_study("wear")
     picture = tmp_path / "by.png"
-    names = (
-        "--characteristics",
-        "brakeTorque,sensorLatency",
-        "--fits",
-        "0",
-        "--attack",
-        "100",
-        "--jobs",
-        "2",
-    )
-    run("tolerance", "wear", "--by", "speed=20,35,40", *names, "--plot", str(picture))
+    asked = "--by speed=20,35,40 --characteristics brakeTorque,sensorLatency --fits 0 --attack 100"
+    answer = json_of("tolerance", "wear", *asked.split(), "--plot", str(picture))
     assert picture.stat().st_size > 10_000
-    answer = tolerance(
-        study, by="speed=20,35,40", fits=0, attack=100, jobs=2, characteristics=names[1].split(",")
-    )
     characteristics = CharacteristicSet.of(study)
-    rows = rows_of(answer)
+    rows = answer["tables"]["limits"]["rows"]
     assert [row["by_speed"] for row in rows] == [20, 35, 40] * 2
     for row in rows:
         column = characteristics.names.index(row["characteristic"])
@@ -240,7 +228,7 @@ def test_of_a_matrix_the_limits_hold_at_its_points_and_their_failures_are_named(
             ).matrix,
         )
         for result in simulate_all_points(assemble(up_to), settings):
-            assert result.evaluations.f_safe.min() >= answer.numbers["margin"], (
+            assert result.evaluations.f_safe.min() >= answer["numbers"]["margin"], (
                 row,
                 result.point.name,
             )
