@@ -16,6 +16,7 @@ from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import run
+from tests.made_up import original_of
 from tests.openscenario.writing import (
     AT_ONCE,
     at,
@@ -193,7 +194,7 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
     assert searched.outcome.tolist() == ["invalid-test", "stopped", "stopped", "collision"]
     for value, degree in list(zip(values, searched.f_safe, strict=True))[1:]:
         own = assemble(load_study("wear", scenario={"file": file, "values": {"v": value}}))
-        alone = drive_and_score(own, own.characteristics.original[np.newaxis])
+        alone = drive_and_score(own, original_of(own))
         assert alone.f_safe[0] == pytest.approx(degree, abs=1e-9)
 
 

@@ -163,24 +163,32 @@ def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
     assert_equal(ours, msgspec.structs.replace(ours, **{table: own}))
 
 
+def assert_same_solutions(ours: Study, theirs: Study, folder: Path) -> None:
+    """Searches of both find the same solutions; the name of a copied algorithm is another one."""
+    tables = [
+        load_runs(searched(study, folder / f"results{number}"))
+        .solutions.drop(columns=["algorithm", "handle"], errors="ignore")
+        .to_csv(index=False)
+        for number, study in enumerate((ours, theirs))
+    ]
+    assert tables[0] == tables[1]
+
+
+def short(study: str, algorithm: str) -> Study:
+    """A study with a short search by one algorithm."""
+    search = {"algorithms": [algorithm], "runs": 1, "population": 10, "evaluations": 40}
+    return load_study(study, search=search)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", each(ALGORITHMS))
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
 ) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
     (in_tmp / "named.py").write_text(f"from {module} import {class_}\n\n{name} = {class_}\n")
-    tables = []
-    for number, model in enumerate((name, f"named:{name}")):
-        search = {"algorithms": [model], "runs": 1, "population": 10, "evaluations": 40}
-        rows = load_runs(
-            searched(load_study("smoke", search=search), in_tmp / f"results{number}")
-        ).solutions
-        tables.append(
-            rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False)
-        )
-    assert tables[0] == tables[1]
+    assert_same_solutions(short("smoke", name), short("smoke", f"named:{name}"), in_tmp)
 
 
 def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> None:
@@ -254,15 +262,8 @@ def with_own_models(study: Study, folder: Path) -> Study:
 def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
 ) -> None:
-    ours = load_study(
-        name, search={"algorithms": ["nsga2"], "runs": 1, "population": 10, "evaluations": 30}
-    )
-    for number, study in enumerate((ours, with_own_models(ours, in_tmp))):
-        searched(study, in_tmp / f"results{number}")
-    solutions = [
-        (in_tmp / f"results{number}" / "solutions.csv").read_bytes() for number in range(2)
-    ]
-    assert solutions[0] == solutions[1]
+    ours = short(name, "nsga2")
+    assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool
+from tests.made_up import original_of
 from tests.questions.conftest import made_up_evaluator, made_up_study
 
 ONE_TEST = """
@@ -294,6 +295,6 @@ def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> No
         and dict(point.parameters).get("speed") == float(said[3])
         and dict(point.parameters).get("impact_location") == float(said[4])
     ]
-    runs = drive_and_score(system.at(named[0]), system.characteristics.original[np.newaxis])
+    runs = drive_and_score(system.at(named[0]), original_of(system))
     assert -runs.f_safe[0] == pytest.approx(float(said[1]), abs=0.005)
     assert "with the study's own parameter set" in answer.tables["limits"].attrs["title"]

@@ -213,9 +213,6 @@ def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.Monk
         pymoo_algorithm("pymoo:GA")
 
 
-MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
-
-
 def test_an_algorithm_may_come_later_but_not_with_another_pymoo(tmp_path: Path) -> None:
     study = with_pymoo(["nsga2"], evaluations=30)
     carried_out(study, tmp_path)
