@@ -15,6 +15,7 @@ that they compare is missing, and over runs if the solutions belong to no run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
@@ -136,10 +137,11 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         If there are no evaluations.
     """
     common = replace(case, solutions=nondominated_evaluations(case))
-    best = (
-        valid_evaluations(case, case.evaluations).groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
-    )
-    further = {(name, BEST): best[name] for name in best.index.unique("algorithm")}
+    valid = valid_evaluations(case, case.evaluations)
+    best = valid.groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
+    # A run without valid evaluations is worse than any other one.
+    best = best.reindex(pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf)
+    further = {(name, BEST): best[name] for name in case.algorithms}
     # The causes were counted among the solutions that the algorithms returned.
     return rq2_runs(common, choices._replace(causes={}), further)
 
@@ -356,6 +358,30 @@ def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> 
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
     return _values(case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs)
+
+
+def describe_runs_without_solutions(case: Case) -> str:
+    """Which algorithms have runs without solutions, and how these runs count, in sentences; "" if
+    no finished run is without solutions.
+    """
+    if not case.has_runs or case.solutions.empty:
+        return ""
+
+    # How many runs of each algorithm have solutions.
+    found = case.solutions.groupby("algorithm")["run"].nunique()
+    counts = [(name, found.get(name, 0), _finished_runs(case, name)) for name in case.algorithms]
+    texts = [
+        f"{case.title_of(name)} {number} of {runs}"
+        for name, number, runs in counts
+        if number < runs
+    ]
+    if not texts:
+        return ""
+    return (
+        f"{case.name}: runs with solutions: {', '.join(texts)}. The other runs count with"
+        " hypervolume 0, and as worst in IGD+, IGD and the best safety degree, so that a median may"
+        " be undefined. Means over solutions leave them out."
+    )
 
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:

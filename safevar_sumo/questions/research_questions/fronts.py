@@ -5,6 +5,7 @@ evaluations. Of all evaluations: the non-dominated ones, and the growth of their
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import moocore
@@ -16,6 +17,8 @@ from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
+NO_FRONT = (math.inf, 0.0, math.inf)
+"""IGD+, hypervolume and IGD of a run without solutions: worse than those of any other run."""
 REFERENCE_COORDINATE = 1.1
 """Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth
 beyond the nadir.
@@ -74,15 +77,13 @@ def reference_front(case: Case) -> FloatArray:
     """
     points = points_of(case, case.solutions)
     if not len(points):
-        raise UnanswerableError(
-            case.name, "has no solution", "results with at least one finished run"
-        )
+        raise UnanswerableError(case.name, "has no solution", "results with at least one solution")
     return nondominated_points(points)
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD+, hypervolume and IGD of every finished run that has solutions; index algorithm and run,
-    a column for each indicator.
+    """IGD+, hypervolume and IGD of every finished run; index algorithm and run, a column for each
+    indicator. A run without solutions has those of `NO_FRONT`.
 
     IGD is the mean Euclidean distance from each point of the reference front to the run's nearest
     point, in the objectives' units; IGD+ counts only the objectives in which this point is worse,
@@ -97,6 +98,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     scaled_reference = normalised(reference, reference)
     rows = {}
     for run, group in _frames_of_runs(case, case.solutions):
+        rows[run] = NO_FRONT
         if len(points := points_of(case, group)):
             scaled = normalised(points, reference)
             igd_plus = moocore.igd_plus(scaled, ref=scaled_reference)
@@ -107,8 +109,8 @@ def compute_indicators(case: Case) -> pd.DataFrame:
 
 
 def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
-    """The finished runs that have rows, each with its rows, in the study's order of algorithms;
-    raises UnanswerableError if there are none.
+    """The finished runs, each with its rows, in the study's order of algorithms; raises
+    UnanswerableError if none of them has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
@@ -116,7 +118,7 @@ def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, in
         raise UnanswerableError(
             case.name, "has no evaluations", "results with the journals of their runs"
         )
-    return [(run, groups[run]) for run in runs if run in groups]
+    return [(run, groups.get(run, frame[:0])) for run in runs]
 
 
 def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
