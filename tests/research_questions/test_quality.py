@@ -120,6 +120,20 @@ def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
     )
 
 
+def test_values_that_rounding_errors_distinguish_are_ties() -> None:
+    """Sums of multiples of 0.05 s in two orders, and their differences."""
+    x = [0.05 + 0.1 + 0.15, 0.1 + 0.2, 1.2, 2.35]
+    y = [0.15 + 0.1 + 0.05, 0.3, 1.0, 2.2]
+    assert len({*x, *y}) > len({0.3, 1.2, 2.35, 1.0, 2.2})
+    ties = [0.3, 0.3, 1.2, 2.35], [0.3, 0.3, 1.0, 2.2]
+    assert compare_samples(x, y) == compare_samples(*ties)
+    assert compare_samples(x, y).p_value == scipy.stats.mannwhitneyu(*ties).pvalue
+    steps = [1.35, 2.35, 0.45], [1.2, 2.2, 0.3]
+    assert len(np.unique(np.subtract(*steps))) > 1
+    assert signed_rank_test(*steps) == signed_rank_test([0.15, 0.15, 0.15])
+    assert signed_rank_test(x[:2], y[:2])[:2] == (1.0, 0.5)
+
+
 @pytest.mark.parametrize(
     ("effect", "name"),
     [

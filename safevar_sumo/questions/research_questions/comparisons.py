@@ -267,7 +267,7 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
         originals = _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.scenario.search else case.original[metric.name]
         test = (
-            signed_rank_test(values - originals)
+            signed_rank_test(values, originals.reindex(values.index))
             if over_runs
             else compare_samples(values, originals.dropna())
         )
