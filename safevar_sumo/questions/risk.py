@@ -9,6 +9,7 @@ Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics import F_SAFE, Unsafe
 from safevar_sumo.questions.answer import (
     HIGH,
     LOW,
@@ -54,6 +55,8 @@ RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
+RARE = 1e-4
+"""If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
 UNSURE = 0.5
 """Width of an interval of a share of the variance from which on the verdict says that it is unsure
 [-].
@@ -63,8 +66,11 @@ NO_PROBABILITY = (
 )
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
-OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
-"""What varies, by the beginning of the names of its columns."""
+OUTPUTS = ("degree", "unsafe")
+"""What varies: the criterion's measure, which is the safety degree for most criteria; and whether a
+vehicle is unsafe. The names of columns begin so.
+"""
+IS_UNSAFE = "whether the vehicle is unsafe"
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
@@ -130,10 +136,11 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
+    measure = _defined_measure(criterion, simulated)
     if model.is_correlated or model.region or study.scenario.search:
-        table = given_data_indices(evaluator, simulated, criterion, confidence)
+        table = given_data_indices(evaluator, simulated, criterion, measure, confidence)
     else:
-        table = sobol_indices(evaluator, model, criterion, confidence)
+        table = sobol_indices(evaluator, model, criterion, measure, confidence)
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -148,13 +155,12 @@ def risk(
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
         f"{NO_PROBABILITY if not study.variation else ''}"
+        f"{_bound_in_words(failures, high, total, confidence)}"
     )
     left_out = int(drawn.infeasible.sum())
-    if total + left_out < samples:
-        verdict += (
-            f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
-        )
-    verdict += deciding_in_words(table, failures)
+    if failed := samples - total - left_out:
+        verdict += f" {failed:,} vehicles could not be simulated and are left out."
+    verdict += _equality_in_words(simulated, measure) + deciding_in_words(table, failures, measure)
     remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
     verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
@@ -166,9 +172,46 @@ def risk(
     )
 
 
-def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
-    """Which characteristic has the largest share of the safety degree's variance, and which shares
-    are unsure.
+def _defined_measure(criterion: Unsafe, simulated: Evaluations) -> str:
+    """The criterion's measure; the safety degree if the measure is undefined for a vehicle, such as
+    one that collides.
+    """
+    is_defined = np.isfinite(simulated.column(criterion.measure)).all()
+    return criterion.measure if is_defined else F_SAFE.name
+
+
+def _in_words(measure: str) -> str:
+    return "the safety degree" if measure == F_SAFE.name else measure
+
+
+def _equality_in_words(simulated: Evaluations, measure: str) -> str:
+    """That nothing decides a measure that is the same in all vehicles; "" if it varies."""
+    if np.ptp(simulated.column(measure)):
+        return ""
+    same = f"All vehicles have the same value of {_in_words(measure)}"
+    return f" {same}, so no characteristic decides it."
+
+
+def _bound_in_words(failures: int, high: float, total: int, confidence: float) -> str:
+    """What a sample without an unsafe vehicle says, and how many vehicles would say more; "" if a
+    vehicle is unsafe. Clopper and Pearson's upper end of 0 of n is
+    1 - ((1 - confidence) / 2)^(1 / n).
+    """
+    if failures:
+        return ""
+    words = f" No vehicle is unsafe, so the share is at most {percentage(high)} %."
+    needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
+    if total >= needed:
+        return words
+    return (
+        f"{words} To show at most {percentage(RARE)} %, {needed:,} vehicles are needed of which"
+        " none is unsafe (--samples)."
+    )
+
+
+def deciding_in_words(table: pd.DataFrame, failures: int, measure: str = F_SAFE.name) -> str:
+    """Which characteristic has the largest share of a measure's variance, and which shares are
+    unsure.
     """
     if table.empty:
         return ""
@@ -181,18 +224,19 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     if np.isfinite(share):
         name = first["characteristic"]
         words = (
-            f" {name} decides most: it causes {100 * share:.0f} % of the variance of the safety"
-            f" degree ({100 * low:.0f} to {100 * high:.0f} %)."
+            f" {name} decides most: it causes {100 * share:.0f} % of the variance of"
+            f" {_in_words(measure)} ({100 * low:.0f} to {100 * high:.0f} %)."
         )
 
     # Shares that are too unsure.
     of_output = {
         name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
     }
+    in_words = dict(zip(OUTPUTS, (_in_words(measure), IS_UNSAFE), strict=True))
     for name, widths in of_output.items():
         if widths.max() > UNSURE:
             words += (
-                f" The shares for {OUTPUTS[name]} are uncertain: their intervals are up to"
+                f" The shares for {in_words[name]} are uncertain: their intervals are up to"
                 f" {100 * widths.max():.0f} percentage points wide."
             )
     if failures and of_output["unsafe"].isna().all():
@@ -223,11 +267,11 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
 
 
 def sobol_indices(
-    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float
+    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, measure: str, confidence: float
 ) -> pd.DataFrame:
     """Sobol indices, first order and total, of independent characteristics; undefined where nothing
     varies, or too few settings are unsafe or safe. Base points with a setting that could not be
-    simulated do not count.
+    simulated, or has no value of the measure, do not count.
     """
     from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
@@ -238,7 +282,8 @@ def sobol_indices(
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
-    is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
+    counts = evaluations.valid & np.isfinite(evaluations.column(measure))
+    is_complete = np.repeat(counts.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
     def indices_of(output: FloatArray) -> Indices:
         options = {
@@ -251,17 +296,18 @@ def sobol_indices(
         return indices
 
     # Indices of both outputs, over the complete rows.
-    outputs = _outputs(evaluations, criterion, is_complete)
+    outputs = _outputs(evaluations, criterion, measure, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
+        measure,
         found,
         {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")},
     )
 
 
 def given_data_indices(
-    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
+    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, measure: str, confidence: float
 ) -> pd.DataFrame:
     """The first-order index of correlated or constrained characteristics, from the vehicles as they
     were drawn: the share of the variance that knowing a characteristic removes, with what is
@@ -294,10 +340,11 @@ def given_data_indices(
         return indices
 
     # Indices of both outputs, with what is correlated.
-    outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
+    outputs = _outputs(drawn, criterion, measure, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
+        measure,
         found,
         {
             "first": ("S1", "first order, with everything that is correlated with it"),
@@ -307,40 +354,46 @@ def given_data_indices(
 
 
 def _outputs(
-    evaluations: Evaluations, criterion: Unsafe, counts: BoolArray
+    evaluations: Evaluations, criterion: Unsafe, measure: str, counts: BoolArray
 ) -> dict[str, FloatArray | None]:
     """The outputs by name; None where there are no indices."""
     is_unsafe = criterion.of(evaluations)
     failures = int(is_unsafe[counts].sum())
-    is_defined = counts.any() and np.ptp(evaluations.f_safe[counts]) > 0
+    values = evaluations.column(measure)
+    is_defined = counts.any() and np.ptp(values[counts]) > 0
     has_outcomes = MIN_OUTCOMES <= failures <= counts.sum() - MIN_OUTCOMES
     return {
-        "degree": evaluations.f_safe if is_defined else None,
+        "degree": values if is_defined else None,
         "unsafe": is_unsafe.astype(float) if has_outcomes else None,
     }
 
 
 def _table(
-    names: list[str], found: Mapping[str, Indices], indices: dict[str, tuple[str, str]]
+    names: list[str],
+    measure: str,
+    found: Mapping[str, Indices],
+    indices: dict[str, tuple[str, str]],
 ) -> pd.DataFrame:
-    """A row for each characteristic, the one that decides most of the safety degree first;
-    `indices` maps an index to SALib's key and its meaning.
+    """A row for each characteristic, the one that decides most of the measure first; `indices` maps
+    an index to SALib's key and its meaning. Readers see the name of a measure other than the safety
+    degree above its column.
     """
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
 
     # An index of each output, with its interval.
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
-    for output, of_what in OUTPUTS.items():
+    for output, of_what in zip(OUTPUTS, (_in_words(measure), IS_UNSAFE), strict=True):
         of_output = found.get(output, {})
         for index, (key, meaning) in indices.items():
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            columns |= with_interval(
-                name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f")
-            )
+            is_named = output == OUTPUTS[0] and measure != F_SAFE.name
+            head = f"{measure} {index}" if is_named else ""
+            meaning = f"share of the variance of {of_what}: {meaning}"
+            columns |= with_interval(name, Column("-", meaning, ".2f", head=head))
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
