@@ -13,6 +13,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import scipy
@@ -53,6 +54,10 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
         "a whole width of f_safe away from one of two"
     )
     assert result.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
+    search = msgspec.structs.replace(case.study.search, reference_point=2.0)
+    study = msgspec.structs.replace(case.study, search=search)
+    wide = compute_indicators(dataclasses.replace(case, study=study))
+    assert wide.loc[("rs", 0), "hypervolume"] == pytest.approx(2 * 1 * 2)
 
 
 def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
@@ -78,6 +83,7 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
         "".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures
     ]
     assert all("My search" in label and "mine" not in label for label in labels)
+    assert "NSGA-II (2 runs)My search (2 runs of 26 evaluations on average)" in labels[0]
 
 
 SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)

@@ -19,10 +19,6 @@ MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
 NO_FRONT = (math.inf, 0.0, math.inf)
 """IGD+, hypervolume and IGD of a run without solutions: worse than those of any other run."""
-REFERENCE_COORDINATE = 1.1
-"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth
-beyond the nadir.
-"""
 USUAL_SHARE = 0.9
 """Share of its budget from which on nobody asks why an algorithm simulates less."""
 CURVE_POINTS = 50
@@ -34,9 +30,9 @@ def nondominated_points(points: FloatArray) -> FloatArray:
     return np.asarray(moocore.filter_dominated(points))
 
 
-def hypervolume(front: FloatArray) -> float:
-    """The volume between `front` and the reference point."""
-    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], REFERENCE_COORDINATE)))
+def hypervolume(front: FloatArray, coordinate: float) -> float:
+    """The volume between `front` and the reference point, whose coordinates are equal."""
+    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], coordinate)))
 
 
 def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
@@ -96,6 +92,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     """
     reference = reference_front(case)
     scaled_reference = normalised(reference, reference)
+    coordinate = case.study.search.reference_point
     rows = {}
     for run, group in _frames_of_runs(case, case.solutions):
         rows[run] = NO_FRONT
@@ -103,7 +100,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
             scaled = normalised(points, reference)
             igd_plus = moocore.igd_plus(scaled, ref=scaled_reference)
             igd = moocore.igd(points, ref=reference)
-            rows[run] = float(igd_plus), hypervolume(scaled), float(igd)
+            rows[run] = float(igd_plus), hypervolume(scaled, coordinate), float(igd)
     index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
@@ -257,7 +254,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         for start, end in pairwise(counts_of_run):
             new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
-            volumes.append(hypervolume(front))
+            volumes.append(hypervolume(front, case.study.search.reference_point))
         columns = {
             "algorithm": algorithm,
             "run": run,
