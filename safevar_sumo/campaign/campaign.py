@@ -137,8 +137,13 @@ def run_campaign(
 
     # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
     runs.sort(key=lambda run: run.key)
-    for remark in _remarks_on_discarded(runs):
-        warn(f"study {study.name!r}: {remark}")
+    for algorithm, rows in groupby(runs, key=lambda run: run.key.algorithm):
+        if count := sum(run.discarded for run in rows):
+            warn(
+                f"study {study.name!r}: {count} settings that {algorithm} returned are no"
+                " solutions: the original vehicle is not safe in their encounter, or an objective"
+                " is undefined (problem.scoring.valid says which)"
+            )
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
     if engine_used is Engine.RECORDED and runs:
@@ -161,19 +166,6 @@ def _remarks(
     if original.collided[0] and not is_rated(study):
         words = Unsafe().breach_in_words(original)
         yield f"the original vehicle itself {words}: no change is needed"
-
-
-def _remarks_on_discarded(runs: Sequence[RunResult]) -> Iterator[str]:
-    """How many of the settings that an algorithm returned are no solutions."""
-    for algorithm, group in groupby(runs, key=lambda run: run.key.algorithm):
-        counts = [(run.discarded, len(run.solutions)) for run in group]
-        discarded, solutions = map(sum, zip(*counts, strict=True))
-        if discarded:
-            yield (
-                f"{discarded} of {discarded + solutions} settings that {algorithm} returned are no"
-                " solutions: the original vehicle is not safe in their encounter, or an objective"
-                " is undefined (problem.scoring.valid says which)"
-            )
 
 
 def _about_algorithms(study: Study) -> JsonObject:

@@ -152,21 +152,16 @@ class Case:
             return "no run is finished"
 
         # The settings that a search may return, as far as there are any.
-        simulated = len(self.evaluations)
         feasible = self.evaluations[self.scoring.feasible_rows(self.evaluations)]
         if feasible.empty:
             return (
-                f"in none of {number_of(simulated, 'encounter')} the original vehicle keeps at"
-                f" least {self.study.scenario.margin:g} m of clearance (scenario.margin)"
+                f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
+                f" keeps at least {self.study.scenario.margin:g} m of clearance (scenario.margin)"
             )
-        objectives = [objective.name for objective in self.scoring.objectives]
-        valid = feasible.dropna(subset=objectives)
-        if valid.empty:
-            settings = number_of(simulated, "simulated setting")
-            return f"none of {settings} has a value of every objective ({', '.join(objectives)})"
+        valid = feasible.dropna(subset=[objective.name for objective in self.scoring.objectives])
         unsafe = self.unsafe.number_in_words(int(self.unsafe.rows(valid).sum()))
-        settings = number_of(len(valid), "simulated setting")
-        return f"the algorithms returned none of {settings} that count; of these, {unsafe}"
+        settings = f"{number_of(len(valid), 'setting')} that have a value of every objective"
+        return f"the algorithms returned none of {settings}; of these, {unsafe}"
 
     def require_solutions(self) -> None:
         """Raise `UnanswerableError` if there is no solution."""

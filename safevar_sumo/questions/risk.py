@@ -66,11 +66,12 @@ NO_PROBABILITY = (
 )
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
-OUTPUTS = ("degree", "unsafe")
-"""What varies: the criterion's measure, which is the safety degree for most criteria; and whether a
-vehicle is unsafe. The names of columns begin so.
+OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
+"""What varies, by the beginning of the names of its columns; another measure may stand in place of
+the safety degree.
 """
-IS_UNSAFE = "whether the vehicle is unsafe"
+MEASURE = "measure"
+"""The attribute of the table that holds the measure whose variance it splits, in words."""
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
@@ -136,11 +137,10 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
-    measure = _defined_measure(criterion, simulated)
     if model.is_correlated or model.region or study.scenario.search:
-        table = given_data_indices(evaluator, simulated, criterion, measure, confidence)
+        table = given_data_indices(evaluator, simulated, criterion, confidence)
     else:
-        table = sobol_indices(evaluator, model, criterion, measure, confidence)
+        table = sobol_indices(evaluator, model, criterion, confidence)
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -160,7 +160,7 @@ def risk(
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
-    verdict += _equality_in_words(simulated, measure) + deciding_in_words(table, failures, measure)
+    verdict += deciding_in_words(table, failures)
     remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
     verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
@@ -170,26 +170,6 @@ def risk(
         numbers=numbers,
         tables={"sensitivity": table},
     )
-
-
-def _defined_measure(criterion: Unsafe, simulated: Evaluations) -> str:
-    """The criterion's measure; the safety degree if the measure is undefined for a vehicle, such as
-    one that collides.
-    """
-    is_defined = np.isfinite(simulated.column(criterion.measure)).all()
-    return criterion.measure if is_defined else F_SAFE.name
-
-
-def _in_words(measure: str) -> str:
-    return "the safety degree" if measure == F_SAFE.name else measure
-
-
-def _equality_in_words(simulated: Evaluations, measure: str) -> str:
-    """That nothing decides a measure that is the same in all vehicles; "" if it varies."""
-    if np.ptp(simulated.column(measure)):
-        return ""
-    same = f"All vehicles have the same value of {_in_words(measure)}"
-    return f" {same}, so no characteristic decides it."
 
 
 def _bound_in_words(failures: int, high: float, total: int, confidence: float) -> str:
@@ -209,9 +189,9 @@ def _bound_in_words(failures: int, high: float, total: int, confidence: float) -
     )
 
 
-def deciding_in_words(table: pd.DataFrame, failures: int, measure: str = F_SAFE.name) -> str:
-    """Which characteristic has the largest share of a measure's variance, and which shares are
-    unsure.
+def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
+    """Which characteristic has the largest share of the variance of the table's measure, and which
+    shares are unsure.
     """
     if table.empty:
         return ""
@@ -220,19 +200,19 @@ def deciding_in_words(table: pd.DataFrame, failures: int, measure: str = F_SAFE.
     # The largest share, of all orders if it is known.
     first = table.iloc[0]
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
-    words = ""
+    in_words = OUTPUTS | {"degree": table.attrs[MEASURE]}
+    words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
         name = first["characteristic"]
         words = (
             f" {name} decides most: it causes {100 * share:.0f} % of the variance of"
-            f" {_in_words(measure)} ({100 * low:.0f} to {100 * high:.0f} %)."
+            f" {in_words['degree']} ({100 * low:.0f} to {100 * high:.0f} %)."
         )
 
     # Shares that are too unsure.
     of_output = {
         name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
     }
-    in_words = dict(zip(OUTPUTS, (_in_words(measure), IS_UNSAFE), strict=True))
     for name, widths in of_output.items():
         if widths.max() > UNSURE:
             words += (
@@ -267,11 +247,11 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
 
 
 def sobol_indices(
-    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, measure: str, confidence: float
+    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
     """Sobol indices, first order and total, of independent characteristics; undefined where nothing
     varies, or too few settings are unsafe or safe. Base points with a setting that could not be
-    simulated, or has no value of the measure, do not count.
+    simulated do not count.
     """
     from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
@@ -282,8 +262,7 @@ def sobol_indices(
     problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
     points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
-    counts = evaluations.valid & np.isfinite(evaluations.column(measure))
-    is_complete = np.repeat(counts.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
+    is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
     def indices_of(output: FloatArray) -> Indices:
         options = {
@@ -296,7 +275,7 @@ def sobol_indices(
         return indices
 
     # Indices of both outputs, over the complete rows.
-    outputs = _outputs(evaluations, criterion, measure, is_complete)
+    measure, outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
@@ -307,7 +286,7 @@ def sobol_indices(
 
 
 def given_data_indices(
-    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, measure: str, confidence: float
+    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
     """The first-order index of correlated or constrained characteristics, from the vehicles as they
     were drawn: the share of the variance that knowing a characteristic removes, with what is
@@ -340,7 +319,7 @@ def given_data_indices(
         return indices
 
     # Indices of both outputs, with what is correlated.
-    outputs = _outputs(drawn, criterion, measure, np.ones(len(drawn), dtype=bool))
+    measure, outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
@@ -354,15 +333,22 @@ def given_data_indices(
 
 
 def _outputs(
-    evaluations: Evaluations, criterion: Unsafe, measure: str, counts: BoolArray
-) -> dict[str, FloatArray | None]:
-    """The outputs by name; None where there are no indices."""
+    evaluations: Evaluations, criterion: Unsafe, counts: BoolArray
+) -> tuple[str, dict[str, FloatArray | None]]:
+    """The criterion's measure in words, or the safety degree where the measure is undefined for a
+    vehicle, such as one that collides; and the outputs by name, None where there are no indices.
+    """
+    values = evaluations.column(criterion.measure)
+    measure = OUTPUTS["degree"] if criterion.measure == F_SAFE.name else criterion.measure
+    if not np.isfinite(values[counts]).all():
+        measure, values = OUTPUTS["degree"], evaluations.f_safe
+
+    # Outputs that vary enough.
     is_unsafe = criterion.of(evaluations)
     failures = int(is_unsafe[counts].sum())
-    values = evaluations.column(measure)
     is_defined = counts.any() and np.ptp(values[counts]) > 0
     has_outcomes = MIN_OUTCOMES <= failures <= counts.sum() - MIN_OUTCOMES
-    return {
+    return measure, {
         "degree": values if is_defined else None,
         "unsafe": is_unsafe.astype(float) if has_outcomes else None,
     }
@@ -383,15 +369,14 @@ def _table(
     # An index of each output, with its interval.
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
-    for output, of_what in zip(OUTPUTS, (_in_words(measure), IS_UNSAFE), strict=True):
+    for output, of_what in (OUTPUTS | {"degree": measure}).items():
         of_output = found.get(output, {})
         for index, (key, meaning) in indices.items():
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            is_named = output == OUTPUTS[0] and measure != F_SAFE.name
-            head = f"{measure} {index}" if is_named else ""
+            head = "" if of_what in OUTPUTS.values() else f"{measure} {index}"
             meaning = f"share of the variance of {of_what}: {meaning}"
             columns |= with_interval(name, Column("-", meaning, ".2f", head=head))
 
@@ -399,4 +384,6 @@ def _table(
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
-    return tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
+    table = tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
+    table.attrs[MEASURE] = measure
+    return table

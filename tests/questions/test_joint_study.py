@@ -164,7 +164,7 @@ def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(joint: 
     infeasible = (~case.evaluations["feasible"]).sum()
     assert 0 < infeasible < 80 == len(case.solutions) + infeasible
     (warning,) = (one for one in warnings if "TakesAll" in one)
-    assert f"{infeasible} of 80 settings that TakesAll returned are no solutions" in warning
+    assert f"{infeasible} settings that TakesAll returned are no solutions" in warning
 
 
 @pytest.mark.slow

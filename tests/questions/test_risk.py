@@ -58,7 +58,7 @@ def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: flo
     needed = int(told.replace(",", ""))
     highest = [clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)]
     assert highest[1] <= 1e-4 < highest[0]
-    assert "All vehicles have the same value of the safety degree" in verdict
+    assert "No vehicle was found that changes the safety degree" in verdict
     assert "No vehicle is unsafe" not in of(box, samples=200).verdict
 
 
@@ -203,6 +203,7 @@ def test_the_verdict_says_which_shares_are_unsure() -> None:
         for end, x in zip(("", LOW, HIGH), row, strict=True)
     }
     frame = pd.DataFrame({"characteristic": ["a"], **values})
+    frame.attrs = {"measure": "the safety degree"}
     words = deciding_in_words(frame, 120)
     assert (
         "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %)." in words

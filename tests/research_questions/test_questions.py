@@ -274,8 +274,11 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
     ("changes", "reason"),
     [
         ({"finished": []}, "no run is finished"),
-        ({}, "returned none of 2 simulated settings that count; of these, 1 is unsafe (safety"),
-        ({"f_diff": math.nan}, "none of 2 simulated settings has a value of every objective"),
+        ({}, "returned none of 2 settings that have a value of every objective; of these, 1 is"),
+        (
+            {"f_diff": math.nan},
+            "none of 0 settings that have a value of every objective; of these, none is",
+        ),
         ({"original_safety_degree": 0.4}, "in none of 2 encounters the original vehicle keeps at"),
     ],
 )

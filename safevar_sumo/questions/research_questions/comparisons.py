@@ -271,10 +271,8 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
             if over_runs
             else compare_samples(values, originals.dropna())
         )
-        if (
-            metric.more_is_unsafe
-        ):  # so that below 0.5 the solutions are more unsafe than the original
-            test = test.reversed()
+        # Below 0.5, the solutions are more unsafe than the original.
+        test = test.oriented(larger_is_better=not metric.more_is_unsafe)
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
         is_enough = not case.has_runs or can_be_significant("RQ1", runs, 0, choices.alpha)
@@ -291,15 +289,13 @@ def _test_opponents(
     samples = {**_samples(case, choices, over_runs), **further}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
     # causes.
-    directions = MORE_IS_BETTER | {
-        metric.name: metric.more_is_unsafe for metric in case.scoring.metrics
-    }
-    directions |= {name: better for name, better in BETTER.items() if (first, name) in samples}
+    metrics = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    further_ones = {name: better for name, better in BETTER.items() if (first, name) in samples}
     rows = []
+    directions = MORE_IS_BETTER | metrics | further_ones
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
-        if not more_is_better:  # so that above 0.5 the first algorithm is better
-            test = test.reversed()
+        test = test.oriented(larger_is_better=more_is_better)
         runs = _finished_runs(case, first), _finished_runs(case, baseline)
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
         row = {"algorithm": first, "baseline": baseline, "metric": metric}
@@ -364,7 +360,7 @@ def describe_runs_without_solutions(case: Case) -> str:
     """Which algorithms have runs without solutions, and how these runs count, in sentences; "" if
     no finished run is without solutions.
     """
-    if not case.has_runs or case.solutions.empty:
+    if not case.has_runs:
         return ""
 
     # How many runs of each algorithm have solutions.

@@ -130,8 +130,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
 def draw_convergence(case: Case) -> Figure:
     """The hypervolume of all settings that a run has evaluated so far, over the number of
     evaluations, as median and quartiles over the runs. A line ends with the longest run of its
-    algorithm; a mark there is the median of what the runs return. The legend says after how many
-    evaluations runs end on average if that is before the budget is used.
+    algorithm; a mark there is the median of what the runs return. The legend says how many
+    evaluations a run has on average: less than its budget if it ends early.
     """
     import seaborn as sns
 
@@ -139,10 +139,9 @@ def draw_convergence(case: Case) -> Figure:
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
     means = count_evaluations(case).groupby("algorithm")["requested"].mean()
-    early = means[means < case.study.search.evaluations]
     labels = {
-        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs"
-        + (f" of {means[algorithm]:,.0f} evaluations on average)" if algorithm in early else ")")
+        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs, on average"
+        f" {means[algorithm]:,.0f} evaluations)"
         for algorithm, count in runs.items()
     }
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))

@@ -77,9 +77,11 @@ class TwoSampleTest(NamedTuple):
     n2: int
     method: str | None
 
-    def reversed(self) -> TwoSampleTest:
-        """The test with the effect size of Y against X, 1 - A12, whose magnitude is the same."""
-        return self._replace(effect_size=1 - self.effect_size)
+    def oriented(self, *, larger_is_better: bool) -> TwoSampleTest:
+        """The test whose effect size is above 0.5 where X is better: A12, or 1 - A12 where smaller
+        values are better.
+        """
+        return self if larger_is_better else self._replace(effect_size=1 - self.effect_size)
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
