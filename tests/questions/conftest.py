@@ -16,11 +16,11 @@ from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.questions import evaluator, measure, models, scope
+from safevar_sumo.questions import between, evaluator, measure, scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.scans import scan
-from safevar_sumo.questions.tolerance.together import LimitsTogether, find_limits_together
+from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Limit, Study
 from safevar_sumo.sumo.system import assemble
@@ -44,7 +44,7 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (evaluator, measure, models, scope):
+    for module in (evaluator, measure, between, scope):
         monkeypatch.setattr(
             module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
         )
@@ -168,4 +168,11 @@ def box_of(
         for end in interval
     ]
     known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
-    return find_limits_together(Models(tuple(fits), ()), columns, limits, scans, known, budget)
+    nothing = known[:0]
+    search = JointSearch(
+        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, budget
+    )
+    search.find(scans, known)
+    for model in fits[1:]:
+        search.cut(model, nothing)
+    return search.found

@@ -13,8 +13,7 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxSearch
-from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.tolerance.validation import CONFIRMATIONS
+from safevar_sumo.questions.tolerance.together import CONFIRMATIONS, LimitsTogether
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
@@ -76,8 +75,9 @@ def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together
         for k, one in enumerate((nowhere, pocket))
     )
     scans = scan(own.evaluator, [0, 1], Unsafe())
-    alone = AloneSearch(scans, [0, 1], [own, other])
-    alone.run(0)
+    alone = AloneSearch(scans, [0, 1], own)
+    alone.add(own)
+    alone.add(other)
     assert [each.safe for each in alone.limits()] == [(0.0, 10.0), (0.0, 10.0)]
     alone.meet([other], np.array([[7.02, 5.0]]))
     assert [each.safe for each in alone.limits()] == [
@@ -103,8 +103,7 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
     points = found.box.at(np.random.default_rng(1).random((20_000, 3)))
     assert not tooth(points).any()
     assert relative_volume(found) > 0.02
-    assert found.falsification is not None
-    assert found.falsification.simulated == (1 + CONFIRMATIONS) * 2000
+    assert found.validations[0].attacked == (1 + CONFIRMATIONS) * 2000
     region = region_of(made_up_study(3))
     whole = Box(region, np.zeros(3), np.full(3, 10.0))
     hit = falsify(
@@ -132,7 +131,7 @@ def test_the_box_holds_in_every_fit() -> None:
     )
     assert not linear(settings).any()
     assert not second(settings).any()
-    assert {*found.corners} == {0, 1}
+    assert {*found.validations} == {0, 1}
 
 
 def test_a_promise_that_a_fit_breaks_is_named_and_the_box_holds_in_the_others() -> None:

@@ -150,7 +150,7 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
         )
     )
     assert known.numbers["unsafe"] == "collision", "as the solutions do, and as `explain` takes it"
-    assert share_of_domain(bare) == pytest.approx(1, abs=0.01)
+    assert share_of_domain(bare) == pytest.approx(1, abs=0.02)
     assert 0.8 < share_of_domain(known) < 0.9, "the largest box ends before 8.5"
     assert share_of_domain(two) == 1, "the solution changes others as well"
 

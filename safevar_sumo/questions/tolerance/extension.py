@@ -20,10 +20,6 @@ STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
 ORDERS = 31
 """Number of random orders in which failures are cut off."""
-CLEARANCE, RETREAT = 0.8, 0.4
-"""Share of such a move by which a limit keeps off a failure that an attack found between corners;
-and by how much more after each box that failed.
-"""
 SLAB_SIMULATIONS = 512
 """Number of simulations that falsify the room beyond a limit."""
 SLAB_CORNERS = 512
@@ -106,12 +102,10 @@ class Extension:
         search.unsafe_settings = np.concatenate([search.unsafe_settings, *found.values()])
         return bool(found)
 
-    def cut(self, box: Box, attempts: int = 0) -> Box:
+    def cut(self, box: Box, clearance: float) -> Box:
         """The largest box within a box without its known failures that was found: they are cut off
-        in several orders, first those that leave the least choice of a limit to move in.
-
-        After more `attempts` that failed, limits keep off failures by more: where the response is
-        not monotone, others lie beside them.
+        in several orders, first those that leave the least choice of a limit to move in. Limits
+        keep off failures by a `clearance`, as a share of a move.
         """
         search = self.search
         sides = search.sides_of(box)
@@ -127,7 +121,7 @@ class Extension:
             *(rng.permutation(len(failures)) for _ in range(ORDERS)),
         ]
         cuts = [
-            self._cut_off(sides, failures[order], CLEARANCE + RETREAT * attempts)
+            self._cut_off(sides, failures[order], clearance)
             for order in orders[: len(failures) * ORDERS]
         ]
         return search.printed(max(cuts, key=search.log_volume))

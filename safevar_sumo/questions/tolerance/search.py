@@ -5,6 +5,7 @@ user specifies.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -279,9 +280,9 @@ class BoxSearch(BoxGeometry):
         found = points[self.are_unsafe(points)]
         return found
 
-    def learn(self, settings: FloatArray, model: Model | None = None) -> bool:
+    def learn(self, settings: FloatArray, model: Model | None = None) -> FloatArray:
         """Add corners that are unsafe, from some settings that are unsafe in a model, or in any;
-        whether there is a new one.
+        their causes, shape (K, n).
 
         One by one, as many changes of a setting as possible are undone while it stays unsafe; the
         directions of the remaining changes are the corner. All combinations of the next few are
@@ -295,7 +296,19 @@ class BoxSearch(BoxGeometry):
         if not is_new:
             self.gap += RETREAT * (1 - self.gap)
         self._keep_causes(causes)
-        return is_new
+        return causes
+
+    def approach(self, causes: FloatArray, model: Model) -> None:
+        """Know, for each change of K causes, the value nearest to the original from which on it is
+        unsafe with the others.
+        """
+        is_changed = (causes != self.original) & self.is_free.any(axis=0)
+        rows, columns = np.nonzero(is_changed)
+        ends = causes[rows]
+        starts = ends.copy()
+        starts[np.arange(len(rows)), columns] = self.original[columns]
+        found = find_boundaries(starts, ends, partial(model.are_unsafe, stage=SEARCH_STAGE))
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, found.unsafe])
 
     def _corners_of(self, causes: FloatArray) -> FloatArray:
         """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its

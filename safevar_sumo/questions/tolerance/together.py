@@ -4,7 +4,7 @@ which each other set in turn cuts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,12 @@ from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
-from safevar_sumo.questions.tolerance.validation import KNOWN_BETWEEN, Validation, Validator
+from safevar_sumo.questions.tolerance.validation import (
+    KNOWN_BETWEEN,
+    Failures,
+    Validation,
+    Validator,
+)
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
@@ -29,6 +34,11 @@ box that passes.
 MAX_BOXES, EXPLORED, MAX_GROWTHS = 150, 2, 2
 """Maximum number of boxes that are tested; of those that a random search seeks; and of times that
 limits move out.
+"""
+CLEARANCE, RETREAT, RETREAT_OF_SET = 0.8, 0.4, 0.05
+"""Share of the least move of a limit by which it keeps off a failure that a search found between
+corners, where the response is not monotone; by how much more after each box that failed; and after
+each that failed with another parameter set, whose failures are approached.
 """
 MAX_CUTS = 40
 """Largest number of times that the failures with one parameter set are cut off a box."""
@@ -286,7 +296,7 @@ class JointSearch:
         extension = Extension(search)
         met = list[Model]()
         for attempt in range(MAX_CUTS):
-            box = extension.cut(outer, attempt)
+            box = extension.cut(outer, RETREAT_OF_SET * attempt)
             validation, proof = self._pass(validator, box, attempt)
             if not validation.failures:
                 passed = {**self.found.validations, model.fit: validation}
@@ -298,7 +308,9 @@ class JointSearch:
                 )
                 break
             met += [failures.model for failures in validation.failures]
-            _learn(search, validation, self.own.evaluator)
+            with self.own.evaluator.stage(SEARCH_STAGE):
+                for failures, causes in _learn(search, validation):
+                    search.approach(causes, failures.model)
             if validator not in self._validators:
                 self._validators.append(validator)
         else:
@@ -358,13 +370,12 @@ def _nothing(model: Model) -> FloatArray:
     return np.zeros((0, len(model.evaluator.characteristics)))
 
 
-def _learn(search: BoxSearch, validation: Validation, evaluator: Evaluator) -> None:
-    """Take failures, and the models in which they are, into a search."""
-    with evaluator.stage(SEARCH_STAGE):
-        for failures in validation.failures:
-            search.join(failures.model)
-            search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
-            search.learn(failures.settings, failures.model)
+def _learn(search: BoxSearch, validation: Validation) -> Iterator[tuple[Failures, FloatArray]]:
+    """Take failures, and the models in which they are, into a search; the causes of each."""
+    for failures in validation.failures:
+        search.join(failures.model)
+        search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+        yield failures, search.learn(failures.settings, failures.model)
 
 
 class _Boxes:
@@ -399,7 +410,7 @@ class _Boxes:
             if sides is None:
                 return None
             self._outer = self.search.printed(sides)
-        return self.extension.cut(self._outer, self._failed)
+        return self.extension.cut(self._outer, CLEARANCE + RETREAT * self._failed)
 
     def is_no_larger(self, box: Box) -> bool:
         """Whether a box is no larger than the one that passed."""
@@ -412,7 +423,9 @@ class _Boxes:
     def refuse(self, validation: Validation) -> None:
         """Take failures, and the models in which they are, into the search."""
         search = self.search
-        _learn(search, validation, self._evaluator)
+        with self._evaluator.stage(SEARCH_STAGE):
+            for _ in _learn(search, validation):
+                pass
         if self.passed and len(search.unsafe_inside(search.sides_of(self.passed.box))):
             self.passed = None
         self._failed += 1
