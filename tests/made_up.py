@@ -27,6 +27,19 @@ HAS_AD_RSS = (
     sys.platform == "linux" and platform.machine() == "x86_64" and sys.version_info < (3, 14)
 )
 """Whether there are wheels of ad-rss; setup.cfg says the same."""
+HARDEST_BRAKING = """
+import numpy as np
+from safevar_sumo.metrics import Measure
+
+def hardest(runs, thresholds):
+    loss = np.max(-np.diff(runs.trace.speed, axis=0), axis=0, initial=0.0) / runs.trace.step
+    return np.where(np.isnan(runs.collision_speed), loss, np.nan)
+
+HARDEST = Measure(
+    name="hardest", title="hardest", unit="m/s^2", more_is_unsafe=True, function=hardest
+)
+"""
+"""The file of a user's metric, the hardest braking [m/s^2], undefined in a collision."""
 
 
 def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:

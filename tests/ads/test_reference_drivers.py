@@ -21,7 +21,7 @@ from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import seen
+from tests.made_up import original_of, seen
 from tests.scenarios.ideal import point_mass
 
 STEP = 0.05
@@ -357,7 +357,7 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
     )
     system = assemble(study)
     for point, (kmh, *rest) in zip(system.points, product(*over.values()), strict=True):
-        trace = drive_worst(system.at(point), system.characteristics.original[np.newaxis]).trace
+        trace = drive_worst(system.at(point), original_of(system)).trace
         gaps = trace.gap[trace.active]
         closing = (trace.speed - trace.obstacle_speed)[trace.active]
         found = gaps.min() if gaps.min() > 0 else -closing[-1]

@@ -19,6 +19,7 @@ from safevar_sumo.study import tables_of
 from safevar_sumo.sumo.matrix import at_point, simulate_all_points, worst_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.made_up import original_of
 
 
 @pytest.fixture(scope="module")
@@ -234,7 +235,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
 def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
     study = load_study("euro_ncap_pedestrian")
     system = assemble(study)
-    points = simulate_all_points(system, system.characteristics.original[np.newaxis])
+    points = simulate_all_points(system, original_of(system))
     worst = points[worst_points(system, [point.evaluations for point in points])[0]].point.name
     assert worst != points[-1].point.name  # the last one that is driven
     alone = sv.simulate(at_point(study, worst)).trace

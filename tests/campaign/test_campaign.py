@@ -36,23 +36,6 @@ def study() -> Study:
     return load_study("smoke", search={"algorithms": sorted(ALGORITHMS)})
 
 
-@pytest.mark.slow
-def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches(
-    study: Study, tmp_path: Path
-) -> None:
-    carried_out(study, tmp_path / "a")
-    for name, pool, batch in (
-        ("b", FormulaPool(workers=7), None),
-        ("c", FormulaPool(workers=3), 3),
-        ("d", FormulaPool(workers=2), 1),
-    ):
-        carried_out(study, tmp_path / name, pool, batch=batch)
-        assert solutions(tmp_path / name) == solutions(tmp_path / "a")
-        pd.testing.assert_frame_equal(
-            load_runs(tmp_path / name).evaluations, load_runs(tmp_path / "a").evaluations
-        )
-
-
 def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
     large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
     together = FormulaPool(workers=2)

@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import all_runs, evaluation, run_campaign
+from safevar_sumo.campaign import evaluation
 from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
@@ -35,10 +35,8 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import SUN, evaluated, solutions
-from tests.in_process import searched
+from tests.campaign.formulas import SUN, evaluated
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 
@@ -117,21 +115,6 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     assert carry_out(evaluate_settings, [(Task(study=study), SUN.original[np.newaxis])], pool)[
         0
     ].valid.all()
-
-
-def test_a_study_in_worker_processes_has_the_solutions_of_this_one(tmp_path: Path) -> None:
-    study = load_study("smoke", search={"algorithms": ["rs"], "evaluations": 20, "runs": 2})
-    with open_pool(2) as pool:
-        run_campaign(
-            study,
-            assemble(study),
-            all_runs(study),
-            tmp_path / "a",
-            pool,
-            show_no_progress,
-            pytest.fail,
-        )
-    assert solutions(tmp_path / "a") == solutions(searched(study, tmp_path / "b"))
 
 
 STUDY = load_study("sun")

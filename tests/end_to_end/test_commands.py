@@ -5,7 +5,6 @@ damage.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from fnmatch import fnmatch
 from pathlib import Path
@@ -80,7 +79,7 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
     assert "RQ1 over runs" not in output, "no test of so few runs can be significant"
 
 
-@pytest.mark.slow
+@SLOW
 def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     for k in (1, 2):
         study("--out", "out", "--shard", f"{k}/2")
@@ -102,7 +101,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
 
-@pytest.mark.slow
+@SLOW
 def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
     assert "warning" not in study("--out", "out")
     longer = study("--out", "out", "--evaluations", "160")
@@ -119,7 +118,7 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
     assert "evaluations before" not in fewer
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what_is_asked_for(
     whole: Path,
 ) -> None:
@@ -131,15 +130,6 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
     assert "NSGA-II" in run(*again, "--quiet", "--table", "algorithms").stdout
 
 
-@pytest.mark.slow
-def test_torn_runs_are_continued(copied: Path, whole: Path) -> None:
-    for name, lost in (("nsga2-00", 20), ("safe_fuzzer-01", 9000)):
-        path = copied / "runs" / f"{name}.jsonl"
-        os.truncate(path, path.stat().st_size - lost)
-    study("--out", "out")
-    assert solutions("out") == solutions(whole)
-
-
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
     assert output.startswith("About ")
@@ -148,7 +138,7 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     assert not Path("results").exists()
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
     """Half of its domain has encounters that cannot be driven."""
     assert "seconds" in run("study", "alks_joint_cut_out", "--dry-run").stdout
@@ -221,7 +211,7 @@ def refusal(*words: str) -> str:
     return f"{result.problem}: {result.legal}"
 
 
-@pytest.mark.slow
+@SLOW
 def test_code_and_named_files_count_and_every_command_that_simulates_results_refuses_by_name(
     mine: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

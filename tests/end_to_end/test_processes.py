@@ -31,17 +31,23 @@ OUT = Path("out")
 @SLOW
 def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
     moments = random.Random(4)
-    out = Path("out")
     for _ in range(6):
-        before = written(out)
+        before = written(OUT)
         process = started("study", "small.toml", "--out", "out", "--jobs", "1", "--batch", "1")
-        until(lambda: written(out) > before, process)  # noqa: B023
+        until(lambda: written(OUT) > before, process)  # noqa: B023
         time.sleep(moments.uniform(0, 0.1))
         assert process.poll() is None, "the study is too short to be killed so often"
         killed(process)
-    assert not (out / "solutions.csv").exists()
+    assert not (OUT / "solutions.csv").exists()
     run("study", "small.toml", "--quiet", "--out", "out")
-    assert solutions(out) == solutions(whole)
+    assert solutions(OUT) == solutions(whole)
+
+
+def assert_ends_with_the_results(process: Process, whole: Path) -> None:
+    """It leaves the bytes of a study that nothing has happened to, and no failed simulation."""
+    ended(process, 0)
+    assert solutions(OUT) == solutions(whole)
+    assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
 @SLOW
@@ -55,9 +61,7 @@ def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
         worker.kill()  # each share loses one
         time.sleep(moments.uniform(0.2, 0.6))
     assert process.poll() is None, "too late: the study is over"
-    ended(process, 0)
-    assert solutions(OUT) == solutions(whole)
-    assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
+    assert_ends_with_the_results(process, whole)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +89,7 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
     assert "interrupted" in ended(process, 130)
 
 
-@pytest.mark.slow
+@SLOW
 def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path) -> None:
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
@@ -256,7 +260,7 @@ def busy(process: Process) -> bool:
     return any("llvmlite" in one.path for one in psutil.Process(process.pid).memory_maps())
 
 
-@pytest.mark.slow
+@SLOW
 def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     scheduler: tuple[Process, str], start: Start, whole: Path
 ) -> None:
@@ -267,10 +271,8 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
         workers[0],
     )
     process = started("study", "small.toml", "--cluster", address, "--out", "out", "--batch", "1")
-    until(lambda: written(Path("out")) > 0 and all(busy(one) for one in workers), process)
+    until(lambda: written(OUT) > 0 and all(busy(one) for one in workers), process)
     assert process.poll() is None, "too late: the study is over"
     killed(workers[0])
-    ended(process, 0)
+    assert_ends_with_the_results(process, whole)
     assert workers[1].poll() is None
-    assert solutions("out") == solutions(whole)
-    assert (load_runs("out").evaluations["outcome"] != "simulator-error").all()

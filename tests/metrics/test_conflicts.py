@@ -17,6 +17,7 @@ from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
+from tests.made_up import original_of
 from tests.scenarios.ideal import met_at_once
 
 WEAR = assemble(load_study("wear", matrix=None, weather="clear"))
@@ -60,7 +61,7 @@ def test_towards_who_crosses_only_the_way_along_the_path_counts(test: Any) -> No
 
 def test_in_the_published_scenario_too() -> None:
     system = assemble(load_study("sun"))
-    runs = drive_worst(system, system.characteristics.original[np.newaxis])
+    runs = drive_worst(system, original_of(system))
     assert measured(runs) == pytest.approx(along_the_path(runs))
 
 

@@ -69,7 +69,8 @@ COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
 
 def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
-    return float(METRICS[name].function(run, thresholds)[0])
+    """A metric of a run's first vehicle."""
+    return float({**METRICS, **OPTIONAL_METRICS}[name].function(run, thresholds)[0])
 
 
 def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_collision() -> None:
@@ -114,16 +115,14 @@ def test_least_ttc_and_largest_drac_of_even_braking() -> None:
     """From 10 m/s with 5 m/s^2 and 12 m ahead, at speed v the distance is 2 m + v^2 / (10
     m/s^2).
     """
-    least = float(OPTIONAL_METRICS["ttc_min"].function(RUN, THRESHOLDS)[0])
-    largest = float(OPTIONAL_METRICS["drac"].function(RUN, THRESHOLDS)[0])
+    least = value("ttc_min", RUN)
+    largest = value("drac", RUN)
     speed = np.linspace(0.01, 10, 100_001)
     distance = 2 + speed**2 / 10
     assert least == pytest.approx((distance / speed).min(), rel=1e-3)
     assert largest == pytest.approx((speed**2 / (2 * distance)).max(), rel=1e-3)
     nobody = meeting(closing_speed=np.zeros_like(RUN.encounter.closing_speed))
-    assert np.isnan(
-        [OPTIONAL_METRICS[name].function(nobody, THRESHOLDS)[0] for name in ("ttc_min", "drac")]
-    ).all()
+    assert np.isnan([value(name, nobody) for name in ("ttc_min", "drac")]).all()
 
 
 @pytest.mark.parametrize(
@@ -151,10 +150,9 @@ def test_post_encroachment_time_is_that_of_the_second_one(
     active = np.array([[True], [True], [False]])
     run = made_up_runs(STEP, 10 * at, gap * at, **columns, active=active)
     run = dataclasses.replace(run, trace=dataclasses.replace(run.trace, vehicle_width=2.0))
-    pet = OPTIONAL_METRICS["pet"].function
-    assert np.isnan(pet(run, THRESHOLDS)[0]), "it has stopped"
+    assert np.isnan(value("pet", run)), "it has stopped"
     run.outcome[:] = "passed"
-    assert pet(run, THRESHOLDS)[0] == pytest.approx(expected, nan_ok=True)
+    assert value("pet", run) == pytest.approx(expected, nan_ok=True)
 
 
 def test_reaction_time_begins_with_the_first_sight() -> None:
@@ -162,12 +160,12 @@ def test_reaction_time_begins_with_the_first_sight() -> None:
     time = RUN.trace.time[:, np.newaxis]
     brake = ((time > 0.5) & (time < 0.9)) | (time >= 1.7)
     visible = time >= 1.0
-    reaction = OPTIONAL_METRICS["reaction_time"].function
-    assert reaction(driving(brake=brake.astype(float), visible=visible), THRESHOLDS)[
-        0
-    ] == pytest.approx(0.7)
-    assert np.isnan(reaction(driving(brake=brake & (time < 0.9), visible=visible), THRESHOLDS)[0])
-    assert np.isnan(reaction(driving(visible=visible & False), THRESHOLDS)[0])
+    for seen, expected in (
+        ({"brake": brake.astype(float), "visible": visible}, 0.7),
+        ({"brake": brake & (time < 0.9), "visible": visible}, np.nan),
+        ({"visible": visible & False}, np.nan),
+    ):
+        assert value("reaction_time", driving(**seen)) == pytest.approx(expected, nan_ok=True)
 
 
 def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none() -> None:
@@ -412,13 +410,13 @@ def test_a_stop_is_that_of_a_constant_deceleration_after_a_delay() -> None:
     run = braked(
         np.maximum(speed - deceleration * np.maximum(times - delay, 0.0), 0.0), delay, step
     )
-    metrics = {name: OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0] for name in STOPS}
+    metrics = {name: value(name, run) for name in STOPS}
     stop = speed**2 / (2 * deceleration)
     assert metrics["stopping_distance"] == pytest.approx(stop, abs=1.5 * speed * step)
     assert metrics["stop_from_pedal"] == pytest.approx(stop + speed * delay, abs=0.01)
     assert metrics["mfdd"] == pytest.approx(deceleration, rel=1e-4)
     half = braked(np.linspace(speed, speed / 2, 60), 0.0, step)
-    assert all(np.isnan(OPTIONAL_METRICS[name].function(half, THRESHOLDS)[0]) for name in STOPS)
+    assert all(np.isnan(value(name, half)) for name in STOPS)
 
 
 def test_the_law_allows_70_m_from_100_km_h_and_a_stricter_mean_deceleration() -> None:
@@ -443,7 +441,7 @@ def test_an_impact_counts_above_the_speed_that_is_allowed(
 ) -> None:
     run = made_up_runs(0.1, np.full((2, 1), speed), gap=-1.0, collision_speed=speed)
     run = dataclasses.replace(run, allowed_impact_speed=np.array(allowed))
-    found = [OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0] for name in IMPACTS]
+    found = [value(name, run) for name in IMPACTS]
     assert found == pytest.approx([speed, excess])
     assert impact_in_words(*found) == words
     columns = {"safety_degree": -speed, **dict(zip(IMPACTS, found, strict=True))}
@@ -461,5 +459,5 @@ def test_without_a_contact_the_excess_is_minus_the_clearance() -> None:
     gap = np.array([[5.0], [2.0], [2.5]])
     run = made_up_runs(0.1, np.full((3, 1), 3.0), gap=gap)
     run = dataclasses.replace(run, allowed_impact_speed=np.array(4.0))
-    assert OPTIONAL_METRICS["impact_excess"].function(run, THRESHOLDS)[0] == -2.0
-    assert np.isnan(OPTIONAL_METRICS["impact_speed"].function(run, THRESHOLDS)[0])
+    assert value("impact_excess", run) == -2.0
+    assert np.isnan(value("impact_speed", run))

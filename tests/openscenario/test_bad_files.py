@@ -26,6 +26,7 @@ from tests.openscenario.writing import (
     lane_change,
     private,
     speed,
+    staged,
     teleport,
     trigger,
     write,
@@ -41,7 +42,7 @@ def test_what_is_too_long_or_too_deep_is_refused_in_a_short_message(tmp_path: Pa
         ({"car": (teleport(at("1" * 4400, 9)), speed(10))}, "LanePosition: laneId = '1111"),  # type: ignore[arg-type]
     ):
         with pytest.raises(InputError, match=problem) as caught:
-            play(write(tmp_path, **parts), {})  # type: ignore[arg-type]
+            staged(tmp_path, **parts)  # type: ignore[arg-type]
         assert len(str(caught.value)) < 400
     file = write(tmp_path, parameters=writing.PARAMETER)
     road = tmp_path / "road.xodr"
@@ -60,7 +61,7 @@ def test_what_is_too_long_or_too_deep_is_refused_in_a_short_message(tmp_path: Pa
 
 def test_what_no_element_has_is_passed_over(tmp_path: Path) -> None:
     """A searched number, too, need not be declared as one more than others."""
-    play(write(tmp_path, minor='2" revMinr="0'), {})
+    staged(tmp_path, minor='2" revMinr="0')
     write(tmp_path, event(speed("$v")), parameters=writing.PARAMETER)
     search = {"v": {"lower": 1.0, "upper": 9.0}}
     load_study("wear", scenario={"file": str(tmp_path / "scenario.xosc"), "search": search})
@@ -93,7 +94,7 @@ TURN = '<geometry s="0" x="0" y="0" hdg="0" length="2000"><arc curvature="0.001"
 
 def test_that_ego_turns_is_said_before_what_a_trigger_needs(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Ego does not drive straight on"):
-        play(write(tmp_path, stop=LIGHT, geometry=TURN), {})
+        staged(tmp_path, stop=LIGHT, geometry=TURN)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_an_event_that_could_not_begin_again_is_played_once(
     events = group(event(speed(5, "linear", "time", 2), trigger(condition, edge=edge)))
     once = events.replace(' maximumExecutionCount="1"', "")
     often = once.replace(f"<{counted} ", f'<{counted} maximumExecutionCount="3" ')
-    remarks = " ".join(play(write(tmp_path, events=often), {}).remarks)
+    remarks = " ".join(staged(tmp_path, events=often).remarks)
     assert "is played once, of up to 3 times" in remarks
 
 
@@ -139,7 +140,7 @@ def test_who_follows_a_trajectory_on_a_straight_road_is_on_the_road(
         + private("Van", teleport(beside), speed(0))
     )
     entities = "".join(map(body, ("Ego", "Car", "Truck", "Van")))
-    car_, truck, van = play(write(tmp_path, init=init, entities=entities), {}).others
+    car_, truck, van = staged(tmp_path, init=init, entities=entities).others
     origins = [one.place - 1.5 * one.facing for one in (car_, truck, van)]
     assert np.abs(origins[0] - origins[1] - (30 - 4j)).max() < 1e-6
     assert origins[2][0] == pytest.approx(115 + 26j)

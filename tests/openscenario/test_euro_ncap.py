@@ -16,6 +16,7 @@ from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.tracks import BODIES, PERSONS, VUT_LENGTH, VUT_WIDTH
 from safevar_sumo.sumo.system import assemble
+from tests.made_up import original_of
 from tests.openscenario.writing import (
     AT_ONCE,
     at,
@@ -94,7 +95,7 @@ def test_a_class_and_its_file_have_the_same_gap(
     tmp_path: Path, scenario: TrackScenario, time_to_impact: float, scale: float
 ) -> None:
     """With the brakes as they are, and with a quarter of their torque."""
-    settings = WEAR.characteristics.original[np.newaxis].copy()
+    settings = original_of(WEAR).copy()
     settings[0, [*WEAR.characteristics.names].index("brakeTorque")] *= scale
     mine = driven(scenario, WEAR.ads, settings, WEAR)
     its = driven(as_file(tmp_path, scenario, time_to_impact), WEAR.ads, settings, WEAR)
@@ -107,7 +108,7 @@ def test_the_two_parked_cars_of_a_file_hide_the_child(tmp_path: Path) -> None:
     """Who brakes as soon as it sees somebody within 40 m stops 6 to 8 m before the child, and 20 m
     earlier without.
     """
-    settings = WEAR.characteristics.original[np.newaxis]
+    settings = original_of(WEAR)
     scenario = Crossing(test="CPNCO", speed=40.0)
     sight = Pedals(lambda seen: (0.0, 1.0 * (seen.gap < 40)))
     seen, hidden, in_file = (

@@ -16,6 +16,7 @@ from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import run
+from tests.made_up import original_of
 from tests.openscenario.writing import (
     AT_ONCE,
     at,
@@ -24,6 +25,7 @@ from tests.openscenario.writing import (
     lane_change,
     private,
     speed,
+    staged,
     teleport,
     trigger,
     watching,
@@ -41,7 +43,7 @@ STOP = trigger(AT_ONCE.format(20), "")
 def played(folder: Path, *events: str, car: str = "", ego: str = STANDING, **parts: str) -> Played:
     """What a file says in which Ego and the Car have these events."""
     groups = (group(*events, actor="Ego") if events else "") + (group(car) if car else "")
-    return play(write(folder, groups=groups, ego=ego, stop=STOP, **parts), {})  # type: ignore[arg-type]
+    return staged(folder, groups=groups, ego=ego, stop=STOP, **parts)  # type: ignore[arg-type]
 
 
 def begins(scene: Played) -> float:
@@ -193,7 +195,7 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
     assert searched.outcome.tolist() == ["invalid-test", "stopped", "stopped", "collision"]
     for value, degree in list(zip(values, searched.f_safe, strict=True))[1:]:
         own = assemble(load_study("wear", scenario={"file": file, "values": {"v": value}}))
-        alone = drive_and_score(own, own.characteristics.original[np.newaxis])
+        alone = drive_and_score(own, original_of(own))
         assert alone.f_safe[0] == pytest.approx(degree, abs=1e-9)
 
 
@@ -219,6 +221,6 @@ def test_a_route_of_ego_after_the_start_straight_on_changes_nothing(
 def test_criteria_of_carlas_scenario_runner_do_not_end_a_scene(tmp_path: Path) -> None:
     condition = '<ParameterCondition parameterRef="" value="" rule="lessThan"/>'
     criterion = trigger(condition, "").replace('name=""', 'name="criteria_CollisionTest"')
-    scene = play(write(tmp_path, stop=criterion + trigger(AT_ONCE.format(7), "")), {})
+    scene = staged(tmp_path, stop=criterion + trigger(AT_ONCE.format(7), ""))
     assert scene.duration == pytest.approx(11)
     assert "without effect here: criteria_CollisionTest" in scene.remarks

@@ -17,6 +17,7 @@ from tests.openscenario.writing import (
     group,
     lane_change,
     speed,
+    staged,
     trigger,
     watching,
     write,
@@ -119,7 +120,7 @@ def test_a_missing_catalog_that_the_file_does_not_need_is_no_fault(
 ) -> None:
     reference = '<CatalogReference catalogName="None" entryName="x"/>'
     car = body("Car").replace("</ScenarioObject>", inner.format(reference))
-    assert play(write(tmp_path, entities=body("Ego") + car), {}).others[0].shape.length == 4
+    assert staged(tmp_path, entities=body("Ego") + car).others[0].shape.length == 4
 
 
 CHANGES = {

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from tests.openscenario.writing import (
     lane_change,
     private,
     speed,
+    staged,
     teleport,
     trigger,
     watching,
@@ -44,6 +46,11 @@ DONE = "<StoryboardElementStateCondition storyboardElementType='{}' storyboardEl
 def only(played: Played) -> Moved:
     (car,) = played.others
     return car
+
+
+def car_of(folder: Path, *events: str, **parts: Any) -> Moved:
+    """The Car in the scene of such a file."""
+    return only(staged(folder, *events, **parts))
 
 
 def origin(car: Moved) -> np.ndarray:
@@ -66,9 +73,7 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def test_a_lane_change_has_its_shape_and_the_body_keeps_its_speed(
     tmp_path: Path, shape: str
 ) -> None:
-    car = only(
-        play(write(tmp_path, event(lane_change(-1, shape, "time", 4.0), AT_ONCE.format(1))), {})
-    )
+    car = car_of(tmp_path, event(lane_change(-1, shape, "time", 4.0), AT_ONCE.format(1)))
     times, place = times_of(car), origin(car)
     since = times >= 1
     left = 20 - 6 + 4 * SHAPES[shape](np.clip((times - 1) / 4, 0, 1)) * since
@@ -111,9 +116,7 @@ def test_a_lane_change_over_a_distance_takes_it_whatever_the_speed_does(
     """
     change = event(lane_change(-1, "cubic", "distance", 30.0))
     faster = event(speed(final, "linear", "rate", 2.0), name="Faster", priority="parallel")
-    played = play(
-        write(tmp_path, change, faster, stop=trigger(DONE.format("event", "Event"), "")), {}
-    )
+    played = staged(tmp_path, change, faster, stop=trigger(DONE.format("event", "Event"), ""))
     assert played.duration - 4 == pytest.approx(end, abs=STEP)
     assert origin(only(played))[round(half / STEP)].imag == pytest.approx(16, abs=0.02)
 
@@ -126,9 +129,7 @@ def test_a_linear_change_of_the_speed(
     tmp_path: Path, dimension: str, amount: float, duration: float
 ) -> None:
     """From 10 to 20 m/s in 5 s, by 2 m/s^2, on 75 m."""
-    car = only(
-        play(write(tmp_path, event(speed(20, "linear", dimension, amount), AT_ONCE.format(2))), {})
-    )
+    car = car_of(tmp_path, event(speed(20, "linear", dimension, amount), AT_ONCE.format(2)))
     times = times_of(car)
     since = np.clip(times - 2, 0, duration)
     later = np.maximum(times - 2 - duration, 0)
@@ -138,7 +139,7 @@ def test_a_linear_change_of_the_speed(
 
 
 def test_a_rate_of_zero_never_ends_and_is_said(tmp_path: Path) -> None:
-    played = play(write(tmp_path, event(speed(20, "linear", "rate", 0.0))), {})
+    played = staged(tmp_path, event(speed(20, "linear", "rate", 0.0)))
     assert set(only(played).speed) == {10.0}
     assert any("rate 0" in remark for remark in played.remarks)
 
@@ -156,7 +157,7 @@ def test_both_are_at_their_positions_at_the_same_time(
     tmp_path: Path, start: float, steady: str
 ) -> None:
     action = SYNCHRONIZE.format(at(-1, 250), at(-2, 190), 15, steady)
-    played = play(write(tmp_path, event(action), car=(teleport(at(-2, 100)), speed(start))), {})
+    played = staged(tmp_path, event(action), car=(teleport(at(-2, 100)), speed(start)))
     car, arrival = only(played), (250 - 50) / 20
     index = round(arrival / STEP)
     assert origin(car)[index].real == pytest.approx(200, abs=0.02)
@@ -169,13 +170,11 @@ def test_both_are_at_their_positions_at_the_same_time(
 def test_a_final_speed_relative_to_ego_is_one_of_that_size(tmp_path: Path) -> None:
     car = (teleport(at(-2, 100)), speed(10))
     action = SYNCHRONIZE.format(at(-1, 250), at(-2, 190), 15, "")
-    absolute = only(play(write(tmp_path, event(action), car=car), {}))
+    absolute = car_of(tmp_path, event(action), car=car)
     for value, kind in (-5, "delta"), (0.75, "factor"):
         relative = f'<RelativeSpeedToMaster value="{value}" speedTargetValueType="{kind}"/>'
         action = SYNCHRONIZE.replace('<AbsoluteSpeed value="{}">{}</AbsoluteSpeed>', relative)
-        found = only(
-            play(write(tmp_path, event(action.format(at(-1, 250), at(-2, 190))), car=car), {})
-        )
+        found = car_of(tmp_path, event(action.format(at(-1, 250), at(-2, 190))), car=car)
         assert np.array_equal(found.place, absolute.place)
 
 
@@ -196,12 +195,12 @@ VERTICES = (0.0, 100.0, 0.0), (2.0, 106.0, 8.0), (5.0, 118.0, 8.0)
 
 def test_a_trajectory_with_times_and_without(tmp_path: Path) -> None:
     timing = "<Timing domainAbsoluteRelative='relative' scale='2' offset='1'/>"
-    car = only(play(write(tmp_path, car=(polyline(*VERTICES, timing=timing),)), {}))
+    car = car_of(tmp_path, car=(polyline(*VERTICES, timing=timing),))
     place = origin(car)
     at_times = {0.5: 100, 1.0: 100, 3.0: 103 + 4j, 5.0: 106 + 8j, 8.0: 112 + 8j, 11.0: 118 + 8j}
     for time, where in at_times.items():
         assert abs(place[round(time / STEP)] - where) < 0.03
-    free = only(play(write(tmp_path, car=(polyline(*VERTICES, timing="<None/>"), speed(5))), {}))
+    free = car_of(tmp_path, car=(polyline(*VERTICES, timing="<None/>"), speed(5)))
     for time, where in {2.0: 106 + 8j, 1.0: 103 + 4j, 4.0: 116 + 8j, 6.0: 126 + 8j}.items():
         assert abs(origin(free)[round(time / STEP)] - where) < 1e-6
 
@@ -211,7 +210,7 @@ def test_a_trajectory_ends_where_its_line_ends(tmp_path: Path) -> None:
     along = event(polyline(*VERTICES, timing="<None/>"), AT_ONCE.format(1))
     then = event(speed(9), DONE.format("event", "Event"), "Then")
     car = teleport(at(-2, 90)), speed(5)
-    played = play(write(tmp_path, along, then, car=car), {})
+    played = staged(tmp_path, along, then, car=car)
     assert played.events[0][3] == pytest.approx(5.4)
     assert np.flatnonzero(only(played).speed > 5)[0] * STEP == pytest.approx(5.4)
 
@@ -221,7 +220,7 @@ def test_who_leaves_a_trajectory_with_times_keeps_its_speed(tmp_path: Path) -> N
     vertices = (0.0, 100.0, 14.0), (4.0, 124.0, 14.0)
     timing = "<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>"
     change = event(lane_change(-1, "linear", "time", 2), AT_ONCE.format(1))
-    car = only(play(write(tmp_path, change, car=(polyline(*vertices, timing=timing),)), {}))
+    car = car_of(tmp_path, change, car=(polyline(*vertices, timing=timing),))
     steps = np.abs(np.diff(origin(car)))
     assert np.abs(steps - 6 * STEP).max() < 1e-6
     assert origin(car)[300:].imag == pytest.approx(18)
@@ -232,19 +231,19 @@ def test_a_clothoid_has_times(tmp_path: Path) -> None:
     clothoid = f'<Clothoid curvature="0" curvaturePrime="0" length="24" startTime="1" stopTime="4"><Position>{world(100, 14)}</Position></Clothoid>'
     action = polyline(timing="<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>")
     action = re.sub("<Polyline>.*</Polyline>", clothoid, action)
-    car = only(play(write(tmp_path, car=(action,)), {}))
+    car = car_of(tmp_path, car=(action,))
     assert origin(car)[[0, 100, 250, 400]] == pytest.approx(
         np.array([100, 100, 112, 124]) + 14j, abs=0.05
     )
     closed = action.replace('closed="false"', 'closed="true"')
     with pytest.raises(InputError, match="a closed Trajectory is not supported"):
-        play(write(tmp_path, car=(closed,)), {})
+        staged(tmp_path, car=(closed,))
 
 
 def test_a_distance_is_kept_between_bodies(tmp_path: Path) -> None:
     action = """<LongitudinalAction><LongitudinalDistanceAction entityRef="Ego" freespace="true" distance="30"
     displacement="leadingReferencedEntity" continuous="false"/></LongitudinalAction>"""
-    played = play(write(tmp_path, car=(action, teleport(at(-1, 500)), speed(20))), {})
+    played = staged(tmp_path, car=(action, teleport(at(-1, 500)), speed(20)))
     car = only(played)
     assert car.place[0].real - 2.5 - played.start.place.real == pytest.approx(30)
 
@@ -275,8 +274,8 @@ def test_a_trigger_that_watches_ego(tmp_path: Path, condition: str, when: float)
     """Ego, 4 m long, drives at 20 m/s, 50 m behind the origin of a Car of 5 m at 10 m/s in the next
     lane.
     """
-    played = play(
-        write(tmp_path, event(lane_change(-1, "linear", "time", 2), watching("Ego", condition))), {}
+    played = staged(
+        tmp_path, event(lane_change(-1, "linear", "time", 2), watching("Ego", condition))
     )
     begins = np.flatnonzero(np.abs(np.diff(origin(only(played)).imag)) > 1e-9)[0] * STEP
     assert begins == pytest.approx(when, abs=2 * STEP)
@@ -290,7 +289,7 @@ def test_edges_and_delays(tmp_path: Path, edge: str, delay: float, when: float) 
     rule = "lessThan' value='5" if edge == "falling" else "greaterOrEqual' value='3"
     condition = f"<SimulationTimeCondition rule='{rule}'/>"
     start = trigger(condition, edge=edge, delay=delay)
-    car = only(play(write(tmp_path, event(speed(20, "linear", "rate", 2), start)), {}))
+    car = car_of(tmp_path, event(speed(20, "linear", "rate", 2), start))
     assert np.flatnonzero(car.speed > 10)[0] * STEP == pytest.approx(when, abs=2 * STEP)
 
 
@@ -299,7 +298,7 @@ def test_one_event_ends_another(tmp_path: Path) -> None:
     first = event(lane_change(-1, "linear", "time", 4), AT_ONCE.format(1), "First")
     second = event(speed(20, "linear", "time", 1), trigger(begun, delay=2), "Second", "{}")
     for priority, left in (("override", 16.0), ("parallel", 18.0)):
-        car = only(play(write(tmp_path, first, second.format(priority)), {}))
+        car = car_of(tmp_path, first, second.format(priority))
         assert origin(car)[-1].imag == pytest.approx(left, abs=0.02)
         assert car.speed[-1] == 20
 
@@ -312,9 +311,7 @@ def test_an_empty_trigger_starts_at_once_and_never_stops(tmp_path: Path, stop: s
     scene ends.
     """
     faster = event(speed(20, "linear", "time", 2), "<StartTrigger></StartTrigger>")
-    empty = play(
-        write(tmp_path, faster, act_trigger="<StartTrigger/><StopTrigger/>", stop=stop), {}
-    )
+    empty = staged(tmp_path, faster, act_trigger="<StartTrigger/><StopTrigger/>", stop=stop)
     assert only(empty).speed[[100, 250]].tolist() == [pytest.approx(15), 20]
     assert (empty.duration, "the scene ends at 60 s" in empty.remarks[0]) == (60, True)
 
@@ -340,8 +337,8 @@ def test_lanes_count_to_the_left_of_an_entity_as_it_faces(
 ) -> None:
     """On lanes with a number above 0 they drive against the others."""
     start = private("Ego", teleport(at(ego, 900)), speed(20))
-    played = play(
-        write(tmp_path, event(action), ego=start, car=(teleport(at(its_lane, 900)), speed(10))), {}
+    played = staged(
+        tmp_path, event(action), ego=start, car=(teleport(at(its_lane, 900)), speed(10))
     )
     assert origin(only(played))[-1].imag == pytest.approx(20 + left)
 
@@ -370,7 +367,7 @@ def test_an_orientation_is_absolute_or_relative(
     """The road leads to the east, lane 1 and the trajectory to the west. A remark says how lanes
     are understood.
     """
-    played = play(write(tmp_path, car=(teleport(place), speed(0)), minor=minor), {})
+    played = staged(tmp_path, car=(teleport(place), speed(0)), minor=minor)
     assert only(played).facing[0] == pytest.approx(np.exp(1j * (0.5 + turned * math.pi)))
     assert any("driving direction" in remark for remark in played.remarks) == (
         turned and "Lane" in place
@@ -400,7 +397,7 @@ def test_the_way_through_a_bend_counts_where_the_body_is(tmp_path: Path) -> None
     )
     ego = private("Ego", teleport(world(0, -300)), speed(20))
     car = (teleport(at(-1, 0)), speed(10))
-    played = play(write(tmp_path, car=car, ego=ego, geometry=geometry, length=bend), {})
+    played = staged(tmp_path, car=car, ego=ego, geometry=geometry, length=bend)
     place, angle = origin(only(played)), 10 * times_of(only(played)) / 102
     assert np.abs(place - (100j + 102 * np.exp(1j * (angle - math.pi / 2)))).max() < 1e-3
 
@@ -430,7 +427,7 @@ def test_files_of_our_own_have_the_numbers_of_a_second_simulator() -> None:
 
 
 def test_an_ego_in_the_left_lane_drives_against_s(tmp_path: Path) -> None:
-    played = play(write(tmp_path, ego=private("Ego", teleport(at(1, 500)), speed(20))), {})
+    played = staged(tmp_path, ego=private("Ego", teleport(at(1, 500)), speed(20)))
     assert played.start.facing == -1
     assert played.start.place == pytest.approx(10 + 500 - 3.5 + 22j)
 
@@ -467,8 +464,8 @@ def test_a_selection_acts_and_is_watched_as_its_members(tmp_path: Path) -> None:
     )
     far = watching("All", '<TraveledDistanceCondition value="30"/>')
     slower = group(event(speed(5, "linear", "time", 2.0), far), actor="All")
-    of_all = only(play(write(tmp_path, groups=slower, entities=entities), {}))
-    of_car = only(play(write(tmp_path, groups=slower.replace("All", "Car")), {}))
+    of_all = car_of(tmp_path, groups=slower, entities=entities)
+    of_car = car_of(tmp_path, groups=slower.replace("All", "Car"))
     assert of_all.speed[-1] == 5
     assert np.array_equal(of_all.place, of_car.place)
 
@@ -476,6 +473,6 @@ def test_a_selection_acts_and_is_watched_as_its_members(tmp_path: Path) -> None:
 def test_who_acquires_a_position_straight_ahead_drives_on(tmp_path: Path) -> None:
     goal = f"<RoutingAction><AcquirePositionAction><Position>{at(-2, 900)}</Position></AcquirePositionAction></RoutingAction>"
     end = trigger(watching("Ego", '<EndOfRoadCondition duration="1"/>'), "")
-    found = only(play(write(tmp_path, car=(goal, teleport(at(-2, 100)), speed(10)), stop=end), {}))
-    without = only(play(write(tmp_path, stop=""), {}))
+    found = car_of(tmp_path, car=(goal, teleport(at(-2, 100)), speed(10)), stop=end)
+    without = car_of(tmp_path, stop="")
     assert np.array_equal(found.place, without.place)

@@ -21,6 +21,7 @@ from tests.openscenario.writing import (
     lane_change,
     private,
     speed,
+    staged,
     teleport,
     write,
 )
@@ -63,14 +64,11 @@ def test_what_happens_less_than_the_file_says_is_remarked(tmp_path: Path) -> Non
         + EGO
         + private("Car", teleport(at(-2, 1900)), speed(30))
     )
-    played = play(write(tmp_path, late, init=actions), {})
+    played = staged(tmp_path, late, init=actions)
     assert "without effect here: EnvironmentAction" in played.remarks
     assert "the event Event never fires" in played.remarks
     often = late.replace("<Event ", '<Event maximumExecutionCount="3" ')
-    assert (
-        "the event Event is played once, of up to 3 times"
-        in play(write(tmp_path, often), {}).remarks
-    )
+    assert "the event Event is played once, of up to 3 times" in staged(tmp_path, often).remarks
     assert any(
         "the scene ends at 3.3 s, when Car is at the end of its road" in remark
         for remark in played.remarks

@@ -19,7 +19,17 @@ from safevar_sumo.sumo.matrix import MAX_VEHICLES, drive_and_score, largest_batc
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of
 from tests.openscenario import writing
-from tests.openscenario.writing import AT_ONCE, at, event, private, speed, teleport, trigger, world
+from tests.openscenario.writing import (
+    AT_ONCE,
+    at,
+    event,
+    private,
+    speed,
+    staged,
+    teleport,
+    trigger,
+    world,
+)
 from tests.scenarios.holding import driven
 
 LONG = {
@@ -108,9 +118,7 @@ def test_what_happens_to_an_ego_that_keeps_its_speed(tmp_path: Path, scene: str)
     other = {"car": car, "walker": walker}[kind](*map(float, numbers))
     ego = private("Ego", teleport(STARTS.get(first, at(-1, 50))), speed(20))
     entities = {"entities": PERSON} if kind == "walker" else {}
-    found = play(
-        writing.write(tmp_path, EVENTS.get(first, ""), car=other, ego=ego, **entities), {}
-    ).uneventful
+    found = staged(tmp_path, EVENTS.get(first, ""), car=other, ego=ego, **entities).uneventful
     nobody = f"the scene ends at {third} s, before Ego has come near anybody"
     assert found == {"-": "", "NO_EVENT": NO_EVENT}.get(third, nobody)
 

@@ -6,6 +6,9 @@ and a Car.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+from safevar_sumo.openscenario import Played, play
 
 ROAD = """<OpenDRIVE><header revMajor="1" revMinor="6"/>
 <road name="" length="{length}" id="1" junction="-1"><planView>{geometry}</planView><lanes><laneSection s="0">
@@ -144,3 +147,8 @@ def write(
     path = folder / "scenario.xosc"
     path.write_text(FILE.format(**found))
     return str(path)
+
+
+def staged(folder: Path, *events: str, **parts: Any) -> Played:
+    """The scene of a file in which a Car has these events."""
+    return play(write(folder, *events, **parts), {})

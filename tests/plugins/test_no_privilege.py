@@ -38,8 +38,11 @@ FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 """Those that are copied in every run of the tests; all others are slow together."""
 
 
-def each(names: Iterable[str]) -> list[Any]:
-    return [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in names]
+def each(names: Iterable[str], *others: str) -> list[Any]:
+    return [
+        pytest.param(name, *others, marks=() if name in FAST else pytest.mark.slow)
+        for name in names
+    ]
 
 
 def copied(model: Any, folder: Path) -> str:
@@ -141,51 +144,51 @@ def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_
     assert names[0] == names[1] != []
 
 
-@pytest.mark.parametrize("name", each(VEHICLES))
-def test_a_vehicle_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
+@pytest.mark.parametrize(("name", "table"), [*each(VEHICLES, "vehicle"), *each(ADS, "ads")])
+def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
+    name: str, table: str, in_tmp: Path
+) -> None:
     base = next(
-        study
-        for study in ("sun", "lgsvl", "native", "wear")
-        if load_study(study).vehicle.model == name
-    )
-    ours = load_study(base, matrix=None)
-    vehicle = msgspec.structs.replace(ours.vehicle, model=copied(VEHICLES[name], in_tmp))
-    assert_equal(ours, msgspec.structs.replace(ours, vehicle=vehicle))
-
-
-@pytest.mark.parametrize("name", each(ADS))
-def test_a_driving_system_in_a_users_file_is_the_same(name: str, in_tmp: Path) -> None:
-    base = next(
-        (one for one in ("sun", "lgsvl", "native", "wear") if load_study(one).ads.model == name),
+        (
+            one
+            for one in ("sun", "lgsvl", "native", "wear")
+            if getattr(load_study(one), table).model == name
+        ),
         None,
     )
-    parameters = {} if base is None else load_study(base).ads.parameters
-    own = copied(ADS[name], in_tmp)
-    ours, theirs = (
-        load_study(base or "wear", matrix=None, ads={"model": model, "parameters": parameters})
-        for model in (name, own)
+    ours = load_study(base or "wear", matrix=None, **{} if base else {table: {"model": name}})
+    own = msgspec.structs.replace(
+        getattr(ours, table), model=copied({**VEHICLES, **ADS}[name], in_tmp)
     )
-    assert_equal(ours, theirs)
+    assert_equal(ours, msgspec.structs.replace(ours, **{table: own}))
+
+
+def assert_same_solutions(ours: Study, theirs: Study, folder: Path) -> None:
+    """Searches of both find the same solutions; the name of a copied algorithm is another one."""
+    tables = [
+        load_runs(searched(study, folder / f"results{number}"))
+        .solutions.drop(columns=["algorithm", "handle"], errors="ignore")
+        .to_csv(index=False)
+        for number, study in enumerate((ours, theirs))
+    ]
+    assert tables[0] == tables[1]
+
+
+def short(study: str, algorithm: str) -> Study:
+    """A study with a short search by one algorithm."""
+    search = {"algorithms": [algorithm], "runs": 1, "population": 10, "evaluations": 40}
+    return load_study(study, search=search)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", each(ALGORITHMS))
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
 ) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
     (in_tmp / "named.py").write_text(f"from {module} import {class_}\n\n{name} = {class_}\n")
-    tables = []
-    for number, model in enumerate((name, f"named:{name}")):
-        search = {"algorithms": [model], "runs": 1, "population": 10, "evaluations": 40}
-        rows = load_runs(
-            searched(load_study("smoke", search=search), in_tmp / f"results{number}")
-        ).solutions
-        tables.append(
-            rows.drop(columns=["algorithm", "handle"], errors="ignore").to_csv(index=False)
-        )
-    assert tables[0] == tables[1]
+    assert_same_solutions(short("smoke", name), short("smoke", f"named:{name}"), in_tmp)
 
 
 def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> None:
@@ -259,15 +262,8 @@ def with_own_models(study: Study, folder: Path) -> Study:
 def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
 ) -> None:
-    ours = load_study(
-        name, search={"algorithms": ["nsga2"], "runs": 1, "population": 10, "evaluations": 30}
-    )
-    for number, study in enumerate((ours, with_own_models(ours, in_tmp))):
-        searched(study, in_tmp / f"results{number}")
-    solutions = [
-        (in_tmp / f"results{number}" / "solutions.csv").read_bytes() for number in range(2)
-    ]
-    assert solutions[0] == solutions[1]
+    ours = short(name, "nsga2")
+    assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
 
 
 @pytest.mark.slow

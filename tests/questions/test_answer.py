@@ -282,22 +282,6 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
         sv.rules("wear", point="CPFB")
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("worker_processes")
-def test_the_same_bytes_whatever_the_number_of_workers(slippery: Path) -> None:
-    for question, *flags in (
-        ("explain", "--limit", "300", "--top", "1", "--fits", "0"),
-        ("tolerance", "--characteristics", "mass,tireFric", "--fits", "0", "--attack", "500"),
-        ("risk", "--samples", "300"),
-        ("compare", str(slippery), "--samples", "100"),
-    ):
-        one, two = (
-            run(question, str(slippery), *flags, "--json", "--jobs", jobs).stdout
-            for jobs in ("1", "2")
-        )
-        assert one == two
-
-
 def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     changes = {"recognition_delay": 0.1, "mass": 2644.4}
     texts = change_texts(CharacteristicSet.of(load_study("sun_joint")), changes)

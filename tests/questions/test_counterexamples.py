@@ -28,6 +28,7 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool
+from tests.made_up import original_of
 from tests.questions.conftest import made_up_evaluator, made_up_study
 
 ONE_TEST = """
@@ -204,21 +205,30 @@ def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     assert within.holds(found[""].setting[np.newaxis])[0]
 
 
-@pytest.mark.parametrize("edge", [6.0, 7.77, 9.99])
-def test_a_reach_ends_just_before_a_planted_boundary(edge: float) -> None:
-    """Unsafe is a above `edge` where b is within 0.4 of 8: a narrow pocket."""
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("edge", [1.0, 2.77, 4.99, 0.0, -0.1])
+def test_a_reach_ends_just_before_a_planted_boundary_at_its_start_or_nowhere(
+    edge: float, side: int
+) -> None:
+    """Unsafe is a beyond `edge` from the original, on either side, where b is within 0.4 of 8: a
+    narrow pocket.
+    """
 
     def pocket(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > edge) & (np.abs(rows[:, 1] - 8) < 0.4))
+        return np.asarray((side * (rows[:, 0] - 5) > edge) & (np.abs(rows[:, 1] - 8) < 0.4))
 
     evaluator = made_up_evaluator(2, pocket)
-    box = Box(evaluator.region, np.array([5.0, 0.0]), np.array([10.0, 10.0]))
+    ends = np.sort([[5.0, 0.0], [5.0 + 5 * side, 10.0]], axis=0)
     judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
-    found = reach(box, (1, 0), 5.0, judges, LEAST_SIMULATIONS, (1,))
+    found = reach(
+        Box(evaluator.region, *ends), (int(side > 0), 0), 5.0, judges, LEAST_SIMULATIONS, (1,)
+    )
+    if edge < 0:
+        assert found.value is None
+        return
     assert found.value is not None
-    assert edge - 0.11 <= found.value <= edge
-    assert found.falsification is not None
-    assert found.falsification.simulated >= LEAST_SIMULATIONS
+    assert edge - 0.11 <= side * (found.value - 5) <= edge
+    assert edge == 0 or found.falsification.simulated >= LEAST_SIMULATIONS  # type: ignore[union-attr]
 
 
 def test_a_falsification_names_the_model_that_fails() -> None:
@@ -230,31 +240,6 @@ def test_a_falsification_names_the_model_that_fails() -> None:
     found = falsify_limits(box, judges_of(models, "falsification"), 2000, (1,))
     assert [*found.failures] == [1]
     assert (found.failures[1][:, 1] > 9.5).all()
-
-
-@pytest.mark.parametrize("edge", [4.0, 2.33, 0.01])
-def test_a_reach_of_a_lower_end_is_its_mirror_image(edge: float) -> None:
-    """Unsafe is a below `edge`, where b is within 0.4 of 8."""
-
-    def pocket(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] < edge) & (np.abs(rows[:, 1] - 8) < 0.4))
-
-    evaluator = made_up_evaluator(2, pocket)
-    box = Box(evaluator.region, np.array([0.0, 0.0]), np.array([5.0, 10.0]))
-    judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
-    found = reach(box, (0, 0), 5.0, judges, LEAST_SIMULATIONS, (1,))
-    assert found.value is not None
-    assert edge <= found.value <= edge + 0.11
-
-
-def test_a_reach_ends_at_its_start_or_nowhere() -> None:
-    box = Box(region_of(made_up_study(2)), np.array([5.0, 0.0]), np.array([10.0, 10.0]))
-    values = []
-    for edge in (5.0, 4.9):
-        evaluator = made_up_evaluator(2, lambda rows, edge=edge: np.asarray(rows[:, 0] > edge))
-        judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
-        values.append(reach(box, (1, 0), 5.0, judges, LEAST_SIMULATIONS, (1,)).value)
-    assert values == [5.0, None]
 
 
 @pytest.mark.parametrize(
@@ -310,6 +295,6 @@ def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> No
         and dict(point.parameters).get("speed") == float(said[3])
         and dict(point.parameters).get("impact_location") == float(said[4])
     ]
-    runs = drive_and_score(system.at(named[0]), system.characteristics.original[np.newaxis])
+    runs = drive_and_score(system.at(named[0]), original_of(system))
     assert -runs.f_safe[0] == pytest.approx(float(said[1]), abs=0.005)
     assert "with the study's own parameter set" in answer.tables["limits"].attrs["title"]

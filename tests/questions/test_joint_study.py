@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.identity import identity_digest, manifest_of
-from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run, searched
 
@@ -144,44 +142,6 @@ def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feas
     strict = load_study(case.study, scenario={"margin": 2.0})
     assert assemble(strict).measuring.scoring.safe_original == 2
     assert identity_digest(manifest_of(strict, {})) != identity_digest(manifest_of(case.study, {}))
-
-
-@pytest.mark.slow
-def test_limits_together_are_not_wider_than_those_alone() -> None:
-    answer = json_of(
-        "tolerance", "tiny.toml", "--fits", "0", "--characteristics", "tireFric,radius"
-    )
-    assert re.search(DEMANDED, answer["tested"])
-    rows: list[dict[str, Any]] = answer["tables"]["limits"]["rows"]
-    assert any(one["alone_low"] > 30 for one in rows)
-    for one in rows:
-        assert one["alone_low"] <= one["together_low"] <= one["together_high"] <= one["alone_high"]
-
-
-@pytest.mark.slow
-def test_a_vehicle_that_keeps_the_printed_limits_survives_encounters_that_nobody_drew_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """All corners of what is printed, each in a thousand new encounters in which the original
-    vehicle is safe.
-    """
-    monkeypatch.undo()  # as many encounters as a user's answer has
-    names = "tireFric,maxBrakeTorque,dampRateZeroT_CE"
-    answer = json_of("tolerance", "sun_joint", "--fits", "0", "--characteristics", names)
-    rows = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
-    assert all(row["together_low"] < row["together_high"] for row in rows.values())
-    system = assemble(load_study("sun_joint"))
-    members, rng = system.characteristics, np.random.default_rng(99)
-    settings = members.lower + rng.random((8000, len(members))) * (members.upper - members.lower)
-    settings[:, members.of_vehicle] = members.original[members.of_vehicle]
-    for name, row in rows.items():
-        ends = row["together_low"], row["together_high"]
-        settings[:, members.names.index(name)] = np.where(rng.random(len(settings)) < 0.5, *ends)
-    evaluations = drive_and_score(system, settings)
-    counts = system.measuring.scoring.violation(evaluations) == 0
-    assert counts.sum() > 4000
-    assert (evaluations.collided & counts).sum() <= 1
-    assert "All corner cases in 32,768 encounters" in answer["tested"]
 
 
 WORN = {

@@ -9,7 +9,6 @@ import re
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import safevar_sumo as sv
@@ -18,22 +17,10 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.measure import STAGE, study_by
-from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.records import Evaluations, FloatArray
 from tests.in_process import json_of, run, searched
+from tests.made_up import HARDEST_BRAKING
 
-METRIC = """
-import numpy as np
-from safevar_sumo.metrics import Measure
-
-def hardest(runs, thresholds):
-    loss = np.max(-np.diff(runs.trace.speed, axis=0), axis=0, initial=0.0) / runs.trace.step
-    return np.where(np.isnan(runs.collision_speed), loss, np.nan)
-
-HARDEST = Measure(
-    name="hardest", title="hardest", unit="m/s^2", more_is_unsafe=True, function=hardest
-)
-"""
 STUDY = """
 extends = "rain"
 name = "tiny"
@@ -50,7 +37,7 @@ runs = 1
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Path:
-    (tmp_path / "hardest_braking.py").write_text(METRIC)
+    (tmp_path / "hardest_braking.py").write_text(HARDEST_BRAKING)
     (tmp_path / "tiny.toml").write_text(STUDY)
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -168,7 +155,7 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
 
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
     (folder / "nowhere.py").write_text(
-        METRIC.replace("return np.where", "return np.nan * np.where")
+        HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")
     )
     (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
     verdict = json_of("risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8")[
@@ -179,53 +166,3 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
     )
     undefined, simulated = (int(text.replace(",", "")) for text in counts)
     assert 0 < undefined < simulated, "some of all collide"
-
-
-@pytest.mark.slow
-def test_limits_by_a_measure_are_obeyed(folder: Path) -> None:
-    """300 cars within the limits together: none brakes harder, and none collides."""
-    few = ("--characteristics", "tireFric,maxBrakeTorque")
-    answer = json_of(
-        "tolerance",
-        "tiny.toml",
-        "--fits",
-        "0",
-        "--attack",
-        "500",
-        "--unsafe",
-        "hardest > 6.8",
-        *few,
-    )
-    limits = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
-    rng = np.random.default_rng(3)
-    ends = {name: (row["together_low"], row["together_high"]) for name, row in limits.items()}
-    cars = [{name: float(rng.uniform(*both)) for name, both in ends.items()} for _ in range(300)]
-    found = sv.evaluate("tiny.toml", cars, filtered=False, jobs=1)
-    assert answer["numbers"]["box"]
-    assert (found["outcome"] != "collision").all()
-    assert found["hardest"].max() <= 6.8
-    assert answer["numbers"]["least_attacked"] <= 6.8
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("coarse")
-def test_limits_of_the_matrix_by_drac_are_obeyed_in_every_fit() -> None:
-    """500 cars within the limits together, in each fit, at all points of the matrix: the worst one
-    by DRAC counts.
-    """
-    answer = json_of("tolerance", "wear", "--unsafe", "drac > 8")
-    rows = answer["tables"]["limits"]["rows"]
-    ends = {row["characteristic"]: (row["together_low"], row["together_high"]) for row in rows}
-    assert answer["numbers"]["box"]
-    rng = np.random.default_rng(5)
-    cars = [
-        {name: float(rng.choice([*both, rng.uniform(*both)])) for name, both in ends.items()}
-        for _ in range(500)
-    ]
-    fits = studies_of_sets(study_by(load_study("wear"), Unsafe.parse("drac > 8")))
-    assert answer["numbers"]["fits"] == answer["numbers"]["fits_tried"] == len(fits)
-    assert f"in {len(fits)} of {len(fits)} parameter sets" in answer["verdict"]
-    for fit in fits:
-        found = sv.evaluate(fit, cars, filtered=False, jobs=1)
-        assert (found["outcome"] != "collision").all()
-        assert found["drac"].max() <= 8

@@ -33,6 +33,7 @@ from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
+from tests.made_up import original_of
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -295,12 +296,7 @@ def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_d
         problem: Any = RepairProblem(
             evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3)
         )  # type: ignore[arg-type]
-        assert (
-            problem.best_driver.evaluator.evaluate(
-                evaluator.characteristics.original[np.newaxis], ""
-            ).f_safe[0]
-            > 0.3
-        )
+        assert problem.best_driver.evaluator.evaluate(original_of(evaluator), "").f_safe[0] > 0.3
 
 
 def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_first(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,15 +20,12 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.tolerance import search
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.words import one_set_in_words
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import run
 from tests.made_up import case_of
@@ -304,63 +300,6 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     ]
 
 
-MANUAL = re.compile(r"(at least|at most) (\d+(?:\.\d+)?)")
-"""A limit in a sentence of a maintenance manual."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "limit", "own"),
-    [
-        ("wear", "treadDepth >= 3", "at least 3 mm"),
-        ("native", "decel >= 7", "7 m/s"),
-        ("rain", "tireFric >= 3", "at least 3"),
-    ],
-)
-def test_a_car_that_keeps_all_printed_limits_is_safe_at_every_point_in_every_fit(
-    name: str, limit: str, own: str
-) -> None:
-    """All sentences obeyed at once, in every combination of ends and by 200 cars within them: it
-    keeps the margin with the study's own fit, and collides with none.
-    """
-    study = load_study(name)
-    answer = tolerance(study, limits=[limit], attack=500, jobs=2)
-    numbers, limits = answer.numbers, answer.to_dict()["tables"]["limits"]["rows"]
-    margin = study.model_error.get("safety_degree", 0.3)
-    assert (numbers["margin"], numbers["kept"]) == (margin, True)
-    characteristics = CharacteristicSet.of(study)
-    ends = []
-    for item, row in zip(characteristics, limits, strict=True):
-        demand = re.split(r"\. (?:At|Scope)", row["sentence"])[0]
-        keep = {word: float(text) for word, text in MANUAL.findall(demand)}
-        ends.append((keep.get("at least", item.lower), keep.get("at most", item.upper)))
-        assert ends[-1] == (row["together_low"], row["together_high"]), "as printed"
-    (specified,) = (row["sentence"] for row in limits if row["specified_low"] is not None)
-    assert own in specified
-    lower, upper = np.transpose(ends)
-    corners = np.unique(np.array(list(product(*ends))), axis=0)
-    settings = np.concatenate(
-        [corners, np.random.default_rng(7).uniform(lower, upper, (200, len(ends)))]
-    )
-    studies = studies_of_sets(study) if study.spread else [study]
-    left_out = {
-        row["fit"]
-        for row in answer.to_dict()["tables"].get("fits", {"rows": []})["rows"]
-        if row["specified"] == "left out"
-    }
-    assert numbers["fits"] == numbers["fits_tried"] == len(studies) - len(left_out)
-    contact = 4.7 if name == "native" else 0.0  # the vehicle's length
-    for fit, fitted in enumerate(studies):
-        for result in simulate_all_points(assemble(fitted), settings):
-            if fit in left_out:
-                continue
-            assert not result.evaluations.collided.any(), (fit, result.point.name)
-            assert np.nanmin(result.evaluations.f_safe) >= contact + (0.0 if fit else margin), (
-                fit,
-                result.point.name,
-            )
-
-
 @pytest.mark.slow
 def test_the_margin_is_added_to_a_collision_alone() -> None:
     """Safety degrees are 8 - |a - 5|, and 1 m less than 5 m is left from a = 8 on."""
@@ -383,13 +322,6 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
     assert ends(unsafe="below=4.5") == ("below=4.5", 0, 8.5)
     with pytest.raises(InputError, match=r"5 m beside 'below=4\.5'"):
         ends(unsafe="below=4.5", margin=5)
-
-
-@pytest.mark.slow
-def test_gaps_are_between_bumpers() -> None:
-    said = run("tolerance", "native", "--characteristics", "decel", "--jobs", "1").stdout
-    assert "every vehicle that was tested within them keeps at least 0.3 m" in said
-    assert "the car keeps less than 0.3 m from a standing vehicle" in said
 
 
 def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:

@@ -21,7 +21,7 @@ from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.made_up import made_up_evaluations
+from tests.made_up import made_up_evaluations, original_of
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
@@ -179,7 +179,7 @@ def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(
     """Rain's published vehicle is one simulation, 0.3 to 0.4 m above its own neighbours."""
     read = load_study(study)
     system = assemble(read)
-    settings = system.characteristics.original[np.newaxis]
+    settings = original_of(system)
     here = score(system, settings, drive_worst(system, settings)).metrics
     for name, share in within.items():
         assert here[name][0] == pytest.approx(read.published[name], rel=share), name

@@ -188,15 +188,6 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
     assert claim["claim"] == "answer risk --samples 300"
     assert claim["packed"].startswith('"probability": 0.')
     assert claim["here"] == f'"probability": {answers[1]["numbers"]["probability"]},'
-    (claim,) = not_same(
-        changed(
-            pack,
-            tmp_path / "it.zip",
-            "report.html",
-            lambda text: text.replace("-&gt; ", "-&gt; 9", 1),
-        )
-    )
-    assert claim["claim"] == "report"
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import verify_everywhere
+from tests.made_up import original_of
 from tests.scenarios.holding import Hold, at_contact, driven
 from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
 
@@ -158,7 +159,7 @@ def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_t
         ({"model": "competent_driver", "parameters": ANY}, too_fast),
     ):
         system = assemble(load_study("alks", ads=ads))
-        results = simulate_all_points(system, system.characteristics.original[np.newaxis])
+        results = simulate_all_points(system, original_of(system))
         degrees = {
             point.name: result.evaluations.f_safe[0]
             for point, result in zip(system.points, results, strict=True)

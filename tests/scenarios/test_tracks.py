@@ -20,6 +20,7 @@ from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import verify_everywhere
+from tests.made_up import original_of
 from tests.scenarios.holding import Hold, driven
 
 LENGTH, WIDTH = 4.9016, 2.1284
@@ -117,7 +118,7 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     }
     system = assemble(load_study(wear, scenario=scenario))
     assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2
-    run = drive_worst(system, system.characteristics.original[np.newaxis])
+    run = drive_worst(system, original_of(system))
     end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
     assert run.outcome[0] == Outcome.PASSED
     assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], (

@@ -14,16 +14,16 @@ import pytest
 from safevar_sumo.api.running import run
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.runs import algorithm_of
-from safevar_sumo.errors import InputError, SafevarError
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.questions.research_questions.answer import tables
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
-from safevar_sumo.results import load_runs, read_manifest
+from safevar_sumo.results import read_manifest
 from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import FormulaPool, carried_out, solutions
+from tests.campaign.formulas import carried_out
 from tests.search.test_algorithms import POPULATION, begun, built, sphere
 from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
 
@@ -211,22 +211,6 @@ def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "pymoo.config", None)
     with pytest.raises(InputError, match=r"pip install '\.\[pymoo\]'"):
         pymoo_algorithm("pymoo:GA")
-
-
-MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
-
-
-def test_an_interrupted_study_ends_as_if_it_had_never_been_and_batches_change_nothing(
-    tmp_path: Path,
-) -> None:
-    study = with_pymoo(MIXED, evaluations=60, parameters={"pymoo:NSGA3": {"ref_dirs": 3}})
-    carried_out(study, tmp_path / "whole")
-    with pytest.raises(SafevarError, match="broken down"):
-        carried_out(study, tmp_path / "out", FormulaPool(limit=9), batch=7)
-    carried_out(study, tmp_path / "out", batch=11)
-    assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
-    names = set(load_runs(tmp_path / "out").solutions["algorithm"])
-    assert names == {"nsga2", "pymoo_NSGA3", "pymoo_CMAES", "pymoo_MOEAD"}
 
 
 def test_an_algorithm_may_come_later_but_not_with_another_pymoo(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run, verify_everywhere
+from tests.made_up import original_of
 from tests.openscenario.writing import (
     AT_ONCE,
     PARAMETER,
@@ -48,10 +49,7 @@ def study_of(file: str, **scenario: Any) -> Study:
 
 def runs_of(study: Study) -> list[SimulationRuns]:
     system = assemble(study)
-    return [
-        result.runs
-        for result in simulate_all_points(system, system.characteristics.original[np.newaxis])
-    ]
+    return [result.runs for result in simulate_all_points(system, original_of(system))]
 
 
 def test_a_concrete_file_is_one_scenario_and_drops_what_is_inherited() -> None:
@@ -169,7 +167,7 @@ def test_encounters_of_a_search_are_those_of_single_files() -> None:
 @pytest.mark.slow
 def test_sumo_repeats_a_run() -> None:
     system = assemble(study_of(str(FILES / "crossing_pedestrian.xosc")))
-    settings = system.characteristics.original[np.newaxis]
+    settings = original_of(system)
     (result,) = simulate_all_points(system, settings)
     assert result.runs.outcome[0] != Outcome.INVALID_TEST
     (point,) = system.points

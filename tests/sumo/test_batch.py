@@ -15,7 +15,7 @@ from safevar_sumo.sumo.drive import _Outcomes
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
-from tests.made_up import drawn
+from tests.made_up import drawn, original_of
 
 
 @pytest.mark.slow
@@ -40,7 +40,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
 def test_the_original_vehicle_does_not_collide(
     any_system: System, request: pytest.FixtureRequest
 ) -> None:
-    original = drive_and_score(any_system, any_system.characteristics.original[np.newaxis])
+    original = drive_and_score(any_system, original_of(any_system))
     if request.node.callspec.id == "autoware_december":  # what docs/autoware.md is about
         assert original.outcome[0] == Outcome.COLLISION
         return

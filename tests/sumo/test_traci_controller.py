@@ -18,6 +18,7 @@ from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
+from tests.made_up import original_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 SCRIPT = """
@@ -182,7 +183,7 @@ def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -
 
 def test_the_vehicle_model_limits_a_commanded_acceleration() -> None:
     runs = system("Harsh")
-    run = drive_worst(runs, runs.characteristics.original[np.newaxis])
+    run = drive_worst(runs, original_of(runs))
     hardest = -np.diff(run.trace.speed[:, 0]).min() / run.trace.step
     assert 7 < hardest < 9.0  # more than SUMO's driver, who plans with 4.5 m/s^2
     assert run.outcome[0] == Outcome.STOPPED

@@ -23,7 +23,7 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import DelayedSignal
-from tests.made_up import seen
+from tests.made_up import original_of, seen
 from tests.vehicles.runs import (
     STEP,
     STUDY_OF,
@@ -279,7 +279,7 @@ def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path)
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
     traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
     system = assemble(load_study(study, scenario={"parameters": {"network": str(traffic.parent)}}))
-    trace = drive_worst(system, system.characteristics.original[np.newaxis]).trace
+    trace = drive_worst(system, original_of(system)).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, (
         "no jump in the first step, whatever the system commands"

@@ -1,0 +1,190 @@
+"""Joint limits hold whatever their study and criterion: another optimiser than the package's finds
+nothing unsafe within them, at any point, in any parameter set.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from safevar_sumo import tolerance
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.measure import study_by
+from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.tolerance.together import MAX_SIMULATIONS
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import InlinePool
+from tests.made_up import HARDEST_BRAKING
+
+WORST, STEPS, ROUNDS = 6, 20, 12
+"""Settings from which the other optimiser searches on, neighbours that it tries at once, and how
+often.
+"""
+MANUAL = re.compile(r"(at least|at most) (\d+(?:\.\d+)?)")
+"""A limit in a sentence of a maintenance manual."""
+FEW_TESTS = {
+    "aggregate": "worst",
+    "tests": [
+        {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [20, 40]}},
+        {
+            "name": "CPNA",
+            "parameters": {"test": "CPNA"},
+            "over": {"speed": [40], "impact_location": [25, 75]},
+        },
+    ],
+}
+CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
+    "wear": (
+        "wear",
+        {"matrix": FEW_TESTS},
+        {"limits": ("treadDepth >= 3",), "fits": 2, "attack": 300},
+        600,
+        "at least 3 mm",
+    ),
+    "a metric, worst in a matrix": (
+        "wear",
+        {"matrix": FEW_TESTS},
+        {"unsafe": "drac > 8", "fits": 2, "attack": 300},
+        600,
+        "in 2 of 2 parameter sets",
+    ),
+    "a user's metric": (
+        "rain",
+        {"metrics": {"also": ["hardest_braking:HARDEST"]}},
+        {
+            "unsafe": "hardest > 6.8",
+            "fits": 0,
+            "attack": 500,
+            "characteristics": ("tireFric,maxBrakeTorque",),
+        },
+        600,
+        "hardest > 6.8",
+    ),
+    "rain": ("rain", {}, {"limits": ("tireFric >= 3",), "fits": 3}, 1500, "at least 3"),
+    "SUMO's vehicle, gaps between bumpers": (
+        "native",
+        {},
+        {"limits": ("decel >= 7",), "fits": 0},
+        1500,
+        "every vehicle that was tested within them keeps at least 0.3 m",
+    ),
+    "several parameter sets": ("smoke", {}, {"fits": 4}, 1500, "in 4 of 4 parameter sets"),
+    "encounters": (
+        "sun_joint",
+        {},
+        {"fits": 0, "characteristics": ("tireFric,maxBrakeTorque,dampRateZeroT_CE",)},
+        4000,
+        "All corner cases in 32,768 encounters",
+    ),
+}
+"""By what is special: study, what is changed of it, what is asked, random settings of the
+other optimiser, and what is said.
+"""
+Judge = Callable[[FloatArray], FloatArray]
+
+
+def judge_of(study: Study, unsafe: Unsafe, margin: float) -> Judge:
+    """What settings leave, shape (M,), at the point where it is least: of a metric's bound, else of
+    the margin; infinite where an encounter does not count.
+    """
+    system = assemble(study)
+    contact = 4.7 if study.name == "native" else 0.0  # the vehicle's length
+
+    def judge(settings: FloatArray) -> FloatArray:
+        least = np.full(len(settings), np.inf)
+        for result in simulate_all_points(system, settings):
+            found = result.evaluations
+            left = found.f_safe - contact - margin
+            if unsafe.bound is not None:
+                left = unsafe.bound.limit - found.column(unsafe.bound.measure)
+            left = np.where(found.collided, -1.0, left)
+            counts = system.measuring.scoring.violation(found) == 0
+            least = np.fmin(least, np.where(counts, left, np.inf))
+        return least
+
+    return judge
+
+
+def worst_within(
+    lower: FloatArray, upper: FloatArray, judges: list[Judge], simulations: int, seed: int
+) -> float:
+    """The least that settings between two ends leave, shape (n,), by any of some judges: random
+    settings, then local search from the six worst.
+    """
+    rng = np.random.default_rng(seed)
+    n = len(lower)
+    # Random settings, half of whose values are at ends, each by a random judge.
+    shares = rng.random((simulations, n))
+    shares = np.where(rng.random(shares.shape) < 0.5, np.round(shares), shares)
+    settings = lower + shares * (upper - lower)
+    of_judge = rng.integers(len(judges), size=len(settings))
+    left = np.full(len(settings), np.inf)
+    for number, judge in enumerate(judges):
+        left[of_judge == number] = judge(settings[of_judge == number])
+    # From the six worst, steps of some values, which become smaller.
+    order = np.argsort(left)[:WORST]
+    best = [(left[row], settings[row], judges[of_judge[row]]) for row in order]
+    step = 0.3
+    for _ in range(ROUNDS):
+        for place, (least, setting, judge) in enumerate(best):
+            is_moved = rng.random((STEPS, n)) < rng.choice([0.15, 0.3, 0.6])
+            moves = rng.normal(0.0, step, (STEPS, n)) * is_moved * (upper - lower)
+            near = np.clip(setting + moves, lower, upper)
+            of_near = judge(near)
+            if of_near.min() < least:
+                best[place] = of_near.min(), near[np.argmin(of_near)], judge
+        step *= 0.9
+    return float(min(least for least, _, _ in best))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
+    claim: str, in_tmp: Path
+) -> None:
+    """Each characteristic is as its printed sentence demands, and keeps the margin with the study's
+    own parameter set; with others it does not collide.
+    """
+    name, changes, options, simulations, said = CLAIMS[claim]
+    (in_tmp / "hardest_braking.py").write_text(HARDEST_BRAKING)
+    unsafe = Unsafe.parse(options.get("unsafe", "collision"))
+    study = study_by(load_study(name, **changes), unsafe)
+    evaluator = Evaluator(study, InlinePool(), verified=0)
+    answer = tolerance.compute(study, evaluator, **options)
+    numbers, members = answer.numbers, CharacteristicSet.of(study)
+    assert evaluator.simulated < 2 * MAX_SIMULATIONS
+    assert numbers["box"]
+    assert numbers["kept"] or not options.get("limits")
+    sets = studies_of_sets(study)[: numbers["fits_tried"]] if study.spread else [study]
+    assert numbers["fits"] == len(sets) == max(options["fits"], 1)
+    lower, upper = (
+        np.where(members.of_vehicle, members.original, ends)
+        for ends in (members.lower, members.upper)
+    )
+    for row in answer.to_dict()["tables"]["limits"]["rows"]:
+        column = members.names.index(row["characteristic"])
+        item = members.members[column]
+        demand = re.split(r"\. (?:At|Scope)", row["sentence"])[0]
+        keep = {word: float(text) for word, text in MANUAL.findall(demand)}
+        lower[column] = keep.get("at least", item.lower)
+        upper[column] = keep.get("at most", item.upper)
+        ends = row["together_low"], row["together_high"]
+        assert (lower[column], upper[column]) == ends, "as printed"
+        assert row["alone_low"] <= ends[0] <= ends[1] <= row["alone_high"]
+    assert said in f"{answer.verdict} {answer.tested} {answer.values('limits.sentence')}"
+    judges = [
+        judge_of(each, unsafe, 0.0 if number else numbers["margin"])
+        for number, each in enumerate(sets)
+    ]
+    assert min(worst_within(lower, upper, judges, simulations, seed) for seed in range(2)) >= 0
