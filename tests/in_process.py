@@ -57,17 +57,9 @@ def inline_worker(last_words: Path) -> InlinePool:
     return InlinePool()
 
 
-def searched(study: Study, out: Path) -> Path:
+def searched(study: Study, out: Path, warn: Callable[[str], None] = lambda message: None) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
-    run_campaign(
-        study,
-        assemble(study),
-        all_runs(study),
-        out,
-        InlinePool(),
-        show_no_progress,
-        lambda message: None,
-    )
+    run_campaign(study, assemble(study), all_runs(study), out, InlinePool(), show_no_progress, warn)
     return out
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,6 +137,13 @@ def run_campaign(
 
     # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
     runs.sort(key=lambda run: run.key)
+    for algorithm, rows in groupby(runs, key=lambda run: run.key.algorithm):
+        if count := sum(run.discarded for run in rows):
+            warn(
+                f"study {study.name!r}: {count} settings that {algorithm} returned are no"
+                " solutions: the original vehicle is not safe in their encounter, or an objective"
+                " is undefined (problem.scoring.valid says which)"
+            )
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
     if engine_used is Engine.RECORDED and runs:

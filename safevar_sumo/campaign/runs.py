@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, about, unknown_name
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, Scoring
 from safevar_sumo.plugins import Lookup, Member, instance_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import Journal, run_name
@@ -44,13 +44,15 @@ class RunKey(NamedTuple):
 
 
 class RunResult(NamedTuple):
-    """A finished run: its solutions, and what SUMO may repeat: one in `REPEATED` of the settings
-    that could be simulated, drawn at random, and at most `MAX_REPEATED`.
+    """A finished run: its solutions; what SUMO may repeat: one in `REPEATED` of the settings that
+    could be simulated, drawn at random, and at most `MAX_REPEATED`; and how many settings the
+    search returned that are not valid, 0 if an earlier command finished the run.
     """
 
     key: RunKey
     solutions: Evaluations
     sample: Evaluations
+    discarded: int = 0
 
 
 def all_runs(study: Study) -> list[RunKey]:
@@ -160,22 +162,28 @@ class Run:
     ----------
     budget
         Number of evaluations that the search may request.
+    scoring
+        Says which settings of the search's result are valid.
 
     Attributes
     ----------
     solutions
-        The result of the search, once it has ended.
+        The valid part of the search's result, once it has ended.
     is_finished
         Whether the journal has the result.
     """
 
     solutions: Evaluations
 
-    def __init__(self, key: RunKey, search: Search, journal: Journal, budget: int) -> None:
+    def __init__(
+        self, key: RunKey, search: Search, journal: Journal, budget: int, scoring: Scoring
+    ) -> None:
         self.key = key
         self._search = search
         self._journal = journal
         self._budget = budget
+        self._scoring = scoring
+        self._discarded = 0
         self._content = journal.content
         self._journaled = set(journal.content.positions)
         settings = journal.content.evaluations.settings
@@ -204,7 +212,8 @@ class Run:
             try:
                 self._request = self._search.send(answer)  # type: ignore[arg-type]
             except StopIteration as end:
-                self.solutions = end.value
+                self.solutions = end.value.take(self._scoring.valid(end.value))
+                self._discarded = len(end.value) - len(self.solutions)
                 self._has_ended = True
                 break
 
@@ -247,7 +256,7 @@ class Run:
         simulated = np.flatnonzero(~requested.failed & ~requested.infeasible)
         number = min(math.ceil(len(simulated) / REPEATED), MAX_REPEATED)
         sample = requested.take(rng.permutation(simulated)[:number])
-        return RunResult(self.key, self.solutions, sample)
+        return RunResult(self.key, self.solutions, sample, self._discarded)
 
     def close(self) -> None:
         """Leave the run to another process."""

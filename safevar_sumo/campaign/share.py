@@ -111,4 +111,4 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     problem = problem_of(study, system, share.original)
     search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
     journal = Journal(path, head, retry_failed=share.retry_failed)
-    return Run(key, search, journal, study.search.evaluations)
+    return Run(key, search, journal, study.search.evaluations, problem.scoring)

@@ -93,6 +93,13 @@ class Unsafe:
         return "collision" if self.below is None else f"below={self.below!r}"
 
     @property
+    def measure(self) -> str:
+        """The column that decides: points of a rating, a metric, or the safety degree."""
+        if self.points is not None:
+            return RATING_POINTS.name
+        return self.bound.measure if self.bound is not None else F_SAFE.name
+
+    @property
     def is_collision(self) -> bool:
         """Whether a collision alone, or less distance than `keep`, is unsafe."""
         return self.below is None and self.points is None and self.bound is None

@@ -331,7 +331,7 @@ class Answer:
         ]
         sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
         folded = [name for name in self.folded if len(self.tables.get(name, ()))]
-        by_all = "" if self.question == "study" else "--all, or "
+        by_all = "--all, or " if self.question == "tables" else ""
         sentences += [f"By {by_all}--table NAME: {', '.join(folded)}."] if folded else []
         return " ".join(sentences)
 

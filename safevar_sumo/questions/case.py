@@ -15,6 +15,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
 from safevar_sumo.results import FailedSetting, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
@@ -142,12 +143,31 @@ class Case:
             pd.Series(self.original[SAFETY_DEGREE], index=solutions.index) if own is None else own
         )
 
-    def require_solutions(self) -> None:
-        """Raise `UnanswerableError` if no run is finished."""
-        if not self.algorithms:
-            raise UnanswerableError(
-                self.name, "has no finished run", "results with at least one finished run"
+    @property
+    def why_no_solution(self) -> str:
+        """Why there is no solution, in words; empty if there is one."""
+        if len(self.solutions):
+            return ""
+        if not self.finished_runs:
+            return "no run is finished"
+
+        # The settings that a search may return, as far as there are any.
+        feasible = self.evaluations[self.scoring.feasible_rows(self.evaluations)]
+        if feasible.empty:
+            return (
+                f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
+                f" keeps at least {self.study.scenario.margin:g} m of clearance (scenario.margin)"
             )
+        valid = feasible.dropna(subset=[objective.name for objective in self.scoring.objectives])
+        unsafe = self.unsafe.number_in_words(int(self.unsafe.rows(valid).sum()))
+        settings = f"{number_of(len(valid), 'setting')} that have a value of every objective"
+        return f"the algorithms returned none of {settings}; of these, {unsafe}"
+
+    def require_solutions(self) -> None:
+        """Raise `UnanswerableError` if there is no solution."""
+        if reason := self.why_no_solution:
+            expected = "results with at least one solution"
+            raise UnanswerableError(self.name, f"has no solution: {reason}", expected)
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
         """Pooled solutions of all finished runs of an algorithm.

@@ -66,9 +66,9 @@ def counts_of(settings: pd.DataFrame) -> dict[str, int]:
 
 def paired_test(a: FloatArray, b: FloatArray) -> tuple[float, float]:
     """The p-value of the signed-rank test of pairs, and the probability that A's value is greater
-    (Vargha and Delaney's A12); NaN without pairs.
+    (Vargha and Delaney's A12), above 0.5 where A is better; NaN without pairs.
     """
-    return signed_rank_test(a - b).p_value, compare_samples(a, b).effect_size
+    return signed_rank_test(a, b).p_value, compare_samples(a, b).effect_size
 
 
 def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:

@@ -9,6 +9,7 @@ Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics import F_SAFE, Unsafe
 from safevar_sumo.questions.answer import (
     HIGH,
     LOW,
@@ -54,6 +55,8 @@ RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
+RARE = 1e-4
+"""If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
 UNSURE = 0.5
 """Width of an interval of a share of the variance from which on the verdict says that it is unsure
 [-].
@@ -64,7 +67,11 @@ NO_PROBABILITY = (
 VEHICLES_PER_CALL = 50_000
 """Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
-"""What varies, by the beginning of the names of its columns."""
+"""What varies, by the beginning of the names of its columns; another measure may stand in place of
+the safety degree.
+"""
+MEASURE = "measure"
+"""The attribute of the table that holds the measure whose variance it splits, in words."""
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
@@ -148,12 +155,11 @@ def risk(
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
         f"{NO_PROBABILITY if not study.variation else ''}"
+        f"{_bound_in_words(failures, high, total, confidence)}"
     )
     left_out = int(drawn.infeasible.sum())
-    if total + left_out < samples:
-        verdict += (
-            f" {samples - total - left_out:,} vehicles could not be simulated and are left out."
-        )
+    if failed := samples - total - left_out:
+        verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
     remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
     verdict = " ".join([verdict, *filter(None, remarks)])
@@ -166,9 +172,26 @@ def risk(
     )
 
 
+def _bound_in_words(failures: int, high: float, total: int, confidence: float) -> str:
+    """What a sample without an unsafe vehicle says, and how many vehicles would say more; "" if a
+    vehicle is unsafe. Clopper and Pearson's upper end of 0 of n is
+    1 - ((1 - confidence) / 2)^(1 / n).
+    """
+    if failures:
+        return ""
+    words = f" No vehicle is unsafe, so the share is at most {percentage(high)} %."
+    needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
+    if total >= needed:
+        return words
+    return (
+        f"{words} To show at most {percentage(RARE)} %, {needed:,} vehicles are needed of which"
+        " none is unsafe (--samples)."
+    )
+
+
 def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
-    """Which characteristic has the largest share of the safety degree's variance, and which shares
-    are unsure.
+    """Which characteristic has the largest share of the variance of the table's measure, and which
+    shares are unsure.
     """
     if table.empty:
         return ""
@@ -177,12 +200,13 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     # The largest share, of all orders if it is known.
     first = table.iloc[0]
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
-    words = ""
+    in_words = OUTPUTS | {"degree": table.attrs[MEASURE]}
+    words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
         name = first["characteristic"]
         words = (
-            f" {name} decides most: it causes {100 * share:.0f} % of the variance of the safety"
-            f" degree ({100 * low:.0f} to {100 * high:.0f} %)."
+            f" {name} decides most: it causes {100 * share:.0f} % of the variance of"
+            f" {in_words['degree']} ({100 * low:.0f} to {100 * high:.0f} %)."
         )
 
     # Shares that are too unsure.
@@ -192,7 +216,7 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     for name, widths in of_output.items():
         if widths.max() > UNSURE:
             words += (
-                f" The shares for {OUTPUTS[name]} are uncertain: their intervals are up to"
+                f" The shares for {in_words[name]} are uncertain: their intervals are up to"
                 f" {100 * widths.max():.0f} percentage points wide."
             )
     if failures and of_output["unsafe"].isna().all():
@@ -251,10 +275,11 @@ def sobol_indices(
         return indices
 
     # Indices of both outputs, over the complete rows.
-    outputs = _outputs(evaluations, criterion, is_complete)
+    measure, outputs = _outputs(evaluations, criterion, is_complete)
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
+        measure,
         found,
         {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")},
     )
@@ -294,10 +319,11 @@ def given_data_indices(
         return indices
 
     # Indices of both outputs, with what is correlated.
-    outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
+    measure, outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
     found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
     return _table(
         names,
+        measure,
         found,
         {
             "first": ("S1", "first order, with everything that is correlated with it"),
@@ -308,42 +334,56 @@ def given_data_indices(
 
 def _outputs(
     evaluations: Evaluations, criterion: Unsafe, counts: BoolArray
-) -> dict[str, FloatArray | None]:
-    """The outputs by name; None where there are no indices."""
+) -> tuple[str, dict[str, FloatArray | None]]:
+    """The criterion's measure in words, or the safety degree where the measure is undefined for a
+    vehicle, such as one that collides; and the outputs by name, None where there are no indices.
+    """
+    values = evaluations.column(criterion.measure)
+    measure = OUTPUTS["degree"] if criterion.measure == F_SAFE.name else criterion.measure
+    if not np.isfinite(values[counts]).all():
+        measure, values = OUTPUTS["degree"], evaluations.f_safe
+
+    # Outputs that vary enough.
     is_unsafe = criterion.of(evaluations)
     failures = int(is_unsafe[counts].sum())
-    is_defined = counts.any() and np.ptp(evaluations.f_safe[counts]) > 0
+    is_defined = counts.any() and np.ptp(values[counts]) > 0
     has_outcomes = MIN_OUTCOMES <= failures <= counts.sum() - MIN_OUTCOMES
-    return {
-        "degree": evaluations.f_safe if is_defined else None,
+    return measure, {
+        "degree": values if is_defined else None,
         "unsafe": is_unsafe.astype(float) if has_outcomes else None,
     }
 
 
 def _table(
-    names: list[str], found: Mapping[str, Indices], indices: dict[str, tuple[str, str]]
+    names: list[str],
+    measure: str,
+    found: Mapping[str, Indices],
+    indices: dict[str, tuple[str, str]],
 ) -> pd.DataFrame:
-    """A row for each characteristic, the one that decides most of the safety degree first;
-    `indices` maps an index to SALib's key and its meaning.
+    """A row for each characteristic, the one that decides most of the measure first; `indices` maps
+    an index to SALib's key and its meaning. Readers see the name of a measure other than the safety
+    degree above its column.
     """
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
 
     # An index of each output, with its interval.
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
-    for output, of_what in OUTPUTS.items():
+    for output, of_what in (OUTPUTS | {"degree": measure}).items():
         of_output = found.get(output, {})
         for index, (key, meaning) in indices.items():
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            columns |= with_interval(
-                name, Column("-", f"share of the variance of {of_what}: {meaning}", ".2f")
-            )
+            head = "" if of_what in OUTPUTS.values() else f"{measure} {index}"
+            meaning = f"share of the variance of {of_what}: {meaning}"
+            columns |= with_interval(name, Column("-", meaning, ".2f", head=head))
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
-    return tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
+    table = tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
+    table.attrs[MEASURE] = measure
+    return table

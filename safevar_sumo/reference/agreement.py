@@ -18,6 +18,7 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tab
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
+from safevar_sumo.questions.research_questions.statistics import rounded_to_rank
 from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, read_reference
@@ -146,9 +147,10 @@ def defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatAr
 
 def rank_correlation(values: FloatArray, other_values: FloatArray) -> float:
     """Spearman's rho; NaN for fewer than two values or if all values of one side are equal."""
-    if len(values) < 2 or np.ptp(values) == 0 or np.ptp(other_values) == 0:
+    pairs = rounded_to_rank(values), rounded_to_rank(other_values)
+    if len(values) < 2 or np.ptp(pairs[0]) == 0 or np.ptp(pairs[1]) == 0:
         return np.nan
-    return float(scipy.stats.spearmanr(values, other_values).statistic)
+    return float(scipy.stats.spearmanr(*pairs).statistic)
 
 
 def shipped_agreement(study: Study) -> pd.DataFrame:

@@ -126,7 +126,7 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
 def _checked_result(
     code: UserCode, result: Any, yielded: set[bytes], problem: Problem
 ) -> Evaluations:
-    """The valid evaluations of a result."""
+    """The result, whose settings were yielded; not all need be valid."""
     if not yielded:
         raise code.wrong(
             "search",
@@ -138,7 +138,7 @@ def _checked_result(
     ):
         expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
         raise code.wrong("search", quoted(result), expected)
-    return result.take(problem.scoring.valid(result))
+    return result
 
 
 class Algorithm:
@@ -161,7 +161,8 @@ class Algorithm:
 
         All randomness comes from `rng`, so that a run which is resumed, with the evaluations of its
         journal, yields the same settings again. Yielded settings are in the domains and filtered.
-        The result consists of valid evaluations (`problem.scoring.valid`) that the run received.
+        The result consists of evaluations that the run received. Those that are not valid
+        (`problem.scoring.valid`) are no solutions, and the command `study` counts them.
         """
 
     def try_out(self, problem: Problem) -> None:

@@ -183,8 +183,9 @@ class SearchTable(Table, frozen=True, kw_only=True):
     generations of `population`; `seed` is the seed of all random numbers.
 
     A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises
-    `objectives`, and drives metrics in their unsafe direction. `parameters` hold the parameters of
-    algorithms by name or label; a file has them in tables such as [search.nsga2].
+    `objectives`, and drives metrics in their unsafe direction. `reference_point` is each coordinate
+    of the hypervolume's reference point, for objectives normalised to 0..1 [-]. `parameters` hold
+    the parameters of algorithms by name or label; a file has them in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1), WITHOUT_EFFECT]
@@ -196,6 +197,7 @@ class SearchTable(Table, frozen=True, kw_only=True):
     objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(
         default_factory=lambda: list(OBJECTIVES)
     )
+    reference_point: Annotated[float, Meta(gt=1, le=100), WITHOUT_EFFECT] = 1.1
     parameters: dict[str, Parameters] = {}
 
     @property

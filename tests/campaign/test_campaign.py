@@ -23,6 +23,7 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
 from safevar_sumo.errors import SafevarError
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
@@ -139,7 +140,7 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(
     journal.append([0, 1], both)
     journal.finish([0], 1)
     journal.close()
-    run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1)  # type: ignore[arg-type]
+    run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1, PUBLISHED_SCORING)  # type: ignore[arg-type]
     result = run.finish(np.random.default_rng(0))
     for found in (result.solutions, result.sample):
         assert np.array_equal(found.settings, both.settings[:1])

@@ -16,7 +16,7 @@ from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.questions import evaluator, models, scope
+from safevar_sumo.questions import evaluator, measure, models, scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.scans import scan
@@ -44,7 +44,7 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (evaluator, models, scope):
+    for module in (evaluator, measure, models, scope):
         monkeypatch.setattr(
             module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
         )

@@ -162,7 +162,7 @@ def test_readers_see_folded_tables_only_if_they_ask() -> None:
     for form in ("text", "latex", "html"):
         assert "Others" not in answer.render(form)
         assert "Others" in answer.render(form, "others")
-    assert "By --all, or --table NAME: others." in answer.render("text")
+    assert "By --table NAME: others." in answer.render("text")
     assert [*json.loads(answer.render("json"))["tables"]] == ["parts", "others"]
 
 

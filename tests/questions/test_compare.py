@@ -64,6 +64,9 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     lines = [one.f_safe.reshape(4, 8).mean(axis=0) for one in runs]
     assert answer.numbers["p"] == pytest.approx(scipy.stats.wilcoxon(*lines).pvalue)
     assert "8 lines" in answer.tested
+    np.testing.assert_allclose(answer.tables["pairs"][["a", "b"]], np.transpose(lines))
+    assert re.search(r"line 7 +│ +-?\d", text := answer.render("text"))
+    assert "The same settings" not in text
     assert only_a > 0
     assert both < 16, "most vehicles with random changes of all characteristics collide in both"
 
@@ -269,6 +272,11 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     assert answer.numbers["p"] == pytest.approx(scipy.stats.wilcoxon(a, b).pvalue)
     assert answer.numbers["a12"] == compare_samples(a, b).effect_size
     assert "10 runs" in answer.tested
+    pairs = answer.tables["pairs"]
+    assert pairs["pair"].tolist() == [
+        f"nsga2-{run:02d} of {side}" for side in "AB" for run in range(5)
+    ]
+    assert pairs["a"].tolist() == pytest.approx(a)
 
 
 @pytest.mark.slow

@@ -144,6 +144,27 @@ def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feas
     assert identity_digest(manifest_of(strict, {})) != identity_digest(manifest_of(case.study, {}))
 
 
+TAKES_ALL = """
+class TakesAll:
+    def search(self, problem, rng):
+        return (yield problem.characteristics.filter(problem.uniform(problem.evaluations, rng)))
+"""
+
+
+def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(joint: Path) -> None:
+    (joint / "takes.py").write_text(TAKES_ALL)
+    own = 'extends = "tiny.toml"\nname = "own"\nsearch.algorithms = ["takes:TakesAll"]\n'
+    (joint / "own.toml").write_text(own)
+    study = load_study("own.toml")
+    warnings: list[str] = []
+    searched(study, joint / "own", warn=warnings.append)
+    case = load_cases([joint / "own"])[0]
+    infeasible = (~case.evaluations["feasible"]).sum()
+    assert 0 < infeasible < 80 == len(case.solutions) + infeasible
+    (warning,) = (one for one in warnings if "TakesAll" in one)
+    assert f"{infeasible} settings that TakesAll returned are no solutions" in warning
+
+
 WORN = {
     "wear_joint": {
         **{"treadDepth": 5.58, "brakeTorque": 0.88, "brakeResponse": 0.112, "payload": 242},

@@ -4,7 +4,10 @@ model and regions that are known.
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,8 +18,9 @@ from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.risk import deciding_in_words
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from tests.questions.conftest import (
     Plant,
     Region,
@@ -46,6 +50,18 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
     assert numbers["probability"] == numbers["failures"] / 8000
 
 
+@pytest.mark.parametrize("confidence", [0.9, 0.99])
+def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: float) -> None:
+    """And that nothing decides: all vehicles of the plant have one safety degree."""
+    verdict = of(nowhere, samples=200, confidence=confidence).verdict
+    (told,) = re.findall(r"at most 0\.01 %, ([\d,]+) vehicles are needed of which", verdict)
+    needed = int(told.replace(",", ""))
+    highest = [clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)]
+    assert highest[1] <= 1e-4 < highest[0]
+    assert "No vehicle was found that changes the safety degree" in verdict
+    assert "No vehicle is unsafe" not in of(box, samples=200).verdict
+
+
 def ishigami(settings: FloatArray) -> FloatArray:
     x = (settings - 5) / 5 * math.pi
     return np.asarray(
@@ -53,14 +69,35 @@ def ishigami(settings: FloatArray) -> FloatArray:
     )
 
 
-def test_sobol_indices_of_ishigamis_function() -> None:
+class MeasuredPlant(Plant):
+    """A pool in which the metric `tit` is Ishigami's function, and `tet` undefined somewhere."""
+
+    def evaluate(self, settings: FloatArray) -> Evaluations:
+        evaluations = super().evaluate(settings)
+        values = ishigami(settings)
+        measured = {"tit": values, "tet": np.where(settings[:, 0] > 5, np.nan, values)}
+        return dataclasses.replace(evaluations, metrics={**evaluations.metrics, **measured})
+
+
+@pytest.mark.parametrize(
+    ("unsafe", "degree", "measure"),
+    [
+        ("collision", ishigami, "the safety degree"),
+        ("tit > 100", None, "tit"),
+        ("tet > 100", ishigami, "the safety degree"),
+    ],
+)
+def test_sobol_indices_of_ishigamis_function(
+    unsafe: str, degree: Callable[[FloatArray], FloatArray] | None, measure: str
+) -> None:
     """Analytic values of Saltelli et al., Global Sensitivity Analysis (2008), for a = 7, b =
-    0.1.
+    0.1. The criterion's measure varies, or the safety degree where the measure is undefined.
     """
     study = made_up_study(3)
-    table = risk(
-        study, unsafe="collision", samples=100, pool=Plant(study, nowhere, ishigami)
-    ).tables["sensitivity"]
+    answer = risk(study, unsafe=unsafe, samples=100, pool=MeasuredPlant(study, nowhere, degree))
+    assert f"of the variance of {measure} (" in answer.verdict
+    assert ("tit total" in answer.render("text")) is (measure == "tit")
+    table = answer.tables["sensitivity"]
     frame = table.set_index("characteristic")
     assert frame["degree_first"].to_dict() == pytest.approx(
         {"a": 0.3139, "b": 0.4424, "c": 0.0}, abs=0.05
@@ -166,6 +203,7 @@ def test_the_verdict_says_which_shares_are_unsure() -> None:
         for end, x in zip(("", LOW, HIGH), row, strict=True)
     }
     frame = pd.DataFrame({"characteristic": ["a"], **values})
+    frame.attrs = {"measure": "the safety degree"}
     words = deciding_in_words(frame, 120)
     assert (
         "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %)." in words

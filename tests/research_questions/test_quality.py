@@ -13,6 +13,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import scipy
@@ -53,6 +54,10 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
         "a whole width of f_safe away from one of two"
     )
     assert result.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
+    search = msgspec.structs.replace(case.study.search, reference_point=2.0)
+    study = msgspec.structs.replace(case.study, search=search)
+    wide = compute_indicators(dataclasses.replace(case, study=study))
+    assert wide.loc[("rs", 0), "hypervolume"] == pytest.approx(2 * 1 * 2)
 
 
 def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
@@ -78,6 +83,7 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
         "".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures
     ]
     assert all("My search" in label and "mine" not in label for label in labels)
+    assert "My search (2 runs)\nmean: 26 evaluations" in labels[0]
 
 
 SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)
@@ -91,7 +97,7 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(
     there = compare_samples(x, y)
     back = compare_samples(y, x)
     assert there.effect_size == pytest.approx(won / (len(x) * len(y)))
-    assert back.reversed().effect_size == pytest.approx(there.effect_size)
+    assert back.oriented(larger_is_better=False).effect_size == pytest.approx(there.effect_size)
     assert 0 <= there.p_value <= 1
     assert back.p_value == pytest.approx(there.p_value)
 
@@ -118,6 +124,20 @@ def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
         tied.p_value
         == scipy.stats.wilcoxon([-1, -1, 1, 2], correction=True, method="approx").pvalue
     )
+
+
+def test_values_that_rounding_errors_distinguish_are_ties() -> None:
+    """Sums of multiples of 0.05 s in two orders, and their differences."""
+    x = [0.05 + 0.1 + 0.15, 0.1 + 0.2, 1.2, 2.35]
+    y = [0.15 + 0.1 + 0.05, 0.3, 1.0, 2.2]
+    assert len({*x, *y}) > len({0.3, 1.2, 2.35, 1.0, 2.2})
+    ties = [0.3, 0.3, 1.2, 2.35], [0.3, 0.3, 1.0, 2.2]
+    assert compare_samples(x, y) == compare_samples(*ties)
+    assert compare_samples(x, y).p_value == scipy.stats.mannwhitneyu(*ties).pvalue
+    steps = [1.35, 2.35, 0.45], [1.2, 2.2, 0.3]
+    assert len(np.unique(np.subtract(*steps))) > 1
+    assert signed_rank_test(*steps) == signed_rank_test([0.15, 0.15, 0.15])
+    assert signed_rank_test(x[:2], y[:2])[:2] == (1.0, 0.5)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from itertools import product
 from typing import Any
 
 import msgspec
@@ -244,6 +245,56 @@ def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
         row[-1] for row in counts
     ]
     assert "causes" not in answer_questions([case]).tables
+
+
+def test_a_run_without_solutions_is_the_worst_run() -> None:
+    """One of two algorithms finds something in a single run, as in two runs of the other one."""
+    rows = [row("nsga2", 0, sd=0.5), row("rs", 0), row("rs", 1)]
+    runs = [*product(("nsga2", "rs"), range(3))]
+    empty = [row(*run, f_diff=math.nan) for run in runs if run not in {("nsga2", 0), *runs[3:5]}]
+    seen = [{**one, "evaluation": 0} for one in [*rows, *empty]]
+    case = made_up(*rows, evaluations=seen, finished=runs)
+    answer = answer_questions([case])
+    for name, metrics in (("rq2-runs", 3), ("rq2-common", 4)):
+        tests = answer.tables[name].dropna(subset="p_value")
+        of_fronts = tests[~tests["metric"].isin(case.original)]
+        assert of_fronts[["n1", "n2"]].to_numpy().tolist() == [[3, 3]] * metrics
+        # of nine pairs of runs three are won and two tied
+        assert of_fronts["effect_size"].to_numpy() == pytest.approx(4 / 9)
+        assert only(tests, metric="safety_degree")["n1"] == 1
+    medians = answer.tables["medians"]
+    found = only(medians, algorithm="nsga2", metric="hypervolume")
+    assert (found["runs"], found["median"]) == (3, 0)
+    assert only(medians, algorithm="nsga2", metric="igd")["median"] == math.inf
+    text = answer.only("medians").render("text")
+    assert "made-up: runs with solutions: NSGA-II 1 of 3, RS 2 of 3. The other runs count" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"finished": []}, "no run is finished"),
+        ({}, "returned none of 2 settings that have a value of every objective; of these, 1 is"),
+        (
+            {"f_diff": math.nan},
+            "none of 0 settings that have a value of every objective; of these, none is",
+        ),
+        ({"original_safety_degree": 0.4}, "in none of 2 encounters the original vehicle keeps at"),
+    ],
+)
+def test_results_without_a_solution_say_why(changes: JsonObject, reason: str) -> None:
+    changes = dict(changes)
+    finished = changes.pop("finished", [("rs", 0)])
+    seen = [{**row("rs", sd=sd), "evaluation": i} for i, sd in enumerate((0.5, 1.5))]
+    case = made_up(evaluations=seen, finished=finished)
+    case = dataclasses.replace(
+        case,
+        evaluations=case.evaluations.assign(**changes),
+        scoring=msgspec.structs.replace(case.scoring, safe_original=0.5),
+    )
+    assert reason in case.why_no_solution
+    with pytest.raises(UnanswerableError, match="has no solution: "):
+        rq1_runs(case)
 
 
 HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.1)

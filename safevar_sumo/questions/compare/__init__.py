@@ -63,6 +63,12 @@ from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
 
+PAIR_COLUMNS = {
+    "pair": Column("", "run, with its solutions in both systems, or line of sampled settings"),
+    "a": Column("", "mean in A", ".2f"),
+    "b": Column("", "mean in B", ".2f"),
+}
+
 
 @question
 @contents(
@@ -79,6 +85,7 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
     "benign_scenes",
     limits=LIMIT_COLUMNS,
+    pairs=PAIR_COLUMNS,
     settings=["source", *SETTING_COLUMNS, ...],
 )
 def compare(
@@ -126,24 +133,23 @@ def compare(
     pairs, outside = pairs_of(subjects, common, criteria, samples)
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
-    is_rating = all(is_rated(side.study) for side in evaluators)
-    tested = _test(settings, valid, RATING_POINTS.name if is_rating else SAFETY_DEGREE)
+    tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = _titles(evaluators)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
-    limits_table = limits_of_both(evaluators, criteria, within)
+    alone = limits_of_both(evaluators, criteria, within)
     of_originals, difference = compare_originals(evaluators, originals, criteria, titles[0])
     differences = (
         compare_counts(counts, titles[0]),
-        compare_limits(limits_table, evaluator.characteristics.vehicle.members),
+        compare_limits(alone, evaluator.characteristics.vehicle.members),
         difference,
         compare_values(tested.quantity, tested.p, tested.a12),
     )
     difference = Difference.joined(differences)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
-        **_numbers(criteria[0], counts, tested, difference, limits_table["change"]),
+        **_numbers(criteria[0], counts, tested, difference, alone["change"]),
         "outside": outside,
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
         **of_originals,
@@ -162,7 +168,8 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={"limits": limits_table, "settings": _settings_table(common, settings)},
+        tables={"limits": alone, "pairs": tested.pairs, "settings": _table(common, settings)},
+        folded=("settings",),
         failures=refusals,
         draw=partial(draw_pairs, titles=titles),
     )
@@ -255,7 +262,7 @@ def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsaf
     )
 
 
-def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
+def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
     """The table of settings, those first that are unsafe in one system only."""
     members = common.evaluators[0].characteristics.members
     columns = {
@@ -274,33 +281,42 @@ def _settings_table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFram
 
 
 class _PairedTest(NamedTuple):
-    """The p-value and A12 of a test in pairs, what the pairs are, and of which quantity."""
+    """The p-value and A12 of a test in pairs, the table of the pairs, what they are, and of which
+    quantity.
+    """
 
     p: float
     a12: float
-    pairs: str
+    pairs: pd.DataFrame
+    unit: str
     quantity: str
 
 
-def _test(settings: pd.DataFrame, runs: Pairs, metric: str) -> _PairedTest:
-    """Test a metric in A and B in pairs.
+def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) -> _PairedTest:
+    """Test the safety degree in A and B, or the points if both are rated, in pairs.
 
     A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs,
     over the settings that were drawn on a line.
     """
+    are_rated = all(is_rated(side.study) for side in evaluators)
+    metric = RATING_POINTS.name if are_rated else SAFETY_DEGREE
     a, b = (run.column(metric) for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
+    names = [f"line {int(line)}" for line in pairs.index]
     unit = "lines of settings"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
+            names = [f"{name}-{int(run):02d} of {side.upper()}" for side, name, run in pairs.index]
             unit = "runs"
     p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
-    quantity = "rating" if metric == RATING_POINTS.name else "safety degree"
-    return _PairedTest(p, a12, f"{len(pairs)} {unit}", quantity)
+    quantity = "rating" if are_rated else "safety degree"
+    rows = pairs.reset_index(drop=True).assign(pair=names)
+    table = tabulate(f"Pairs that are tested: mean {quantity}", PAIR_COLUMNS, rows)
+    return _PairedTest(p, a12, table, unit, quantity)
 
 
 def _verdict(
@@ -338,8 +354,8 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {tested.quantity} over {tested.pairs} gives p ="
-        f" {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"
+        f"A signed-rank test of the {tested.quantity} over {len(tested.pairs)} {tested.unit} gives"
+        f" p = {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"
         f" {tested.a12:.2f} (A12)."
     )
 

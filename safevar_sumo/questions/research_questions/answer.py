@@ -23,7 +23,12 @@ from safevar_sumo.questions.case import (
     solutions_for_metric,
 )
 from safevar_sumo.questions.research_questions import changes
-from safevar_sumo.questions.research_questions.comparisons import DEFAULT, Choices, titles_of
+from safevar_sumo.questions.research_questions.comparisons import (
+    DEFAULT,
+    Choices,
+    describe_runs_without_solutions,
+    titles_of,
+)
 from safevar_sumo.questions.research_questions.figures import (
     draw_change_counts,
     draw_figures,
@@ -191,7 +196,7 @@ def answer_questions(
     of_all = [
         ("all", remark)
         for case in cases
-        for remark in (*case.remarks, few_evaluations(case))
+        for remark in (*case.remarks, few_evaluations(case), describe_runs_without_solutions(case))
         if remark
     ]
     different = dict.fromkeys([*of_all, *remarks])
@@ -212,6 +217,9 @@ def answer_questions(
 
 def _verdict(case: Case) -> str:
     """How many of a case's solutions collide, and how many of NSGA-II's are critical."""
+    if case.why_no_solution:
+        return f"{case.name} has no solution: {case.why_no_solution}."
+
     # Collisions, and solutions that are less safe than the original.
     collisions = are_collisions(case.solutions).sum()
     text = f"{case.name}: {collisions} of {len(case.solutions)} solutions collide"
@@ -321,8 +329,9 @@ def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> It
         needed = fewest_runs(rq, alpha, len(tests))
         none = f"None of the {tests_in_words} of {rq} can"
         some = f"{few} of {tests_in_words} of {rq} cannot"
+        subject = none if few == len(tests) > 1 else some
         yield (
-            f"{none if few == len(tests) else some} be significant: after Holm's correction, a test"
+            f"{subject} be significant: after Holm's correction, a test"
             f" needs at least {needed} runs of each algorithm."
         )
     if len(tests):

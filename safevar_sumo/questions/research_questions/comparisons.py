@@ -15,6 +15,7 @@ that they compare is missing, and over runs if the solutions belong to no run.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
@@ -136,10 +137,11 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         If there are no evaluations.
     """
     common = replace(case, solutions=nondominated_evaluations(case))
-    best = (
-        valid_evaluations(case, case.evaluations).groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
-    )
-    further = {(name, BEST): best[name] for name in best.index.unique("algorithm")}
+    valid = valid_evaluations(case, case.evaluations)
+    best = valid.groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
+    # A run without valid evaluations is worse than any other one.
+    best = best.reindex(pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf)
+    further = {(name, BEST): best[name] for name in case.algorithms}
     # The causes were counted among the solutions that the algorithms returned.
     return rq2_runs(common, choices._replace(causes={}), further)
 
@@ -265,14 +267,12 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
         originals = _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.scenario.search else case.original[metric.name]
         test = (
-            signed_rank_test(values - originals)
+            signed_rank_test(values, originals.reindex(values.index))
             if over_runs
             else compare_samples(values, originals.dropna())
         )
-        if (
-            metric.more_is_unsafe
-        ):  # so that below 0.5 the solutions are more unsafe than the original
-            test = test.reversed()
+        # Below 0.5, the solutions are more unsafe than the original.
+        test = test.oriented(larger_is_better=not metric.more_is_unsafe)
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
         is_enough = not case.has_runs or can_be_significant("RQ1", runs, 0, choices.alpha)
@@ -289,15 +289,13 @@ def _test_opponents(
     samples = {**_samples(case, choices, over_runs), **further}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
     # causes.
-    directions = MORE_IS_BETTER | {
-        metric.name: metric.more_is_unsafe for metric in case.scoring.metrics
-    }
-    directions |= {name: better for name, better in BETTER.items() if (first, name) in samples}
+    metrics = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    further_ones = {name: better for name, better in BETTER.items() if (first, name) in samples}
     rows = []
+    directions = MORE_IS_BETTER | metrics | further_ones
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
-        if not more_is_better:  # so that above 0.5 the first algorithm is better
-            test = test.reversed()
+        test = test.oriented(larger_is_better=more_is_better)
         runs = _finished_runs(case, first), _finished_runs(case, baseline)
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
         row = {"algorithm": first, "baseline": baseline, "metric": metric}
@@ -356,6 +354,30 @@ def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> 
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
     return _values(case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs)
+
+
+def describe_runs_without_solutions(case: Case) -> str:
+    """Which algorithms have runs without solutions, and how these runs count, in sentences; "" if
+    no finished run is without solutions.
+    """
+    if not case.has_runs:
+        return ""
+
+    # How many runs of each algorithm have solutions.
+    found = case.solutions.groupby("algorithm")["run"].nunique()
+    counts = [(name, found.get(name, 0), _finished_runs(case, name)) for name in case.algorithms]
+    texts = [
+        f"{case.title_of(name)} {number} of {runs}"
+        for name, number, runs in counts
+        if number < runs
+    ]
+    if not texts:
+        return ""
+    return (
+        f"{case.name}: runs with solutions: {', '.join(texts)}. The other runs count with"
+        " hypervolume 0, and as worst in IGD+, IGD and the best safety degree, so that a median may"
+        " be undefined. Means over solutions leave them out."
+    )
 
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:

@@ -35,9 +35,9 @@ from safevar_sumo.questions.research_questions.changes import (
     rq32,
 )
 from safevar_sumo.questions.research_questions.fronts import (
-    REFERENCE_COORDINATE,
     compute_convergence,
     compute_indicators,
+    count_evaluations,
     nondominated_points,
     points_of,
     reference_front,
@@ -129,16 +129,19 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 def draw_convergence(case: Case) -> Figure:
     """The hypervolume of all settings that a run has evaluated so far, over the number of
-    evaluations, as median and quartiles over the runs. A line ends where its algorithm does; a mark
-    there is the median of what the runs return.
+    evaluations, as median and quartiles over the runs. A line ends with the longest run of its
+    algorithm; a mark there is the median of what the runs return. The legend says how many
+    evaluations a run has on average: less than its budget if it ends early.
     """
     import seaborn as sns
 
     # Growth over all evaluations, as median and quartiles.
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
+    means = count_evaluations(case).groupby("algorithm")["requested"].mean().to_dict()
     labels = {
-        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)"
+        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)\n"
+        f"mean: {means[algorithm]:,.0f} evaluations"
         for algorithm, count in runs.items()
     }
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
@@ -155,7 +158,7 @@ def draw_convergence(case: Case) -> Figure:
     )
     axis.set_ylabel(
         "normalised hypervolume of all settings so far\n(line: median, band: quartiles over runs;\n"
-        f"mark: of what a run returns; reference point {REFERENCE_COORDINATE:g})"
+        f"mark: of what a run returns; reference point {case.study.search.reference_point:g})"
     )
 
     # A mark for what runs return.

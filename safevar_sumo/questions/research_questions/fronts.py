@@ -5,6 +5,7 @@ evaluations. Of all evaluations: the non-dominated ones, and the growth of their
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import moocore
@@ -16,10 +17,8 @@ from safevar_sumo.records import FloatArray
 
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
-REFERENCE_COORDINATE = 1.1
-"""Each coordinate of the hypervolume's reference point for objectives normalised to 0..1: a tenth
-beyond the nadir.
-"""
+NO_FRONT = (math.inf, 0.0, math.inf)
+"""IGD+, hypervolume and IGD of a run without solutions: worse than those of any other run."""
 USUAL_SHARE = 0.9
 """Share of its budget from which on nobody asks why an algorithm simulates less."""
 CURVE_POINTS = 50
@@ -31,9 +30,9 @@ def nondominated_points(points: FloatArray) -> FloatArray:
     return np.asarray(moocore.filter_dominated(points))
 
 
-def hypervolume(front: FloatArray) -> float:
-    """The volume between `front` and the reference point."""
-    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], REFERENCE_COORDINATE)))
+def hypervolume(front: FloatArray, coordinate: float) -> float:
+    """The volume between `front` and the reference point, whose coordinates are equal."""
+    return float(moocore.hypervolume(front, ref=np.full(front.shape[1], coordinate)))
 
 
 def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
@@ -74,15 +73,13 @@ def reference_front(case: Case) -> FloatArray:
     """
     points = points_of(case, case.solutions)
     if not len(points):
-        raise UnanswerableError(
-            case.name, "has no solution", "results with at least one finished run"
-        )
+        raise UnanswerableError(case.name, "has no solution", "results with at least one solution")
     return nondominated_points(points)
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD+, hypervolume and IGD of every finished run that has solutions; index algorithm and run,
-    a column for each indicator.
+    """IGD+, hypervolume and IGD of every finished run; index algorithm and run, a column for each
+    indicator. A run without solutions has those of `NO_FRONT`.
 
     IGD is the mean Euclidean distance from each point of the reference front to the run's nearest
     point, in the objectives' units; IGD+ counts only the objectives in which this point is worse,
@@ -95,20 +92,22 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     """
     reference = reference_front(case)
     scaled_reference = normalised(reference, reference)
+    coordinate = case.study.search.reference_point
     rows = {}
     for run, group in _frames_of_runs(case, case.solutions):
+        rows[run] = NO_FRONT
         if len(points := points_of(case, group)):
             scaled = normalised(points, reference)
             igd_plus = moocore.igd_plus(scaled, ref=scaled_reference)
             igd = moocore.igd(points, ref=reference)
-            rows[run] = float(igd_plus), hypervolume(scaled), float(igd)
+            rows[run] = float(igd_plus), hypervolume(scaled, coordinate), float(igd)
     index = pd.MultiIndex.from_tuples(rows, names=["algorithm", "run"])
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
 
 def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
-    """The finished runs that have rows, each with its rows, in the study's order of algorithms;
-    raises UnanswerableError if there are none.
+    """The finished runs, each with its rows, in the study's order of algorithms; raises
+    UnanswerableError if none of them has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
@@ -116,7 +115,7 @@ def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, in
         raise UnanswerableError(
             case.name, "has no evaluations", "results with the journals of their runs"
         )
-    return [(run, groups[run]) for run in runs if run in groups]
+    return [(run, groups.get(run, frame[:0])) for run in runs]
 
 
 def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
@@ -255,7 +254,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
         for start, end in pairwise(counts_of_run):
             new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
-            volumes.append(hypervolume(front))
+            volumes.append(hypervolume(front, case.study.search.reference_point))
         columns = {
             "algorithm": algorithm,
             "run": run,

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from decimal import Decimal
 from itertools import count
 from typing import NamedTuple
 
@@ -27,6 +28,10 @@ is a normal approximation.
 """
 MAX_EXACT_RUNS = 50
 """Without ties and differences of zero, the signed-rank test is exact for up to this many runs."""
+RANKED_DIGITS = 12
+"""Number of significant digits of a value that is ranked: values that only rounding errors
+distinguish are ties.
+"""
 EXACT_TEST = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC_TEST = (
     "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
@@ -72,15 +77,17 @@ class TwoSampleTest(NamedTuple):
     n2: int
     method: str | None
 
-    def reversed(self) -> TwoSampleTest:
-        """The test with the effect size of Y against X, 1 - A12, whose magnitude is the same."""
-        return self._replace(effect_size=1 - self.effect_size)
+    def oriented(self, *, larger_is_better: bool) -> TwoSampleTest:
+        """The test whose effect size is above 0.5 where X is better: A12, or 1 - A12 where smaller
+        values are better.
+        """
+        return self if larger_is_better else self._replace(effect_size=1 - self.effect_size)
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     """Compare two samples without undefined values by U test and effect size."""
-    first = np.asarray(x, dtype=float)
-    second = np.asarray(y, dtype=float)
+    first = rounded_to_rank(x)
+    second = rounded_to_rank(y)
     if not first.size or not second.size:
         return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
     is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values(
@@ -90,6 +97,15 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     test = scipy.stats.mannwhitneyu(first, second, method=method, nan_policy="raise")
     a12 = float(test.statistic) / (first.size * second.size)
     return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, name)
+
+
+def rounded_to_rank(values: ArrayLike) -> FloatArray:
+    """Values with `RANKED_DIGITS` significant digits, of any shape, in one dimension."""
+    return np.array(_decimals(values), dtype=float)
+
+
+def _decimals(values: ArrayLike) -> list[Decimal]:
+    return [Decimal(f"{value:.{RANKED_DIGITS}g}") for value in np.ravel(values).tolist()]
 
 
 def has_distinct_values(values: ArrayLike) -> bool:
@@ -103,14 +119,17 @@ def magnitude_of(effect_size: float) -> str:
     return next((name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible")
 
 
-def signed_rank_test(sample: ArrayLike) -> TwoSampleTest:
-    """Compare independent differences, shape (N,), with 0 by Wilcoxon's test; the effect size is
-    the share of greater ones.
+def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
+    """Compare pairs, each of shape (N,), or values with one value, by Wilcoxon's test; the effect
+    size is the share of pairs in which x is greater.
 
     The test drops differences of 0 (as Wilcoxon did); the effect size counts them by half.
     """
+    # Differences of decimal numbers have no rounding errors.
+    pairs = zip(_decimals(x), _decimals(np.broadcast_to(y, np.shape(x))), strict=True)
+    differences = np.array([first - second for first, second in pairs], dtype=float)
+
     # No test of undefined or equal values.
-    differences = np.asarray(sample, dtype=float)
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
     if not differences.any():
