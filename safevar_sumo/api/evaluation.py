@@ -34,7 +34,7 @@ def evaluate(
     study: StudyLike,
     settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike,
     *,
-    filtered: bool = True,
+    filtered: bool = False,
     beyond: bool = False,
     pool: Pool | None = None,
     jobs: int | None = None,
@@ -55,7 +55,7 @@ def evaluate(
         - an array of shape (M, n) without missing values, with the n characteristics in the study's
           order.
     filtered
-        Put changes that are smaller than their thresholds back to the original, as every search
+        Put changes that do not exceed their thresholds back to the original first, as every search
         does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
@@ -71,11 +71,12 @@ def evaluate(
     -------
     pandas.DataFrame
         One row per setting, in the order of `settings` and with the index of a frame: the
-        characteristics as simulated, f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics
-        in their units (NaN where undefined), collision_speed [m/s], outcome: simulator-error if a
-        setting cannot be simulated, invalid-test if it leaves a test's speed before the driving
-        system acts. These have no metrics, and are neither failures nor successes. If the study
-        searches its scenario, feasible says whether the original is safe in the same encounter.
+        characteristics as simulated, f_safe [m or -m/s], f_diff [fraction] and f_num_diff (both of
+        the filtered setting, as in the paper), the metrics in their units (NaN where undefined),
+        collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated,
+        invalid-test if it leaves a test's speed before the driving system acts. These have no
+        metrics, and are neither failures nor successes. If the study searches its scenario,
+        feasible says whether the original is safe in the same encounter.
 
     Raises
     ------
@@ -87,7 +88,7 @@ def evaluate(
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
 
-    # Settings that may be simulated, after the filter of small changes.
+    # Settings that may be simulated, as they are given or as a search would filter them.
     requested, index = _read_settings(settings, characteristics, beyond)
     if not beyond:
         with about("settings"):

@@ -74,7 +74,7 @@ def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
-    assert result.setting["tireFric"] == 1.5
+    assert (result.setting["tireFric"], result.setting["mass"]) == (1.5, 2410.0)
     assert result.reset_values == {"mass": 2410.0}
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
@@ -86,7 +86,7 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.original.metrics != result.metrics
     assert "<p>&lt;Simulation of rain" in result._repr_html_()
     assert result.to_dict()["vcs"] == result.setting
-    assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
+    assert sv.simulate("rain", {"mass": 2410.0}, filtered=True).setting["mass"] == 2404.0
 
 
 def test_evaluate_is_simulate_row_by_row() -> None:
@@ -95,7 +95,10 @@ def test_evaluate_is_simulate_row_by_row() -> None:
     )
     frame = sv.evaluate("sun", asked, jobs=1)
     assert list(frame.index) == list("abc")
-    assert frame.loc["b", "tireFric"] == 3.5, "too small a change is put back"
+    assert frame.loc["b", "tireFric"] == 3.45, "a setting is simulated as it is given"
+    assert frame.loc["b", ["f_diff", "f_num_diff"]].tolist() == [0, 0], "as in the paper"
+    filtered = sv.evaluate("sun", asked, filtered=True, jobs=1)
+    assert filtered.loc["b", ["tireFric", "mass"]].tolist() == [3.5, 2404.0]
     assert frame.loc["a"].equals(frame.loc["c"])
     one = sv.simulate("sun", {"tireFric": 1.2, "mass": 2500.0})
     for name, value in {**one.metrics, **one.objectives}.items():
