@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     impact_in_words,
     time_to_collision,
 )
-from safevar_sumo.questions.words import OUTCOME_VERBS
+from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,
@@ -248,7 +248,7 @@ class Simulation:
             impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
             return f"has an {impact_in_words(*impact)}"
         if self.outcome is Outcome.COLLISION:
-            return f"collides at {-safety_degree:.2f} m/s"
+            return collision_in_words(-safety_degree, self.collision_speed)
         distance = distance_in_words(safety_degree, self.runs.middles_apart)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"

@@ -125,6 +125,17 @@ def test_a_simulation_is_shown_beside_the_original() -> None:
     )
 
 
+def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() -> None:
+    study = sv.load_study(
+        "euro_ncap_car_to_car", matrix={"point": "CCRm, speed 80, impact_location 50, clear"}
+    )
+    one = sv.simulate(study, {"tireFric": 1.0})
+    closing, own = -one.metrics["safety_degree"], one.collision_speed
+    assert own == pytest.approx(closing + 20 / 3.6, abs=1e-6)
+    speeds = f"{closing:.2f} m/s (closing speed; its own is {own:.2f} m/s)"
+    assert one.verdict == f"collides at {speeds}"
+
+
 def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> None:
     """A table, a trace, and a picture show the same two drives."""
     one = sv.simulate("wear", {"brakeTorque": 0.6})
