@@ -16,7 +16,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
-from safevar_sumo.records import FloatArray, Nominal
+from safevar_sumo.records import GRAVITY, FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.study import WORST, MetricsTable, Study, Weather
@@ -40,6 +40,7 @@ from safevar_sumo.vehicles import (
     region_of,
 )
 from safevar_sumo.vehicles.base import Prepared
+from safevar_sumo.vehicles.sensing import SumoVehicle
 
 _ONE_AT_A_TIME = RLock()
 """Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
@@ -178,6 +179,7 @@ class System:
         ]
         remarks += self.vehicle.remarks
         remarks += self._remarks_on_driver()
+        remarks += self._remarks_on_grip()
 
         # On weathers without effect.
         for weather in {point.weather.name: point.weather for point in self.points}.values():
@@ -225,6 +227,24 @@ class System:
             if is_default
             else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
         )
+
+    def _remarks_on_grip(self) -> list[str]:
+        """A remark on values of `decel` above what the tyres of SUMO's vehicle type carry."""
+        if not isinstance(self.vehicle, SumoVehicle):
+            return []
+        vehicle = self.characteristics.vehicle
+        original = dict(zip(vehicle.names, vehicle.original.tolist(), strict=True))
+        friction = max(point.weather.road_friction for point in self.points)
+        share = original["brakeGain"] * self.vehicle.reference_mass / original["mass"]
+        highest = self.vehicle.tyre_friction * friction * GRAVITY / share
+        if vehicle.upper[vehicle.names.index("decel")] <= highest:
+            return []
+        return [
+            f"decel above {highest:.2f} m/s^2 makes the original vehicle brake no harder with its"
+            " pedal fully pressed, as its tyres carry no more (tyre_friction"
+            f" {self.vehicle.tyre_friction:g}, road_friction {friction:g}); it acts on lighter"
+            " braking alone"
+        ]
 
     def _has_limited_range(self) -> bool:
         sensors = self.vehicle.sensors(self._prepared_original())
