@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -142,11 +143,14 @@ def _read_settings(
         if isinstance(settings, pd.DataFrame):
             for name in settings.columns:
                 check_name("settings", f"column {name!r} is no characteristic", name, names)
+                _check_numbers(name, settings[name])
             values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
             array = np.array(settings, dtype=float)
+            if not array.ndim:
+                raise InputError("settings", repr(settings), SETTINGS_FORMAT)
             if array.ndim != 2 or array.shape[1] != len(names):
                 raise InputError(
                     "settings",
@@ -155,7 +159,8 @@ def _read_settings(
                 )
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
-        raise InputError("settings", str(error), SETTINGS_FORMAT) from None
+        kind = type(settings).__name__
+        raise InputError("settings", f"a {kind}: {error}", SETTINGS_FORMAT) from None
 
     # The first illegal value is refused.
     is_legal = [
@@ -166,3 +171,10 @@ def _read_settings(
         with about(f"settings, row {row}"):
             characteristics.members[column].check(float(array[row, column]), beyond=beyond)
     return array, index
+
+
+def _check_numbers(name: str, column: pd.Series) -> None:
+    """Refuse a value of a column that is neither a number nor missing, such as a list or a text."""
+    for row, value in enumerate(column if column.dtype.kind not in "fiu" else ()):
+        if not isinstance(value, Real | None):
+            raise InputError(f"settings, row {row}", f"{name} = {value!r}", "a number, or None")

@@ -17,7 +17,6 @@ from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
-from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName
@@ -42,6 +41,7 @@ from safevar_sumo.sumo.matrix import (
     simulate_all_points,
     vehicle_remarks,
 )
+from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -216,7 +216,7 @@ def _fails(study: Study, result: PointResult) -> bool:
     """Whether the first setting fails at a point: by the study's own criterion, or by a contact
     that is faster than the point allows.
     """
-    criterion = Unsafe.parse(study.unsafe.criterion or COLLISION)
+    criterion = own_criterion(study)
     bound = criterion.bound
     evaluations = result.evaluations
     if bound is not None and bound.measure in evaluations.metrics:

@@ -16,7 +16,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
-from safevar_sumo.records import GRAVITY, FloatArray, Nominal
+from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.study import WORST, MetricsTable, Study, Weather
@@ -40,7 +40,6 @@ from safevar_sumo.vehicles import (
     region_of,
 )
 from safevar_sumo.vehicles.base import Prepared
-from safevar_sumo.vehicles.sensing import SumoVehicle
 
 _ONE_AT_A_TIME = RLock()
 """Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
@@ -52,6 +51,10 @@ UNKNOWN_TO_DRIVER = (
     " nor its brakes: that can make him collide"
 )
 """Remark on a controller written for TraCI."""
+DECEL = "decel"
+"""The characteristic that is the largest deceleration by the brakes [m/s^2]."""
+NEARLY = 0.999
+"""Share of the end of its domain at which the deceleration is lower if nothing else limits it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,21 +232,22 @@ class System:
         )
 
     def _remarks_on_grip(self) -> list[str]:
-        """A remark on values of `decel` above what the tyres of SUMO's vehicle type carry."""
-        if not isinstance(self.vehicle, SumoVehicle):
+        """A remark on values of `decel` above what the tyres of the original vehicle carry."""
+        members = self.characteristics.vehicle
+        if DECEL not in members.names:
             return []
-        vehicle = self.characteristics.vehicle
-        original = dict(zip(vehicle.names, vehicle.original.tolist(), strict=True))
+
+        # Does the largest deceleration still rise at the end of the domain?
+        column = members.names.index(DECEL)
+        settings = np.tile(members.original, (2, 1))
+        settings[:, column] = members.upper[column] * np.array([NEARLY, 1.0])
         friction = max(point.weather.road_friction for point in self.points)
-        share = original["brakeGain"] * self.vehicle.reference_mass / original["mass"]
-        highest = self.vehicle.tyre_friction * friction * GRAVITY / share
-        if vehicle.upper[vehicle.names.index("decel")] <= highest:
+        nearly, highest = self.vehicle.sumo_type(self._prepared(settings, friction)).decel.tolist()
+        if highest > nearly:
             return []
         return [
-            f"decel above {highest:.2f} m/s^2 makes the original vehicle brake no harder with its"
-            " pedal fully pressed, as its tyres carry no more (tyre_friction"
-            f" {self.vehicle.tyre_friction:g}, road_friction {friction:g}); it acts on lighter"
-            " braking alone"
+            f"the tyres of the original vehicle carry at most {highest:.2f} m/s^2: a {DECEL} above"
+            " that acts on lighter braking alone, and a fully pressed pedal brakes no harder"
         ]
 
     def _has_limited_range(self) -> bool:
@@ -252,9 +256,13 @@ class System:
 
     def _prepared_original(self) -> Prepared:
         """The constants of the original vehicle."""
-        vehicle = self.characteristics.vehicle
-        original = dict(zip(vehicle.names, vehicle.original[:, np.newaxis], strict=True))
-        return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
+        return self._prepared(self.characteristics.vehicle.original[np.newaxis], 1.0)
+
+    def _prepared(self, settings: FloatArray, friction: float) -> Prepared:
+        """The constants of N vehicles, shape (N, k), on a road with this factor on its friction."""
+        columns = np.ascontiguousarray(settings.T)
+        values = dict(zip(self.characteristics.vehicle.names, columns, strict=True))
+        return self.vehicle.prepare(values, friction, 0.1)  # time step 0.1 s
 
 
 def assemble(study: Study) -> System:

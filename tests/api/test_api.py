@@ -159,7 +159,13 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
     ("settings", "expected"),
     [
         (pd.DataFrame({"weight": [1.0]}), "weight"),
-        (pd.DataFrame({"mass": ["heavy"]}), "heavy"),
+        (pd.DataFrame({"mass": ["heavy"]}), "row 0: mass = 'heavy'\nexpected: a number"),
+        (
+            [{"mass": 2500.0}, {"mass": [1], "radius": 33}],
+            r"row 1: mass = \[1\]\nexpected: a number",
+        ),
+        ([{"mass": "2500"}], "row 0: mass = '2500'\nexpected: a number"),
+        ("1", "settings: '1'\nexpected: a list of mappings"),
         ([[1.0, 2.0]], r"shape \(1, 2\)"),
         ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"),
         ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
@@ -172,6 +178,17 @@ def test_unusable_settings_are_reported_before_any_simulation(
 ) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
+
+
+def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
+    for changes, told in (
+        ({"serach": {"runs": 2}}, r"rain.toml with serach=...: serach: .* did you mean 'search'"),
+        ({"search": {"rns": 2}}, r"rain.toml with search=...: search.rns: .* did you mean 'runs'"),
+    ):
+        with pytest.raises(sv.InputError, match=told):
+            sv.load_study("rain", **changes)
+    with pytest.raises(sv.InputError, match=r"mass = '1'\nexpected: a number in"):
+        sv.simulate("rain", {"mass": "1"})  # type: ignore[dict-item]
 
 
 def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond() -> None:
