@@ -141,7 +141,7 @@ def poses_of(comparison: Comparison) -> list[Poses]:
 
 
 def _with_next_place(actor: Poses) -> Poses:
-    """An actor with a place one step after its end, where an even change of its speed leads: between
+    """An actor with a place one step after its end, where an even change of speed leads: between
     the places beside it, a reader finds the speed at the end.
     """
     moves = np.diff([actor.x, actor.y], axis=1)
