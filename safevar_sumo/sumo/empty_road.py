@@ -130,7 +130,7 @@ def _problem(
     meets_undisturbed = keeps_speed and uneventful == ""
     if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
         return None
-    if gap[-1] <= 0 and _stays_beside(runs, end):
+    if gap[-1] <= 0 and not uneventful and _stays_beside(runs, end):
         words = "meets nobody: whoever is there stays beside its way, and comes no nearer to it"
         return EmptyRoadFault(Reason.LATE, words)
     if gap[-1] <= 0 or (keeps_speed and is_alone):
