@@ -51,7 +51,7 @@ from safevar_sumo.questions.words import (
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios.declared import read_study
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
@@ -211,6 +211,14 @@ def _found(results: Results, system: System, unsafe: str | None, jobs: int | Non
     following = ", ".join(
         question_command(name, directory) + criterion for name in ("explain", "tolerance")
     )
+
+    # Questions refuse an original encounter in which the original vehicle is not safe.
+    demanded = results.case.scoring.safe_original
+    if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
+        following = (
+            "a smaller scenario.margin, or original values of scenario.search with which the"
+            " original vehicle is safe, as questions demand"
+        )
     sentence, changes = _verdict(results, case, system)
     tables = answer.tables
     if changes:
@@ -308,7 +316,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     # The solution with the fewest changes; as it is printed, it ends in the same way.
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
-        return "The search found no solution.", []
+        return f"The search found no solution: {case.why_no_solution}.", []
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
         f"The search found {number_of(len(solutions), 'different solution')};"
