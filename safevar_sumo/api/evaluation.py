@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def evaluate(
     study: StudyLike,
     settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike,
     *,
-    filtered: bool = True,
+    filtered: bool = False,
     beyond: bool = False,
     pool: Pool | None = None,
     jobs: int | None = None,
@@ -55,7 +56,7 @@ def evaluate(
         - an array of shape (M, n) without missing values, with the n characteristics in the study's
           order.
     filtered
-        Put changes that are smaller than their thresholds back to the original, as every search
+        Put changes that do not exceed their thresholds back to the original first, as every search
         does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
@@ -71,11 +72,12 @@ def evaluate(
     -------
     pandas.DataFrame
         One row per setting, in the order of `settings` and with the index of a frame: the
-        characteristics as simulated, f_safe [m or -m/s], f_diff [fraction], f_num_diff, the metrics
-        in their units (NaN where undefined), collision_speed [m/s], outcome: simulator-error if a
-        setting cannot be simulated, invalid-test if it leaves a test's speed before the driving
-        system acts. These have no metrics, and are neither failures nor successes. If the study
-        searches its scenario, feasible says whether the original is safe in the same encounter.
+        characteristics as simulated, f_safe [m or -m/s], f_diff [fraction] and f_num_diff (both of
+        the filtered setting, as in the paper), the metrics in their units (NaN where undefined),
+        collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated,
+        invalid-test if it leaves a test's speed before the driving system acts. These have no
+        metrics, and are neither failures nor successes. If the study searches its scenario,
+        feasible says whether the original is safe in the same encounter.
 
     Raises
     ------
@@ -87,7 +89,7 @@ def evaluate(
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
 
-    # Settings that may be simulated, after the filter of small changes.
+    # Settings that may be simulated, as they are given or as a search would filter them.
     requested, index = _read_settings(settings, characteristics, beyond)
     if not beyond:
         with about("settings"):
@@ -141,11 +143,14 @@ def _read_settings(
         if isinstance(settings, pd.DataFrame):
             for name in settings.columns:
                 check_name("settings", f"column {name!r} is no characteristic", name, names)
+                _check_numbers(name, settings[name])
             values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
             array = np.array(settings, dtype=float)
+            if not array.ndim:
+                raise InputError("settings", repr(settings), SETTINGS_FORMAT)
             if array.ndim != 2 or array.shape[1] != len(names):
                 raise InputError(
                     "settings",
@@ -154,7 +159,8 @@ def _read_settings(
                 )
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
-        raise InputError("settings", str(error), SETTINGS_FORMAT) from None
+        kind = type(settings).__name__
+        raise InputError("settings", f"a {kind}: {error}", SETTINGS_FORMAT) from None
 
     # The first illegal value is refused.
     is_legal = [
@@ -165,3 +171,10 @@ def _read_settings(
         with about(f"settings, row {row}"):
             characteristics.members[column].check(float(array[row, column]), beyond=beyond)
     return array, index
+
+
+def _check_numbers(name: str, column: pd.Series) -> None:
+    """Refuse a value of a column that is neither a number nor missing, such as a list or a text."""
+    for row, value in enumerate(column if column.dtype.kind not in "fiu" else ()):
+        if not isinstance(value, Real | None):
+            raise InputError(f"settings, row {row}", f"{name} = {value!r}", "a number, or None")

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     impact_in_words,
     time_to_collision,
 )
-from safevar_sumo.questions.words import OUTCOME_VERBS
+from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,
@@ -139,7 +139,8 @@ class Simulation:
     no_verdict
         Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
     reset_values
-        Requested values that the filter reset to the original, by name.
+        Requested values that the filter resets to the original, by name: for the simulation if it
+        is `filtered`, otherwise for f_diff and f_num_diff alone.
     """
 
     study: Study
@@ -157,7 +158,7 @@ class Simulation:
 
     @property
     def setting(self) -> dict[str, float]:
-        """The simulated value of every characteristic in its table unit, after the filter."""
+        """The simulated value of every characteristic in its table unit."""
         names = self.pair.system.characteristics.names
         return dict(zip(names, self.evaluation.settings[0].tolist(), strict=True))
 
@@ -193,8 +194,8 @@ class Simulation:
 
     @property
     def objectives(self) -> dict[str, float]:
-        """f_safe [m, or -m/s on a collision], f_diff [fraction], f_num_diff [characteristics]; all
-        are minimised.
+        """f_safe [m, or -m/s on a collision], and of the filtered setting f_diff [fraction] and
+        f_num_diff [characteristics]; all are minimised.
         """
         return {
             name: float(self.evaluation.column(name)[0])
@@ -247,7 +248,7 @@ class Simulation:
             impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
             return f"has an {impact_in_words(*impact)}"
         if self.outcome is Outcome.COLLISION:
-            return f"collides at {-safety_degree:.2f} m/s"
+            return collision_in_words(-safety_degree, self.collision_speed)
         distance = distance_in_words(safety_degree, self.runs.middles_apart)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
@@ -278,7 +279,7 @@ def simulate(
     study: StudyLike,
     changes: Mapping[str, float] | None = None,
     *,
-    filtered: bool = True,
+    filtered: bool = False,
     beyond: bool = False,
 ) -> Simulation:
     """Simulate one setting in this process, and the original vehicle for comparison.
@@ -291,7 +292,7 @@ def simulate(
         Values by characteristic, in their table units; all other characteristics keep the
         original's value.
     filtered
-        Put changes that are smaller than their thresholds back to the original, as every search
+        Put changes that do not exceed their thresholds back to the original first, as every search
         does.
     beyond
         Also accept values outside the domains, and settings that violate the study's constraints.
@@ -352,15 +353,15 @@ def simulate_with_original(
     vehicle; in a matrix, both at the setting's worst point.
     """
     characteristics = system.characteristics
-    setting = characteristics.filter(requested) if filtered else requested
-    pair = _drive_pair(system, setting)
-    values = zip(characteristics.names, requested.tolist(), setting.tolist(), strict=True)
+    filtered_setting = characteristics.filter(requested)
+    pair = _drive_pair(system, filtered_setting if filtered else requested)
+    values = zip(characteristics.names, requested.tolist(), filtered_setting.tolist(), strict=True)
     return Simulation(
         study=study,
         pair=pair,
         row=len(pair.evaluations) - 1,
         no_verdict=why_no_verdict(system),
-        reset_values={name: value for name, value, simulated in values if value != simulated},
+        reset_values={name: value for name, value, kept in values if value != kept},
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -13,7 +14,6 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-import pandas as pd
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
@@ -48,10 +48,10 @@ from safevar_sumo.questions.words import (
     number_of,
     question_command,
 )
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.records import FloatArray, JsonObject, Outcome
 from safevar_sumo.results import CHOICES
 from safevar_sumo.scenarios.declared import read_study
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
@@ -211,6 +211,14 @@ def _found(results: Results, system: System, unsafe: str | None, jobs: int | Non
     following = ", ".join(
         question_command(name, directory) + criterion for name in ("explain", "tolerance")
     )
+
+    # Questions refuse an original encounter in which the original vehicle is not safe.
+    demanded = results.case.scoring.safe_original
+    if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
+        following = (
+            "a smaller scenario.margin, or original values of scenario.search with which the"
+            " original vehicle is safe, as questions demand"
+        )
     sentence, changes = _verdict(results, case, system)
     tables = answer.tables
     if changes:
@@ -305,10 +313,10 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
             breach = case.unsafe.breach_in_words(original)
             return f"The original vehicle itself {breach}: no change is needed.", []
 
-    # The solution with the fewest changes, as it is printed, must be unsafe, too.
+    # The solution with the fewest changes; as it is printed, it ends in the same way.
     solutions = case.solutions.drop_duplicates(names)
     if solutions.empty:
-        return "The search found no solution.", []
+        return f"The search found no solution: {case.why_no_solution}.", []
     failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
     counts = (
         f"The search found {number_of(len(solutions), 'different solution')};"
@@ -318,26 +326,14 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
     if failures.empty:
         return counts, []
-    fewest = failures.iloc[0]
-    values = fewest[names].to_numpy(dtype=float)
-    printed = None if system.rater else _failing_as_printed(system, case, values)
-    if printed is None:
-        ending = ending_in_words(fewest["outcome"], fewest["f_safe"], system.contact)
-        bounded = fewest
-    else:
-        values = printed.settings[0]
-        ending = ending_in_words(str(printed.outcome[0]), float(printed.f_safe[0]), system.contact)
-        bounded = pd.Series({name: column[0] for name, column in printed.metrics.items()})
+    fewest: dict[Any, Any] = failures.iloc[0].to_dict()
+    values = np.array([fewest[name] for name in names], dtype=float)
+    ending = _ending(system, case, fewest)
+    printed = None if system.rater else _ending_as_printed(system, case, values, ending)
+    if printed is not None:
+        values = printed
 
-    # How it ends, and what it changes.
-    if system.rater:
-        ending = f"earns {fewest[RATING_POINTS.name]:.2f} points"
-    elif case.unsafe.is_of_impacts:
-        ending = (
-            f"has an {impact_in_words(bounded[IMPACT_SPEED.name], bounded[IMPACT_EXCESS.name])}"
-        )
-    elif case.unsafe.bound:
-        ending += f", {case.unsafe.bound.measure} {bounded[case.unsafe.bound.measure]:.3g}"
+    # What it changes.
     by_name = dict(zip(names, values.tolist(), strict=True))
     are_printed = printed is not None
     texts = change_texts(case.characteristics, by_name, are_printed=are_printed)
@@ -353,15 +349,30 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     return f"{counts} {fewest_in_words} {ending}{listed}.", rows
 
 
-def _failing_as_printed(system: System, case: Case, setting: FloatArray) -> Evaluations | None:
-    """A solution simulated with its values as they are printed, with as many digits as it needs to
-    be unsafe; None if it is safe with all of them.
+def _ending(system: System, case: Case, row: Mapping[str, Any]) -> str:
+    """How a solution ends, in words, from its row of results."""
+    if system.rater:
+        return f"earns {row[RATING_POINTS.name]:.2f} points"
+    if case.unsafe.is_of_impacts:
+        return f"has an {impact_in_words(row[IMPACT_SPEED.name], row[IMPACT_EXCESS.name])}"
+    ending = ending_in_words(str(row["outcome"]), float(row["f_safe"]), system.contact)
+    bound = case.unsafe.bound
+    return f"{ending}, {bound.measure} {row[bound.measure]:.3g}" if bound else ending
+
+
+def _ending_as_printed(
+    system: System, case: Case, setting: FloatArray, ending: str
+) -> FloatArray | None:
+    """An unsafe solution with its values as they are printed, shape (n,), with as many digits as it
+    needs to be unsafe with the same ending; None if it is not with any of them.
     """
     for further in FURTHER_DIGITS:
-        printed = drive_and_score(
-            system, as_printed(system.characteristics, setting, further)[np.newaxis]
-        )
-        if case.unsafe.of(printed)[0] and not system.measuring.scoring.violation(printed)[0]:
+        printed = as_printed(system.characteristics, setting, further)
+        found = drive_and_score(system, printed[np.newaxis])
+        metrics = {name: column[0] for name, column in found.metrics.items()}
+        row = {"outcome": found.outcome[0], "f_safe": found.f_safe[0], **metrics}
+        is_unsafe = case.unsafe.of(found)[0] and not system.measuring.scoring.violation(found)[0]
+        if is_unsafe and _ending(system, case, row) == ending:
             return printed
     return None
 

@@ -176,6 +176,7 @@ def _failed_evaluation(
     characteristics = CharacteristicSet.of(study)
     undefined = np.full(1, np.nan)
     setting = row[:, : len(characteristics)]  # without the ADS's parameters
+    filtered = characteristics.filter(setting)
     if isinstance(failure, UserCodeError):
         command = reproduction_command(study, setting[0])
         raise UserCodeError(
@@ -186,8 +187,8 @@ def _failed_evaluation(
         outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
         collision_speed=undefined,
         metrics=dict.fromkeys(METRICS, undefined),
-        f_diff=characteristics.largest_change(setting),
-        f_num_diff=characteristics.number_changed(setting),
+        f_diff=characteristics.largest_change(filtered),
+        f_num_diff=characteristics.number_changed(filtered),
         reasons={row[0].tobytes(): " ".join(str(failure).split())},
     )
 
@@ -289,7 +290,6 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
         for characteristic, value in zip(characteristics, setting.tolist(), strict=True)
         if value != characteristic.original
     ]
-    words += ["--no-filter"] if (characteristics.filter(setting) != setting).any() else []
     words += (
         ["--beyond"]
         if ((setting < characteristics.lower) | (setting > characteristics.upper)).any()

@@ -20,7 +20,9 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.measuring import own_criterion
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
 
 STUDY_OF_AN_ADS = "smoke"
@@ -48,10 +50,14 @@ CHECKS: Mapping[str, str] = {
     ),
     "meeting": (
         "choose values of the scenario's parameters at which the vehicle meets the others before"
-        " they have left"
+        " they have left, and check the signs of places and speeds: the others come into its way"
+    ),
+    "original": (
+        "find out with `simulate` why the original vehicle fails: check signs and units of what the"
+        " code reads and commands; changes of a vehicle that is unsafe as it is explain nothing"
     ),
 }
-"""The checks, with advice on a failure. All but the last two, of which every answer itself warns,
+"""The checks, with advice on a failure. All but the last three, of which every answer itself warns,
 also keep a study from starting.
 """
 
@@ -97,7 +103,7 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     system = assemble(study)
     problems = find_problems(system)
     if not problems:
-        return []
+        return _unsafe_original(study, system)
     words = sentence_on(problems, len(system.points))
     if next(iter(problems.values())).reason is Reason.LATE:
         where = _definition(study, "scenario.model", study.scenario.model)
@@ -108,6 +114,22 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
             "reaction", words, where, "", "a drive to the encounter, without braking for nobody"
         )
     ]
+
+
+def _unsafe_original(study: Study, system: System) -> list[Finding]:
+    """A finding if the original vehicle is unsafe; none in a rated study, where all collide
+    in some cell.
+    """
+    if system.rater is not None:
+        return []
+    unsafe = own_criterion(study)
+    original = drive_and_score(system, system.characteristics.original[np.newaxis])
+    if not unsafe.of(original)[0]:
+        return []
+    point = system.points[original.points[0]].name
+    words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
+    where = _definition(study, "ads.model", study.ads.model)
+    return [Finding("original", words, where, point, "an original vehicle that is safe")]
 
 
 def refuse_defects(study: Study) -> None:

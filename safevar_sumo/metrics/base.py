@@ -77,7 +77,7 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     of
         What it measures: `runs` or `settings`.
     function
-        Takes N simulation runs and thresholds, or filtered settings of shape (N, n) and the
+        Takes N simulation runs and thresholds, or settings as simulated, shape (N, n), and the
         characteristics; returns shape (N,), of runs NaN where it is undefined. Element i depends
         only on run or setting i, bit for bit. None in results, and for columns that all results
         have.

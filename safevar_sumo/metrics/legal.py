@@ -13,18 +13,35 @@ PEDAL_ROUNDING = 1e-6
 """Change of the brake pedal that is a rounding error of its delay [-]."""
 
 
+@np.errstate(all="ignore")  # of vehicles that do not brake
 def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that
     does not brake or stop.
 
-    A sample's pedal acts in the step before it.
+    A sample's pedal acts in the step before it. A dead time of the brake may end inside that step.
     """
+    # The step in which the brake first acts.
     trace = runs.trace
     pedal = np.broadcast_to(trace.pedal, trace.speed.shape)
     vehicles = np.arange(trace.speed.shape[1])
     is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
-    begin = np.maximum(np.argmax(is_pressed, axis=0) - 1, 0)
-    distance = trace.position[-1] - trace.position[begin, vehicles]
+    end = np.argmax(is_pressed, axis=0)
+    samples = np.clip([end - 1, end, end + 1], 0, len(pedal) - 1)
+
+    # Its share with brake force: 1 unless the pedal has a part of the first command there and all
+    # of it a step later. Where the tyres limit the force, the loss of speed says more.
+    first_command = trace.brake[
+        np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
+    ]
+    _, part, whole = pedal[samples, vehicles]
+    lost, lost_later = -np.diff(trace.speed[samples, vehicles], axis=0)
+    is_part = (part < whole) & (np.abs(whole - first_command) <= PEDAL_ROUNDING) & (lost_later > 0)
+    shares = np.maximum(part / whole, lost / lost_later)
+    share = np.where(is_part, np.minimum(shares, 1.0), 1.0)
+
+    # From there to standstill.
+    begin, after, _ = trace.position[samples, vehicles]
+    distance = trace.position[-1] - after + share * (after - begin)
     return _of_stops(runs, np.where(is_pressed.any(axis=0), distance, np.nan))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import EXACT, join_phrases
 from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import unit_text
@@ -64,7 +64,7 @@ def describe(
 
 def limit_text(item: Characteristic, value: float) -> str:
     """A value as it is printed, without further zeros, as in tables."""
-    return f"{value:.10g}{item.suffix}"
+    return f"{value:{EXACT}}{item.suffix}"
 
 
 def as_printed(
@@ -128,7 +128,7 @@ def where_in_words(
     units = searchable_in(point.scenario)
     texts = {
         name: (
-            f"{value:.10g}{unit_text(units[name].unit) if name in units else ''}"
+            f"{value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
             if isinstance(value, int | float)
             else str(value)
         )

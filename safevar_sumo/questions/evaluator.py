@@ -94,14 +94,15 @@ class Evaluator:
         if is_feasible.all():
             return self._evaluate_shown(settings, stage, self._verified)
         infeasible = settings[~is_feasible]
+        filtered = self.characteristics.filter(infeasible)
         undefined = np.full(np.count_nonzero(~is_feasible), np.nan)
         not_simulated = Evaluations(
             settings=infeasible,
             outcome=np.full(len(infeasible), Outcome.INFEASIBLE.value, dtype="U16"),
             collision_speed=undefined,
             metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self.characteristics.largest_change(infeasible),
-            f_num_diff=self.characteristics.number_changed(infeasible),
+            f_diff=self.characteristics.largest_change(filtered),
+            f_num_diff=self.characteristics.number_changed(filtered),
         )
         simulated = self._evaluate_shown(settings[is_feasible], stage, self._verified)
         both = Evaluations.concatenate([simulated, not_simulated])

@@ -24,6 +24,10 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
+EXACT = ".15g"
+"""How values are printed with which a vehicle was simulated: all their digits."""
+
+
 def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 0.0) -> str:
     """How a run ended, such as `collides at 3.21 m/s` or `stops with a safety degree of 0.87 m`.
 
@@ -39,6 +43,15 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 
     return f"{verb} with a safety degree of {distance_in_words(safety_degree, contact)}"
 
 
+def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) -> str:
+    """How a vehicle collides [m/s], such as `collides at 3.17 m/s`; with its own speed if that is
+    another one, as the struck body moves along the lane.
+    """
+    closing, own = (f"{speed:.{digits}f}" for speed in (closing_speed, own_speed))
+    beside = "" if closing == own else f" (closing speed; its own is {own} m/s)"
+    return f"collides at {closing} m/s{beside}"
+
+
 def change_texts(
     characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
 ) -> list[str]:
@@ -52,7 +65,7 @@ def change_texts(
         value = values.get(item.name, item.original)
         if value != original:
             share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
-            text = f"{value:.10g}" if are_printed else item.text(value)
+            text = f"{value:{EXACT}}" if are_printed else item.text(value)
             texts.append(f"{item.name} {original:g} -> {text}{item.suffix}{share}")
     return texts
 
@@ -64,7 +77,7 @@ def encounter_in_words(
     empty without any.
     """
     texts = {
-        item: f"{values[item.name]:.10g}" if are_printed else item.text(values[item.name])
+        item: f"{values[item.name]:{EXACT}}" if are_printed else item.text(values[item.name])
         for item in characteristics.scenario
     }
     phrases = [f"{item.short_name} {text}{item.suffix}" for item, text in texts.items()]

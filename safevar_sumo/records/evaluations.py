@@ -40,12 +40,13 @@ class CellResults(NamedTuple):
 class Evaluations:
     """M evaluated settings with their outcomes, metrics and objectives.
 
-    `settings` has shape (M, n) and holds the filtered values in their table units; all other arrays
-    have shape (M,). `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further metrics;
-    an undefined value is NaN. `collision_speed` is in m/s, `f_diff` a fraction, `f_num_diff` a
-    count. `reasons` says, by the bytes of a setting, why the setting could not be simulated.
-    `cells` are a rating's results, None without a rating. `worst_points` are the numbers of the
-    points at which the settings were worst, None without a matrix.
+    `settings` has shape (M, n) and holds the simulated values in their table units; all other
+    arrays have shape (M,). `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further
+    metrics; an undefined value is NaN. `collision_speed` is in m/s, `f_diff` a fraction,
+    `f_num_diff` a count, both of the filtered values. `reasons` says, by the bytes of a setting,
+    why the setting could not be simulated. `cells` are a rating's results, None without a rating.
+    `worst_points` are the numbers of the points at which the settings were worst, None without a
+    matrix.
     """
 
     settings: FloatArray

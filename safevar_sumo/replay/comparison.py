@@ -16,7 +16,7 @@ import numpy as np
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Measure
 from safevar_sumo.questions.braking import brake_onset
-from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts
+from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts, collision_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.scenarios import Point
@@ -142,7 +142,8 @@ class Comparison:
 
         # A collision, or how else it ends.
         if not math.isnan(runs.closing_speed[row]):
-            return f"collides at {runs.closing_speed[row]:.1f} m/s"
+            own = runs.collision_speed[row]
+            return collision_in_words(runs.closing_speed[row], own, digits=1)
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"

@@ -140,6 +140,24 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     return actors
 
 
+def _with_next_place(actor: Poses) -> Poses:
+    """An actor with a place one step after its end, where an even change of speed leads: between
+    the places beside it, a reader finds the speed at the end.
+    """
+    moves = np.diff([actor.x, actor.y], axis=1)
+    if moves.shape[1] < 2 or not moves[:, -1].any():
+        return actor
+    before, last = np.hypot(*moves[:, -2:])
+    x, y = moves[:, -1] * max(2 - before / last, 0.0)
+    time = round(2 * actor.time[-1] - actor.time[-2], TIME_DECIMALS)
+    return actor._replace(
+        time=np.append(actor.time, time),
+        x=np.append(actor.x, actor.x[-1] + x),
+        y=np.append(actor.y, actor.y[-1] + y),
+        heading=np.append(actor.heading, actor.heading[-1]),
+    )
+
+
 def open_drive(network: NetworkFiles) -> str:
     """The network as OpenDRIVE 1.4: of a shipped network the file beside it, of others by
     netconvert.
@@ -311,13 +329,13 @@ def write_files(
         files[SCRIPT] = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
         files[VEHICLE] = json.dumps(scene, indent=1, allow_nan=False) + "\n"
     else:
-        actors = poses_of(comparison)
+        ego, *others = poses_of(comparison)
         template = template_environment().get_template(f"{SCENARIO}.j2")
         files[SCENARIO] = template.render(
             title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
             road=ROAD,
-            actors=actors,
-            end=max(float(actor.time[-1]) for actor in actors),
+            actors=[ego, *map(_with_next_place, others)],
+            end=float(ego.time[-1]),
             wheelbase=WHEELBASE,
         )
     make_directory(out)

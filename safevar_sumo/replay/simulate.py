@@ -17,7 +17,6 @@ from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
-from safevar_sumo.metrics.unsafe import COLLISION, Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName
@@ -42,6 +41,7 @@ from safevar_sumo.sumo.matrix import (
     simulate_all_points,
     vehicle_remarks,
 )
+from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -152,7 +152,7 @@ def show_simulation(
         A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it
         for others.
     no_filter
-        Keep changes that are smaller than the filter's thresholds.
+        Accepted for earlier versions and without effect: changes of any size are simulated.
     beyond
         Also accept values beyond the domains, and settings that violate a constraint.
     trace
@@ -173,13 +173,12 @@ def show_simulation(
     # What is simulated: a study or a solution, with changes.
     target = load_target(source, solution, as_it_is_now, point)
     system = assemble(target.study)
-    filtered = not no_filter
     changes = set
     with about("set"):
         values = read_changes(changes, system.characteristics, beyond=beyond)
         requested = _combine(values, target.setting(system), system)
         if changes and not beyond:  # what a study or results hold has been checked
-            system.check_feasible(requested, filtered=filtered, switch="--beyond")
+            system.check_feasible(requested, filtered=False, switch="--beyond")
 
     # Files that cannot be written are refused first.
     if trace is not None:
@@ -195,10 +194,10 @@ def show_simulation(
                 "one value for each characteristic with --trace, --animate, --gui or --spread"
             )
             raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
-        return _sweep(target.study, system, requested, list(values), filtered)
+        return _sweep(target.study, system, requested, list(values))
 
     # One setting beside the original vehicle.
-    simulation = simulate_with_original(target.study, system, requested[0], filtered=filtered)
+    simulation = simulate_with_original(target.study, system, requested[0], filtered=False)
     if target.row and not changes and point is None:  # results belong to the whole matrix
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
@@ -217,7 +216,7 @@ def _fails(study: Study, result: PointResult) -> bool:
     """Whether the first setting fails at a point: by the study's own criterion, or by a contact
     that is faster than the point allows.
     """
-    criterion = Unsafe.parse(study.unsafe.criterion or COLLISION)
+    criterion = own_criterion(study)
     bound = criterion.bound
     evaluations = result.evaluations
     if bound is not None and bound.measure in evaluations.metrics:
@@ -230,15 +229,20 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix.
     """
-    # What was reset by the filter, or came too early.
+    # Which numbers are of the filtered setting, and what came too early.
     study = target.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks(system)
-    remarks.extend(
-        f"{name} = {value:g} differs from the original by less than the filter threshold and was"
-        f" reset to {simulation.setting[name]:g}; --no-filter keeps it."
+    small = [
+        f"{name} = {value:g}"
         for name, value in simulation.reset_values.items()
-    )
+        if name in system.characteristics.vehicle.names
+    ]
+    if small:
+        remarks.append(
+            f"f_diff and f_num_diff are of the filtered setting, as in a search: they count"
+            f" {' and '.join(small)} as unchanged. Everything else is of the vehicle as given."
+        )
     remarks += _acted_early(system, setting)
 
     # Values and results of both vehicles.
@@ -352,13 +356,10 @@ def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation
         warn(f"{target.handle} of {target.source}: {difference}; {why}")
 
 
-def _sweep(
-    study: Study, system: System, requested: FloatArray, names: list[str], filtered: bool
-) -> Answer:
+def _sweep(study: Study, system: System, settings: FloatArray, names: list[str]) -> Answer:
     """A row for each setting of a sweep."""
     # All settings, and the original vehicle first.
     characteristics = system.characteristics
-    settings = characteristics.filter(requested) if filtered else requested
     evaluations = evaluate_with_workers(
         study, np.concatenate([characteristics.original[np.newaxis], settings])
     )
@@ -388,13 +389,7 @@ def _sweep(
 
     # What a reader should know of the settings.
     collisions = int(evaluations.collided[1:].sum())
-    resets = np.count_nonzero((settings != requested).any(axis=1))
     remarks = [*_remarks(system), degree_note(contact)]
-    if resets:
-        remarks.append(
-            f"In {resets} of {len(frame)} settings the filter reset small changes; --no-filter"
-            " keeps them."
-        )
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     if len(names) == 1 and rises_again(frame, names[0], characteristics):

@@ -252,6 +252,10 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Length of a run [s]."""
         return _Start.of(self).time_to_impact + self.time_after
 
+    def check(self) -> None:
+        """Refuse a target that cannot be at the impact in time."""
+        _Start.of(self)
+
     def tracks(self, times: FloatArray) -> list[Track]:
         """The target, which moves past the place of the impact, and the parked cars, if any."""
         # The target's way over time; on foot it stops beyond the path.

@@ -131,8 +131,8 @@ class TargetProfile(NamedTuple):
         if np.any(begin < 0):
             raise InputError(
                 "",
-                f"the target needs {np.max(shortest_time):.2f} s to the impact and has"
-                f" {np.max(time):g} s",
+                f"time_to_impact: the target needs {np.max(shortest_time):.2f} s to the impact, and"
+                f" has {np.max(time):g} s",
                 "a faster target, a shorter distance or a longer time_to_impact",
             )
         return cls(begin, speed, run_up)

@@ -90,7 +90,8 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
     """
     raw = _raw_study(study)
     if changes:
-        raw = _with_overrides(raw, plain_values(changes), raw.source)
+        arguments = ", ".join(f"{name}=..." for name in changes)
+        raw = _with_overrides(raw, plain_values(changes), f"{raw.source} with {arguments}")
     with about(raw.source):
         if "origin" in raw.tables:
             raise InputError("", "origin: there is no such key")

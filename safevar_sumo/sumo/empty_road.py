@@ -92,6 +92,16 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
     )
 
 
+def _stays_beside(runs: SimulationRuns, end: int) -> bool:
+    """Whether nobody is in the way of the only vehicle at the samples before `end`, or comes nearer
+    to it in the last step.
+    """
+    trace = runs.trace
+    width = np.broadcast_to(trace.obstacle_width, trace.gap.shape)[:end, 0]
+    beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + width) / 2
+    return bool((beside > 0).all() and beside[-1] >= beside[-2:][0])
+
+
 def _problem(
     runs: SimulationRuns, test_speed: float | None, uneventful: str | None
 ) -> EmptyRoadFault | None:
@@ -120,6 +130,9 @@ def _problem(
     meets_undisturbed = keeps_speed and uneventful == ""
     if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
         return None
+    if gap[-1] <= 0 and not uneventful and _stays_beside(runs, end):
+        words = "meets nobody: whoever is there stays beside its way, and comes no nearer to it"
+        return EmptyRoadFault(Reason.LATE, words)
     if gap[-1] <= 0 or (keeps_speed and is_alone):
         return EmptyRoadFault(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
 

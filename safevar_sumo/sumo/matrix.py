@@ -127,7 +127,7 @@ def drive_and_score(
     *,
     with_originals: bool = True,
 ) -> Evaluations:
-    """Simulate filtered settings, shape (N, n), in one batch and score them.
+    """Simulate settings, shape (N, n), as they are given, in one batch and score them.
 
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
     matrix, row i holds the result of setting i at its worst point. In a study that searches its

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, check_name, one_of
 from safevar_sumo.metrics import (
     F_DIFF,
     F_NUM_DIFF,
@@ -19,8 +19,10 @@ from safevar_sumo.metrics import (
     STOPPING_DISTANCE,
     Measure,
     Scoring,
+    Unsafe,
     checked_measure,
 )
+from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
@@ -41,6 +43,7 @@ RESULT_COLUMNS = (
 )
 """Names of result columns, which no characteristic or measure may use."""
 OBJECTIVES_KEY = "search.objectives"
+CRITERION_KEY = "unsafe.criterion"
 
 
 class Measuring(NamedTuple):
@@ -78,6 +81,13 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
 
+    # The one of its own criterion.
+    bound = own_criterion(study).bound
+    if bound is not None:
+        problem = f"{CRITERION_KEY} = {study.unsafe.criterion!r}: there is no such metric"
+        check_name("", problem, bound.measure, {*named.computed, *OPTIONAL_METRICS})
+        named.look_up(bound.measure, CRITERION_KEY, {**metrics, **named.computed})
+
     # Objectives, each once.
     shipped = {**metrics, **OBJECTIVES}
     objectives = [
@@ -99,6 +109,25 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         raise InputError("", f"search.objectives: {problem}", "each objective once")
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
+
+
+def own_criterion(study: Study) -> Unsafe:
+    """The study's own criterion; without one, a collision.
+
+    Raises
+    ------
+    InputError
+        If it is no criterion, or about points of a study that is not rated.
+    """
+    text = study.unsafe.criterion or COLLISION
+    try:
+        criterion = Unsafe.parse(text)
+    except InputError as error:
+        raise InputError("", f"{CRITERION_KEY} = {text!r}", error.legal) from None
+    if criterion.points is not None and not is_rated(study):
+        problem = f"{CRITERION_KEY} = {text!r}: the study is not rated and has no points"
+        raise InputError("", problem, "collision or below=X")
+    return criterion
 
 
 class _Named:

@@ -51,6 +51,10 @@ UNKNOWN_TO_DRIVER = (
     " nor its brakes: that can make him collide"
 )
 """Remark on a controller written for TraCI."""
+DECEL = "decel"
+"""The characteristic that is the largest deceleration by the brakes [m/s^2]."""
+NEARLY = 0.999
+"""Share of the end of its domain at which the deceleration is lower if nothing else limits it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,6 +182,7 @@ class System:
         ]
         remarks += self.vehicle.remarks
         remarks += self._remarks_on_driver()
+        remarks += self._remarks_on_grip()
 
         # On weathers without effect.
         for weather in {point.weather.name: point.weather for point in self.points}.values():
@@ -226,15 +231,38 @@ class System:
             else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
         )
 
+    def _remarks_on_grip(self) -> list[str]:
+        """A remark on values of `decel` above what the tyres of the original vehicle carry."""
+        members = self.characteristics.vehicle
+        if DECEL not in members.names:
+            return []
+
+        # Does the largest deceleration still rise at the end of the domain?
+        column = members.names.index(DECEL)
+        settings = np.tile(members.original, (2, 1))
+        settings[:, column] = members.upper[column] * np.array([NEARLY, 1.0])
+        friction = max(point.weather.road_friction for point in self.points)
+        nearly, highest = self.vehicle.sumo_type(self._prepared(settings, friction)).decel.tolist()
+        if highest > nearly:
+            return []
+        return [
+            f"the tyres of the original vehicle carry at most {highest:.2f} m/s^2: a {DECEL} above"
+            " that acts on lighter braking alone, and a fully pressed pedal brakes no harder"
+        ]
+
     def _has_limited_range(self) -> bool:
         sensors = self.vehicle.sensors(self._prepared_original())
         return sensors is not None and bool(np.isfinite(sensors.reach).all())
 
     def _prepared_original(self) -> Prepared:
         """The constants of the original vehicle."""
-        vehicle = self.characteristics.vehicle
-        original = dict(zip(vehicle.names, vehicle.original[:, np.newaxis], strict=True))
-        return self.vehicle.prepare(original, 1.0, 0.1)  # road friction 1, time step 0.1 s
+        return self._prepared(self.characteristics.vehicle.original[np.newaxis], 1.0)
+
+    def _prepared(self, settings: FloatArray, friction: float) -> Prepared:
+        """The constants of N vehicles, shape (N, k), on a road with this factor on its friction."""
+        columns = np.ascontiguousarray(settings.T)
+        values = dict(zip(self.characteristics.vehicle.names, columns, strict=True))
+        return self.vehicle.prepare(values, friction, 0.1)  # time step 0.1 s
 
 
 def assemble(study: Study) -> System:

@@ -195,7 +195,7 @@ class TraciView:
         self._step = world.step_length
         self._commands = CommandedSpeed(world.step_length)
         self._steps_of_action = round(self._api.vehicle.getActionStepLength(self._vut) / self._step)
-        self._last_speed = 0.0
+        self._acceleration = 0.0
         self._subscriptions: dict[tuple[str, str], Variables] = {}
         self.time = 0.0
         self.last_error: InputError | None = None
@@ -207,15 +207,15 @@ class TraciView:
         """
         accel = self._api.vehicle.getAccel(self._vut)
         decel = self._api.vehicle.getDecel(self._vut)
-        sumo_speed = (
-            2 * speed - self._last_speed
-        )  # between two actions the driver keeps his acceleration
-        self._last_speed = speed
+        # Between two actions the driver asks for the acceleration of the last step again, however
+        # little of it the vehicle's delays let through.
+        sumo_speed = speed + self._acceleration * self._step
         steps = round(self.time / self._step)
         is_action = steps % self._steps_of_action == 0
         if is_action:
             sumo_speed = self._speed_of_sumo(speed, accel, decel)
-        return self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
+        self._acceleration = self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
+        return self._acceleration
 
     def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
         """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the

@@ -155,7 +155,7 @@ class Characteristic:
             hint = f", or any with {switch}" if is_outside_domain and switch else ""
             raise InputError(
                 "",
-                f"{self.name} = {value}{' is outside its domain' if is_outside_domain else ''}",
+                f"{self.name} = {value!r}{' is outside its domain' if is_outside_domain else ''}",
                 f"{expected}{self.suffix}{otherwise}{hint}",
             )
 

@@ -75,7 +75,7 @@ def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     result = sv.simulate("rain", {"tireFric": 1.5, "mass": 2410.0})
-    assert result.setting["tireFric"] == 1.5
+    assert (result.setting["tireFric"], result.setting["mass"]) == (1.5, 2410.0)
     assert result.reset_values == {"mass": 2410.0}
     assert result.objectives["f_num_diff"] == 1
     assert result.objectives["f_diff"] == pytest.approx(2 / 3.5)
@@ -87,7 +87,7 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.original.metrics != result.metrics
     assert "<p>&lt;Simulation of rain" in result._repr_html_()
     assert result.to_dict()["vcs"] == result.setting
-    assert sv.simulate("rain", {"mass": 2410.0}, filtered=False).objectives["f_num_diff"] == 1
+    assert sv.simulate("rain", {"mass": 2410.0}, filtered=True).setting["mass"] == 2404.0
 
 
 def test_evaluate_is_simulate_row_by_row() -> None:
@@ -96,7 +96,10 @@ def test_evaluate_is_simulate_row_by_row() -> None:
     )
     frame = sv.evaluate("sun", asked, jobs=1)
     assert list(frame.index) == list("abc")
-    assert frame.loc["b", "tireFric"] == 3.5, "too small a change is put back"
+    assert frame.loc["b", "tireFric"] == 3.45, "a setting is simulated as it is given"
+    assert frame.loc["b", ["f_diff", "f_num_diff"]].tolist() == [0, 0], "as in the paper"
+    filtered = sv.evaluate("sun", asked, filtered=True, jobs=1)
+    assert filtered.loc["b", ["tireFric", "mass"]].tolist() == [3.5, 2404.0]
     assert frame.loc["a"].equals(frame.loc["c"])
     one = sv.simulate("sun", {"tireFric": 1.2, "mass": 2500.0})
     for name, value in {**one.metrics, **one.objectives}.items():
@@ -123,6 +126,17 @@ def test_a_simulation_is_shown_beside_the_original() -> None:
     )
 
 
+def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() -> None:
+    study = sv.load_study(
+        "euro_ncap_car_to_car", matrix={"point": "CCRm, speed 80, impact_location 50, clear"}
+    )
+    one = sv.simulate(study, {"tireFric": 1.0})
+    closing, own = -one.metrics["safety_degree"], one.collision_speed
+    assert own == pytest.approx(closing + 20 / 3.6, abs=1e-6)
+    speeds = f"{closing:.2f} m/s (closing speed; its own is {own:.2f} m/s)"
+    assert one.verdict == f"collides at {speeds}"
+
+
 def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> None:
     """A table, a trace, and a picture show the same two drives."""
     one = sv.simulate("wear", {"brakeTorque": 0.6})
@@ -146,7 +160,13 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
     ("settings", "expected"),
     [
         (pd.DataFrame({"weight": [1.0]}), "weight"),
-        (pd.DataFrame({"mass": ["heavy"]}), "heavy"),
+        (pd.DataFrame({"mass": ["heavy"]}), "row 0: mass = 'heavy'\nexpected: a number"),
+        (
+            [{"mass": 2500.0}, {"mass": [1], "radius": 33}],
+            r"row 1: mass = \[1\]\nexpected: a number",
+        ),
+        ([{"mass": "2500"}], "row 0: mass = '2500'\nexpected: a number"),
+        ("1", "settings: '1'\nexpected: a list of mappings"),
         ([[1.0, 2.0]], r"shape \(1, 2\)"),
         ({"mass": [2500.0]}, "'dict'\nexpected: a list of mappings"),
         ([{"mass": 2500.0}, {"weight": 1.0}], "weight"),
@@ -159,6 +179,17 @@ def test_unusable_settings_are_reported_before_any_simulation(
 ) -> None:
     with pytest.raises(sv.InputError, match=expected):
         sv.evaluate("sun", settings)  # type: ignore[arg-type]
+
+
+def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
+    for changes, told in (
+        ({"serach": {"runs": 2}}, r"rain.toml with serach=...: serach: .* did you mean 'search'"),
+        ({"search": {"rns": 2}}, r"rain.toml with search=...: search.rns: .* did you mean 'runs'"),
+    ):
+        with pytest.raises(sv.InputError, match=told):
+            sv.load_study("rain", **changes)
+    with pytest.raises(sv.InputError, match=r"mass = '1'\nexpected: a number in"):
+        sv.simulate("rain", {"mass": "1"})  # type: ignore[dict-item]
 
 
 def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond() -> None:

@@ -265,12 +265,20 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     ] == [("reaction", True)]
 
 
-@pytest.mark.parametrize(("pace", "found"), [(2.5, []), (4.0, ["meeting"])])
-def test_others_who_have_left_in_time_are_the_scenarios_matter(
-    pace: float, found: list[str], in_tmp: Path
+@pytest.mark.parametrize(
+    ("pace", "found", "words"),
+    [
+        (2.5, [], ""),
+        (4.0, ["meeting"], "have left after"),
+        (-1.5, ["meeting"], "stays beside its way"),
+        (0.0, ["meeting"], "stays beside its way"),
+    ],
+)
+def test_others_who_have_left_in_time_or_never_come_are_the_scenarios_matter(
+    pace: float, found: list[str], words: str, in_tmp: Path
 ) -> None:
-    """A deer runs from 12 m beside the lane to 50 m ahead; the car, at 40 km/h, is there after 4.5
-    s.
+    """A deer runs from 12 m beside the lane to 50 m ahead, or away; the car, at 40 km/h, is there
+    after 4.5 s.
     """
     (in_tmp / "mine.py").write_text(
         "from safevar_sumo.scenarios import Track\n\n\nclass Deer:\n    speed = 40.0\n    duration"
@@ -282,10 +290,21 @@ def test_others_who_have_left_in_time_are_the_scenarios_matter(
     )
     findings = check_study(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
-    assert all(
-        "mine.py:4" in finding.where and "have left after" in finding.finding
-        for finding in findings
-    )
+    assert all("mine.py:4" in finding.where and words in finding.finding for finding in findings)
+
+
+@pytest.mark.parametrize("criterion", ["", '[unsafe]\ncriterion = "safety_degree < 99"\n'])
+def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) -> None:
+    """With a wrong sign a driving system hits the pedestrian; with a right one it stops nearer
+    than 99 m.
+    """
+    wrong = SCALAR.replace("seen.gap < stopping", "seen.gap < -stopping").replace("BODY", "pass")
+    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "pass") if criterion else wrong)
+    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + criterion)
+    (finding,) = check_study(study_to_check("mine.toml"))
+    assert finding.check == "original", finding
+    assert ("below 99 m" if criterion else "itself collides at ") in finding.finding
+    assert "mine.py" in finding.where
 
 
 @pytest.mark.parametrize(

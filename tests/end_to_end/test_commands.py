@@ -90,7 +90,7 @@ def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert written(Path("out")) == before, "nothing was left to simulate"
     assert solutions("out") == solutions(whole)
     assert (
-        "The search found no solution."
+        "The search found no solution: no run is finished."
         in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
     )
     study("--out", "alone", "--shard", "2/9")

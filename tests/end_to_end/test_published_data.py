@@ -143,7 +143,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     refused("tables", "part", "--table", "rq9", message=("no table 'rq9'", "rq3.3-safety"))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
-    refused("tables", "part", message=("no finished run",))
+    refused("tables", "part", message=("no run is finished",))
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")

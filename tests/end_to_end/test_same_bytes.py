@@ -1,6 +1,7 @@
 """A command writes the same bytes for any number of worker processes and any size of batches.
 
-An author of a question adds a row.
+An author of a question adds a row. `repair`, which takes minutes, is asked in
+`tests/questions/test_repair.py`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from safevar_sumo.search import ALGORITHMS
 from tests.campaign.formulas import FormulaPool, carried_out
 from tests.end_to_end.conftest import solutions, study
 from tests.in_process import run
-from tests.questions.test_repair import planted as planted
 
 QUESTIONS = {
     "explain": "small.toml --limit 300 --top 1 --fits 0",
@@ -25,13 +25,12 @@ QUESTIONS = {
     "risk": "small.toml --samples 300",
     "rules": "small.toml --samples 300",
     "compare": "small.toml smoke --samples 100",
-    "repair": "planted.toml --change always --quick",
 }
 """What each command is asked."""
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("small", "planted", "worker_processes")
+@pytest.mark.usefixtures("small", "worker_processes")
 @pytest.mark.parametrize("command", QUESTIONS)
 def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command: str) -> None:
     words = f"{command} {QUESTIONS[command]}".split()

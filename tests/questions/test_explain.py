@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.api.study import _verdict
 from safevar_sumo.campaign.questions import COMPILING
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -30,9 +32,13 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain, failures
+from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, printed_limits
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.progress import Phases
+from safevar_sumo.questions.subject import load
+from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import handles_of, solutions_frame
+from safevar_sumo.results import choose_handle, handles_of, row_of_handle, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
@@ -115,22 +121,47 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
         explain.compute(case, evaluator, solution=("nsga2:7:0",))
 
 
+def test_every_boundary_is_unsafe_as_it_is_printed(
+    slippery: Path, case: Case, explained: Answer
+) -> None:
+    """Also each change alone at its boundary; and the solution in the verdict of `study` ends as in
+    the table of solutions.
+    """
+    table = explained.tables["causes"]
+    columns = columns_of(table)
+    typed = []
+    for row in table.to_dict("records"):
+        boundary, alone = (
+            dict(re.findall(r"(\w+) ([\d.]+)", cell_text(row[name], columns[name].number_format)))
+            for name in ("boundary", "single_boundary")
+        )
+        typed += [boundary, *({**row["changes"], name: value} for name, value in alone.items())]
+    settings = [
+        case.characteristics.setting({name: float(value) for name, value in one.items()})
+        for one in typed
+    ]
+    system = assemble(case.study)
+    assert case.unsafe.of(drive_and_score(system, np.array(settings))).all()
+
+    handle = choose_handle(case.solutions, case.unsafe, "fewest")
+    solution = case.solutions.iloc[row_of_handle(case.solutions, handle)]
+    verdict, rows = _verdict(load(slippery), case, system)
+    assert f"collides at {-solution['f_safe']:.2f} m/s" in verdict
+    again = case.characteristics.setting({name: value for name, _, _, value in rows})
+    degree = drive_and_score(system, again[np.newaxis]).f_safe[0]
+    assert f"{degree:.2f}" == f"{solution['f_safe']:.2f}"
+
+
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
     case: Case, explained: Answer
 ) -> None:
-    """The limits are those of the first row, with values with which the vehicle collides; nothing
-    names a solution.
-    """
+    """The limits are those of the first row; nothing names a solution."""
     leading, verdict = explained.tables["causes"].iloc[0], explained.verdict
     for item in case.characteristics:
         if item.name in leading["boundary"]:
             value = leading["boundary"][item.name]
             side = "above" if value > item.original else "below"
-            said = float(re.search(rf"{item.short_name} {side} ([\d.]+)", verdict)[1])  # type: ignore[index]
-            assert abs(said - item.original) >= abs(value - item.original)
-            assert said == pytest.approx(value, abs=10.0**-item.digits)
-            printed = case.characteristics.setting({**leading["boundary"], item.name: said})
-            assert case.unsafe.of(drive_and_score(assemble(case.study), printed[np.newaxis]))[0]
+            assert float(re.search(rf"{item.short_name} {side} ([\d.]+)", verdict)[1]) == value  # type: ignore[index]
     share = f"{100 * leading['robust_share']:.0f} % of vehicles with slightly different values"
     assert re.search(
         rf"^With .* the vehicle collides\. The cause d.* exact values: .*{share} are unsafe, too\.",
@@ -212,6 +243,29 @@ def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None
     assert result.boundary["a"] > 6.5 >= result.boundary["a"] - 2 * RESOLUTION * 4.5
     assert result.single_boundary == result.boundary
     assert result.end == BoundaryState.SAFE
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "value", "printed"),
+    [
+        (8.12341, 10, 9.0, "8.2"),
+        (0, 1.23441, 1.0, "1.2"),
+        (8.12341, 8.12349, 8.12345, "8.12345"),
+        (1.23441, 1.23449, 1.23445, "1.23445"),
+    ],
+)
+def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_needs(
+    low: float, high: float, value: float, printed: str
+) -> None:
+    """Between `low` and `high` it is unsafe."""
+    evaluator = made_up_evaluator(1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high))
+    (causes,) = find_minimal_causes(evaluator, np.array([[value]]), COLLISION)
+    found = find_cause_limits(evaluator, causes, COLLISION)
+    _, (rounded,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
+    number_format = CAUSE_COLUMNS["boundary"].number_format  # type: ignore[union-attr]
+    for values in (rounded.boundary, rounded.single_boundary):
+        assert cell_text(values["a"], number_format) == printed
+        assert low < values["a"] < high
 
 
 def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:

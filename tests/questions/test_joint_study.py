@@ -165,6 +165,19 @@ def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(joint: 
     assert f"{infeasible} settings that TakesAll returned are no solutions" in warning
 
 
+def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refused(
+    joint: Path,
+) -> None:
+    (joint / "far.toml").write_text(
+        'extends = "tiny.toml"\nname = "far"\nscenario.margin = 40\nsearch.evaluations = 10\n'
+    )
+    text = run("study", "far.toml", "--out", "far").stdout
+    assert "The search found no solution: in none of 20 encounters the original vehicle" in text
+    assert "Next: a smaller scenario.margin" in text
+    assert "explain" not in text
+    assert "Remarks" not in text, "a table without a remark"
+
+
 WORN = {
     "wear_joint": {
         **{"treadDepth": 5.58, "brakeTorque": 0.88, "brakeResponse": 0.112, "payload": 242},

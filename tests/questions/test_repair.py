@@ -203,9 +203,13 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
 
 
 @pytest.mark.slow
-def test_always_braking_has_its_price(planted: Path) -> None:
-    answer = sv.repair(planted, change=["always"], pool=InlinePool(2)).to_dict()
-    (repair,) = answer["tables"]["repairs"]["rows"]
+def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
+    answers = [
+        sv.repair(planted, change=["always"], pool=pool).to_dict()
+        for pool in (InlinePool(), InlinePool(2))
+    ]
+    assert answers[0] == answers[1]
+    (repair,) = answers[0]["tables"]["repairs"]["rows"]
     assert repair["needless_braking"] == repair["benign_scenes"] >= 6
     assert repair["needless_braking_today"] == 0
 

@@ -41,11 +41,14 @@ def distances(system: System, **changes: float) -> FloatArray:
     return np.array([result.evaluations.metrics["stopping_distance"][0] for result in results])
 
 
-@pytest.mark.parametrize(("brake_response", "friction"), [(0.1, 0.3), (0.05, 0.75), (0.3, 0.5)])
+@pytest.mark.parametrize(
+    ("brake_response", "friction"),
+    [(0.1, 0.3), (0.149, 0.3), (0.11, 0.3), (0.125, 0.75), (0.05, 0.75), (0.3, 0.5)],
+)
 def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(
     brake_response: float, friction: float
 ) -> None:
-    """From the first brake force on: a delay of the brake, here of whole steps, changes nothing."""
+    """From the first brake force on: a delay of the brake changes nothing, also within a step."""
     speeds = np.array([10.0, 30.0, 50.0, 80.0, 81.7, 120.0, 250.0])
     system = stops(
         {"name": "polished", "road_friction": friction, "visibility": 1.0}, *speeds.tolist()

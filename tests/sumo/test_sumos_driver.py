@@ -15,7 +15,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.matrix import drive_worst
+from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
 from tests.sumo.test_traci_controller import changed, system
@@ -107,6 +107,17 @@ def bare_sumo(traffic: Path, step: Callable[[Any, str], None], n: int = 161) -> 
     return np.array(rows)
 
 
+def with_attributes(folder: Path, attributes: str) -> Path:
+    """A copy of the network, in which the type of the vehicle under test has attributes of SUMO's
+    driver.
+    """
+    shutil.copytree(NET, folder)
+    traffic = folder / "traffic.rou.xml"
+    old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
+    traffic.write_text(traffic.read_text().replace(old, f'speedDev="0" {attributes}'))
+    return traffic
+
+
 def refuse_difference(
     runs: System, traffic: Path, step: Callable[[Any, str], None], speed_error: float = 1e-6
 ) -> None:
@@ -141,21 +152,28 @@ def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
 )
 def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in_tmp: Path) -> None:
     """All but tau, which the study varies: without delays it drives as in bare SUMO."""
-    network = in_tmp / "net"
-    shutil.copytree(NET, network)
-    traffic = network / "traffic.rou.xml"
-    old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
-    new = f'speedDev="0" mass="900" tau="0.3" {attributes}'
-    traffic.write_text(traffic.read_text().replace(old, new))
-    runs = system(
-        "idle", CONTROLLERS, vehicle=NO_DELAYS, scenario={"parameters": {"network": str(network)}}
-    )
+    traffic = with_attributes(in_tmp / "net", f'mass="900" tau="0.3" {attributes}')
+    scenario = {"parameters": {"network": str(traffic.parent)}}
+    runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario=scenario)
     unused = (
         f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
     )
     assert any(remark.startswith(unused) for remark in runs.remarks)
     traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
     refuse_difference(runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6)
+
+
+def test_between_two_actions_sumos_driver_asks_for_what_he_decided(in_tmp: Path) -> None:
+    """A lag lets through a part of it in the first step, and more in the next ones."""
+    lag = {"actuatorLag": {"original": 0.2}}
+    vehicle = {**NO_DELAYS, "characteristics": {**NO_DELAY, **lag}}
+    for action in ("0.1", "1"):
+        traffic = with_attributes(in_tmp / action, f'sigma="0" actionStepLength="{action}"')
+        scenario = {"parameters": {"network": str(traffic.parent)}}
+        runs = system("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
+        run = drive_worst(runs, changed(runs))
+        assert run.outcome[0] == Outcome.STOPPED
+        assert run.trace.gap[run.trace.active][-1] == pytest.approx(2.5, abs=0.3), "his minGap"
 
 
 def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
@@ -213,11 +231,21 @@ def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> No
     assert np.all(np.diff(drive_worst(runs, lags).collision_speed) > 0.3)
 
 
-def test_tau_drives_idm_and_a_line_says_where_it_has_no_effect() -> None:
+def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> None:
     def remarks(model: str, **parameters: float) -> list[str]:
-        return assemble(
-            load_study("native", ads={"model": model, "parameters": parameters})
-        ).remarks
+        study = load_study("native", ads={"model": model, "parameters": parameters})
+        *others, on_decel = assemble(study).remarks
+        assert f"carry at most {0.9 * 9.81:.2f} m/s^2: a decel above" in on_decel
+        return others
+
+    stops = assemble(
+        load_study({"extends": "native", "name": "stops", "scenario": {"model": "stop"}})
+    )
+    settings = [changed(stops, decel=decel) for decel in (8.82, 8.83, 9.0, 9.5)]
+    hardest = drive_and_score(stops, np.concatenate(settings)).metrics["stopping_distance"]
+    assert hardest[0] > hardest[1] == hardest[2] == hardest[3]
+    grippy = load_study("native", vehicle={"parameters": {"tyre_friction": 1.0}})
+    assert assemble(grippy).remarks == []
 
     runs = assemble(load_study("native", ads={"model": "idm"}))
     fast, slow = (drive_worst(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))

@@ -15,7 +15,7 @@ from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.causes import BOUNDARIES, OTHER_SETS, SUBSETS, count_needed
-from safevar_sumo.questions.counterexamples import describe, limit_text
+from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
     TO_EXPLAIN,
@@ -34,7 +34,6 @@ from safevar_sumo.questions.explain.tables import (
     failures_frame,
     statistics_tables,
 )
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -256,25 +255,16 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, causes: pd
             "The original vehicle itself is unsafe in this encounter: no change is necessary."
             f" {counts}"
         )
-    # The vehicle at the boundary with the values as they are printed, with which it is unsafe.
-    members = evaluator.characteristics
-    boundary = {**leading["boundary"], **leading.get("encounter", {})}
-    setting = np.array([boundary.get(item.name, item.original) for item in members], dtype=float)
-    printed = describe(Model(0, evaluator, unsafe), {"": setting})
-    values = dict(
-        zip(members.names, (printed[""].setting if printed else setting).tolist(), strict=True)
-    )
 
     # Its limits, its encounter, and how sure the cause is.
+    members = evaluator.characteristics
+    boundary = leading["boundary"]
     limits = []
     for item in members:
-        if item.name not in leading["boundary"]:
-            continue
-        value = values[item.name]
-        side = "above" if value > item.original else "below"
-        text = limit_text(item, value) if printed else item.text(value) + item.suffix
-        limits.append(f"{item.short_name} {side} {text}")
-    encounter = encounter_in_words(members, values, are_printed=bool(printed))
+        if item.name in boundary:
+            side = "above" if boundary[item.name] > item.original else "below"
+            limits.append(f"{item.short_name} {side} {limit_text(item, boundary[item.name])}")
+    encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
     where = " in an encounter in which the original vehicle is safe" if encounter else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
     sentences = [

@@ -12,11 +12,13 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.causes import (
     OTHER_SETS,
     Cause,
+    Limits,
     are_causes,
     count_distinct_causes,
     find_cause_limits,
     settings_of,
 )
+from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
     Population,
@@ -26,6 +28,7 @@ from safevar_sumo.questions.explain.failures import (
 )
 from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     assess_collisions,
@@ -33,7 +36,7 @@ from safevar_sumo.questions.preventability import (
     drivers_frame,
 )
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import EXACT, number_of
 from safevar_sumo.records import BoolArray
 
 MAX_DISTINCT = 10
@@ -46,12 +49,18 @@ CAUSE_COLUMNS: Columns = {
         ".5g",
         is_shown=False,
     ),
-    "encounter": Column("", "the encounter, in which the original vehicle is safe", ".5g"),
+    "encounter": Column("", "the encounter, in which the original vehicle is safe", EXACT),
     "boundary": Column(
-        "", "the values if these changes are made as small as they can be and still unsafe", ".5g"
+        "",
+        "the values if these changes are made as small as they can be and still unsafe; rounded to"
+        " the unsafe side, and simulated as they stand here",
+        EXACT,
     ),
     "single_boundary": Column(
-        "", "for each change, the value if this change alone is made smaller", ".5g", is_shown=False
+        "",
+        "for each change, the value if this change alone is made smaller; rounded and simulated",
+        EXACT,
+        is_shown=False,
     ),
     "fraction": Column(
         "-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False
@@ -176,6 +185,7 @@ def causes_table(
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
+    causes, limits = printed_limits(Model(0, evaluator, unsafe), causes, limits)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:
         at_original = [cause._replace(encounter={}) for cause in causes]
@@ -201,6 +211,51 @@ def causes_table(
     omitted = () if study.scenario.search else OF_ENCOUNTER
     columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
     return tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
+
+
+def printed_limits(
+    model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
+) -> tuple[list[Cause], list[Limits]]:
+    """Causes and their limits with boundaries and encounters as they are printed: rounded to the
+    unsafe side, with as many digits as the vehicle needs to be unsafe.
+    """
+    boundaries = [
+        cause._replace(changes=limit.boundary) for cause, limit in zip(causes, limits, strict=True)
+    ]
+    rounded = _as_unsafe(model, boundaries)
+    causes = [
+        cause._replace(encounter=one.encounter) for cause, one in zip(causes, rounded, strict=True)
+    ]
+
+    # Each change alone at its boundary, in the printed encounter.
+    alone = [
+        cause._replace(changes={**cause.changes, name: value})
+        for cause, limit in zip(causes, limits, strict=True)
+        for name, value in limit.single_boundary.items()
+    ]
+    found = iter(_as_unsafe(model, alone))
+    return causes, [
+        limit._replace(
+            boundary=one.changes,
+            single_boundary={name: next(found).changes[name] for name in limit.single_boundary},
+        )
+        for one, limit in zip(rounded, limits, strict=True)
+    ]
+
+
+def _as_unsafe(model: Model, causes: Sequence[Cause]) -> list[Cause]:
+    """Causes with the values that `describe` prints, or with their own where it prints none."""
+    members = model.evaluator.characteristics
+    settings = {str(row): one for row, one in enumerate(settings_of(members, causes))}
+    settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
+    rounded = []
+    for cause, setting in zip(causes, settings.values(), strict=True):
+        values = dict(zip(members.names, setting.tolist(), strict=True))
+        changes, encounter = (
+            {name: values[name] for name in part} for part in (cause.changes, cause.encounter)
+        )
+        rounded.append(cause._replace(changes=changes, encounter=encounter))
+    return rounded
 
 
 def _holding(

@@ -138,10 +138,10 @@ def draw_convergence(case: Case) -> Figure:
     # Growth over all evaluations, as median and quartiles.
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
-    means = count_evaluations(case).groupby("algorithm")["requested"].mean()
+    means = count_evaluations(case).groupby("algorithm")["requested"].mean().to_dict()
     labels = {
-        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs, on average"
-        f" {means[algorithm]:,.0f} evaluations)"
+        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)\n"
+        f"mean: {means[algorithm]:,.0f} evaluations"
         for algorithm, count in runs.items()
     }
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
