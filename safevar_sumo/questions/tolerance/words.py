@@ -103,7 +103,9 @@ def verdict_sentences(
         yield "No single characteristic makes the vehicle unsafe on its own."
     if unsafe.remark:
         yield unsafe.remark
-    yield f"Scope: {scope_of(study, between=asked.budget > 0)}."
+    if asked.at_tests:
+        yield "Nothing was simulated between the values of the tests (--at-tests)."
+    yield f"Scope: {scope_of(study, between=asked.drives_between)}."
 
 
 def tested_sentences(
