@@ -44,14 +44,12 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
                 metrics[name] = np.where(
                     is_invalid, np.nan, measure.function(runs, system.metrics_table)
                 )
-    filtered = system.characteristics.filter(settings)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
         metrics=metrics,
-        f_diff=system.characteristics.largest_change(filtered),
-        f_num_diff=system.characteristics.number_changed(filtered),
+        **system.characteristics.changes_of(settings),
     )
 
 

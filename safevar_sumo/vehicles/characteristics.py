@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -262,6 +263,14 @@ class CharacteristicSet:
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
         return np.asarray(filtered != self.original)
+
+    def changes_of(self, settings: FloatArray) -> dict[str, Any]:
+        """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
+        filtered = self.filter(settings)
+        return {
+            "f_diff": self.largest_change(filtered),
+            "f_num_diff": self.number_changed(filtered),
+        }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
         """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w
