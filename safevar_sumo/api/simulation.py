@@ -342,7 +342,8 @@ def changed_setting(
     with about("changes"):
         setting = system.characteristics.setting({} if changes is None else changes, beyond=beyond)
         if not beyond:
-            system.check_feasible(setting[np.newaxis], filtered=filtered)
+            simulated = system.characteristics.filter(setting) if filtered else setting
+            system.region.check(simulated[np.newaxis], otherwise=", or any with beyond=True")
         return setting
 
 

@@ -178,7 +178,7 @@ def show_simulation(
         values = read_changes(changes, system.characteristics, beyond=beyond)
         requested = _combine(values, target.setting(system), system)
         if changes and not beyond:  # what a study or results hold has been checked
-            system.check_feasible(requested, filtered=False, switch="--beyond")
+            system.region.check(requested, otherwise=", or any with --beyond")
 
     # Files that cannot be written are refused first.
     if trace is not None:

@@ -4,10 +4,12 @@ other.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import RLock
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -157,17 +159,6 @@ class System:
             rater=None,
         )
 
-    def check_feasible(
-        self, settings: FloatArray, *, filtered: bool, switch: str = "beyond=True"
-    ) -> None:
-        """Refuse settings, shape (M, n), that violate a constraint; raises the errors of
-        `FeasibleRegion.check`.
-        """
-        self.region.check(
-            self.characteristics.filter(settings) if filtered else settings,
-            otherwise=f", or any with {switch}",
-        )
-
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user on parts of networks and weathers that are not used or have no
@@ -208,7 +199,7 @@ class System:
 
     @property
     def _has_tau(self) -> bool:
-        return self.vehicle.sumo_type(self._prepared_original()).tau is not None
+        return self.vehicle.sumo_type(self._prepared()).tau is not None
 
     def _remarks_on_driver(self) -> list[str]:
         """Remarks on the headway `tau` and on what SUMO's driver does not know."""
@@ -238,11 +229,12 @@ class System:
             return []
 
         # Does the largest deceleration still rise at the end of the domain?
-        column = members.names.index(DECEL)
-        settings = np.tile(members.original, (2, 1))
-        settings[:, column] = members.upper[column] * np.array([NEARLY, 1.0])
+        upper = members.upper[members.names.index(DECEL)]
         friction = max(point.weather.road_friction for point in self.points)
-        nearly, highest = self.vehicle.sumo_type(self._prepared(settings, friction)).decel.tolist()
+        nearly, highest = (
+            self.vehicle.sumo_type(self._prepared(friction, {DECEL: np.array([value])})).decel[0]
+            for value in (NEARLY * upper, upper)
+        )
         if highest > nearly:
             return []
         return [
@@ -251,18 +243,18 @@ class System:
         ]
 
     def _has_limited_range(self) -> bool:
-        sensors = self.vehicle.sensors(self._prepared_original())
+        sensors = self.vehicle.sensors(self._prepared())
         return sensors is not None and bool(np.isfinite(sensors.reach).all())
 
-    def _prepared_original(self) -> Prepared:
-        """The constants of the original vehicle."""
-        return self._prepared(self.characteristics.vehicle.original[np.newaxis], 1.0)
-
-    def _prepared(self, settings: FloatArray, friction: float) -> Prepared:
-        """The constants of N vehicles, shape (N, k), on a road with this factor on its friction."""
-        columns = np.ascontiguousarray(settings.T)
-        values = dict(zip(self.characteristics.vehicle.names, columns, strict=True))
-        return self.vehicle.prepare(values, friction, 0.1)  # time step 0.1 s
+    def _prepared(
+        self, friction: float = 1.0, changes: Mapping[str, FloatArray] = MappingProxyType({})
+    ) -> Prepared:
+        """The constants of the original vehicle with changes, on a road with this factor on its
+        friction.
+        """
+        members = self.characteristics.vehicle
+        original = dict(zip(members.names, members.original[:, np.newaxis], strict=True))
+        return self.vehicle.prepare({**original, **changes}, friction, 0.1)  # time step 0.1 s
 
 
 def assemble(study: Study) -> System:
