@@ -159,8 +159,7 @@ class Simulation:
     @property
     def setting(self) -> dict[str, float]:
         """The simulated value of every characteristic in its table unit."""
-        names = self.pair.system.characteristics.names
-        return dict(zip(names, self.evaluation.settings[0].tolist(), strict=True))
+        return self.pair.system.characteristics.named(self.evaluation.settings[0])
 
     @cached_property
     def evaluation(self) -> Evaluations:

@@ -305,9 +305,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
 
     # An original vehicle that is unsafe itself needs no change.
     if not system.rater and not system.characteristics.scenario:
-        original = drive_and_score(
-            assemble(case.study), system.characteristics.original[np.newaxis]
-        )
+        original = drive_and_score(assemble(case.study), system.characteristics.original_settings)
         if case.unsafe.of(original)[0]:
             breach = case.unsafe.breach_in_words(original)
             return f"The original vehicle itself {breach}: no change is needed.", []
@@ -329,12 +327,10 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     values = fewest[names].to_numpy(dtype=float)
     ending = _ending(system, case, fewest)
     printed = None if system.rater else _ending_as_printed(system, case, values, ending)
-    if printed is not None:
-        values = printed
 
     # What it changes.
-    by_name = dict(zip(names, values.tolist(), strict=True))
     are_printed = printed is not None
+    by_name = case.characteristics.named(values if printed is None else printed)
     texts = change_texts(case.characteristics, by_name, are_printed=are_printed)
     rows = [
         (item.name, item.unit, item.original, by_name[item.name])

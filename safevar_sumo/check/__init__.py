@@ -113,7 +113,7 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
 
     # In a rated study, every original vehicle collides in some cell.
     unsafe = own_criterion(study)
-    original = drive_and_score(system, system.characteristics.original[np.newaxis])
+    original = drive_and_score(system, system.characteristics.original_settings)
     if system.rater is not None or not unsafe.of(original)[0]:
         return []
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"

@@ -86,7 +86,7 @@ class Case:
     def settings(self) -> FloatArray:
         """The original vehicle, then the solutions; shape (1 + M, n)."""
         solutions = self.solutions[[*self.characteristics.names]].to_numpy(dtype=float)
-        return np.concatenate([self.characteristics.original[np.newaxis], solutions])
+        return np.concatenate([self.characteristics.original_settings, solutions])
 
     def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
         """The case of another form of its study, in which its settings have been simulated

@@ -190,7 +190,7 @@ class Evaluator:
             return self.evaluate(settings, stage)
         of_vehicle = self.characteristics.of_vehicle
         encounters = np.concatenate(
-            [self.characteristics.original[np.newaxis], self.critical_encounters]
+            [self.characteristics.original_settings, self.critical_encounters]
         )
         pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(
             -1, settings.shape[1]
@@ -275,7 +275,7 @@ class Evaluator:
             If the study searches its scenario, and the original vehicle is not safe in the original
             encounter.
         """
-        evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
+        evaluations = self.evaluate(self.characteristics.original_settings, "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
             problem = (
                 "scenario.search: the original vehicle is not safe in the encounter of the original"

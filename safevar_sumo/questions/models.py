@@ -174,7 +174,7 @@ def models_of(
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(
-            evaluator.characteristics.original[np.newaxis], "original with each parameter set"
+            evaluator.characteristics.original_settings, "original with each parameter set"
         )
         if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
             left_out.append(number)
@@ -195,7 +195,7 @@ def with_points_between(
     tests = tests_between(study, rng, cells)
     if not tests:
         return model, 0
-    original = model.evaluator.characteristics.original[np.newaxis]
+    original = model.evaluator.characteristics.original_settings
     results = simulate_all_points(assemble(_with_tests(study, tests)), original)
     kept = [
         test

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
@@ -260,16 +262,14 @@ def sobol_indices(
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
     is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
-    def indices_of(output: FloatArray) -> Indices:
-        options = {
-            "calc_second_order": False,
-            "num_resamples": RESAMPLES,
-            "conf_level": confidence,
-            "seed": seed,
-        }
-        indices: Indices = analysis.analyze(problem, output, **options)
-        return indices
-
+    indices_of = partial(
+        analysis.analyze,
+        problem,
+        calc_second_order=False,
+        num_resamples=RESAMPLES,
+        conf_level=confidence,
+        seed=seed,
+    )
     kinds = {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")}
     return _table(names, evaluations.take(is_complete), criterion, indices_of, kinds)
 
@@ -285,11 +285,7 @@ def given_data_indices(
 
     # Characteristics that vary in the sample.
     varies = np.ptp(drawn.settings, axis=0) > 0
-    names = [
-        name
-        for name, it_varies in zip(evaluator.characteristics.names, varies, strict=True)
-        if it_varies
-    ]
+    names = [*compress(evaluator.characteristics.names, varies)]
     problem = {
         "num_vars": len(names),
         "names": [str(number) for number in range(len(names))],

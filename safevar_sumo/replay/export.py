@@ -295,7 +295,7 @@ def export(
     setting = target.setting(system)
     vehicle = system.characteristics.vehicle
     of_vehicle = setting[system.characteristics.of_vehicle]
-    values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
+    values = vehicle.named(of_vehicle)
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
     comparison = comparison_of(

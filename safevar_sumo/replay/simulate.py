@@ -361,7 +361,7 @@ def _sweep(study: Study, system: System, settings: FloatArray, names: list[str])
     # All settings, and the original vehicle first.
     characteristics = system.characteristics
     evaluations = evaluate_with_workers(
-        study, np.concatenate([characteristics.original[np.newaxis], settings])
+        study, np.concatenate([characteristics.original_settings, settings])
     )
     contact = system.contact
     no_verdict = why_no_verdict(system)

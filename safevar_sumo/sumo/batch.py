@@ -202,14 +202,13 @@ def open_points_world(
     (point,) = system.points
     step = system.scenes.step
     n, n_searched = encounters.shape
-    names = system.characteristics.scenario.names
 
     # The scenario in each encounter, and a network for it.
     scenarios = [point.scenario]
     if n_searched:
         scenarios = [
-            encounter(point, dict(zip(names, values, strict=True))).scenario
-            for values in encounters.tolist()
+            encounter(point, system.characteristics.scenario.named(values)).scenario
+            for values in encounters
         ]
     networks = networks_for(scenarios)
 

@@ -56,14 +56,14 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     the obstacle is not what keeps it from a collision. Neither is it where nothing happens to a
     vehicle that keeps its speed.
     """
-    original = system.characteristics.original[np.newaxis]
+    original = system.characteristics.original_settings
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), original)
     except SimulationError:  # the study's own simulations decide, and report their errors
         return {}
     # A searched scenario is the one of the original encounter.
     members = system.characteristics
-    values = dict(zip(members.scenario.names, original[:, ~members.of_vehicle].T, strict=True))
+    values = members.scenario.columns(members.scenario.original_settings)
     points = [encounter(point, values) if values else point for point in system.points]
     return {
         point.name: problem

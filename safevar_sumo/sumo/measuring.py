@@ -125,7 +125,7 @@ def criterion_of(text: CriterionLike, study: Study) -> Unsafe:
     """
     criterion = Unsafe.parse(text)
     if criterion.points is not None and not is_rated(study):
-        problem = f"{text!r}: the study is not rated and has no points"
+        problem = f"{text!r}: study {study.name!r} is not rated and has no points"
         raise InputError("unsafe", problem, "collision or below=X")
     return criterion
 

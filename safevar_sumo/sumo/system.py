@@ -4,12 +4,10 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import RLock
-from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -142,8 +140,7 @@ class System:
         if not encounters.shape[1]:
             return self
         (point,) = self.points
-        columns = np.ascontiguousarray(encounters.T)
-        values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
+        values = self.characteristics.scenario.columns(encounters)
         return replace(
             self.at(encounter(point, values)), characteristics=self.characteristics.vehicle
         )
@@ -232,7 +229,7 @@ class System:
         upper = members.upper[members.names.index(DECEL)]
         friction = max(point.weather.road_friction for point in self.points)
         nearly, highest = (
-            self.vehicle.sumo_type(self._prepared(friction, {DECEL: np.array([value])})).decel[0]
+            self.vehicle.sumo_type(self._prepared(friction, decel=np.array([value]))).decel[0]
             for value in (NEARLY * upper, upper)
         )
         if highest > nearly:
@@ -246,15 +243,13 @@ class System:
         sensors = self.vehicle.sensors(self._prepared())
         return sensors is not None and bool(np.isfinite(sensors.reach).all())
 
-    def _prepared(
-        self, friction: float = 1.0, changes: Mapping[str, FloatArray] = MappingProxyType({})
-    ) -> Prepared:
+    def _prepared(self, friction: float = 1.0, **changes: FloatArray) -> Prepared:
         """The constants of the original vehicle with changes, on a road with this factor on its
         friction.
         """
         members = self.characteristics.vehicle
-        original = dict(zip(members.names, members.original[:, np.newaxis], strict=True))
-        return self.vehicle.prepare({**original, **changes}, friction, 0.1)  # time step 0.1 s
+        original = members.columns(members.original_settings)
+        return self.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
 
 
 def assemble(study: Study) -> System:

@@ -139,8 +139,8 @@ def _compare(
             differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():
             sample, row = np.argwhere(differs)[0]
-            pairs = zip(system.characteristics.names, settings[row].tolist(), strict=True)
-            setting = ", ".join(f"{key} = {value:.17g}" for key, value in pairs)
+            values_of = system.characteristics.named(settings[row]).items()
+            setting = ", ".join(f"{key} = {value:.17g}" for key, value in values_of)
             raise InputError(
                 system.source,
                 f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g}"

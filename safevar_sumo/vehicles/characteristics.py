@@ -230,6 +230,11 @@ class CharacteristicSet:
     def original(self) -> FloatArray:
         return self._column("original")
 
+    @property
+    def original_settings(self) -> FloatArray:
+        """The original setting alone, shape (1, n)."""
+        return self.original[np.newaxis]
+
     @cached_property
     def lower(self) -> FloatArray:
         return self._column("lower")
@@ -253,6 +258,14 @@ class CharacteristicSet:
         )
         values.flags.writeable = False
         return values
+
+    def named(self, setting: FloatArray) -> dict[str, float]:
+        """The values of a setting, shape (n,), by name."""
+        return dict(zip(self.names, setting.tolist(), strict=True))
+
+    def columns(self, settings: FloatArray) -> dict[str, FloatArray]:
+        """The values of N settings, shape (N, n), by name, each of shape (N,)."""
+        return dict(zip(self.names, np.ascontiguousarray(settings.T), strict=True))
 
     def filter(self, settings: FloatArray) -> FloatArray:
         """Reset each value that differs from the original by no more than the threshold (method

@@ -247,7 +247,7 @@ def _as_printed(model: Model, vehicles: Sequence[dict[str, float]]) -> list[dict
     members = model.evaluator.characteristics
     settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
     settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
-    return [dict(zip(members.names, one.tolist(), strict=True)) for one in settings.values()]
+    return [members.named(one) for one in settings.values()]
 
 
 def _holding(
