@@ -181,7 +181,7 @@ def _failed_evaluation(
             failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal
         ) from None
     reasons = {row[0].tobytes(): " ".join(str(failure).split())}
-    changes = characteristics.changes_of(setting)
+    changes = characteristics.change_objectives(setting)
     return Evaluations.undefined(row, Outcome.SIMULATOR_ERROR, METRICS, reasons=reasons, **changes)
 
 

@@ -94,7 +94,7 @@ class Evaluator:
         if is_feasible.all():
             return self._evaluate_shown(settings, stage, self._verified)
         infeasible = settings[~is_feasible]
-        changes = self.characteristics.changes_of(infeasible)
+        changes = self.characteristics.change_objectives(infeasible)
         not_simulated = Evaluations.undefined(infeasible, Outcome.INFEASIBLE, METRICS, **changes)
         simulated = self._evaluate_shown(settings[is_feasible], stage, self._verified)
         both = Evaluations.concatenate([simulated, not_simulated])

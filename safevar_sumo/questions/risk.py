@@ -36,12 +36,7 @@ from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import (
-    constraints_in_words,
-    counted_in_words,
-    join_phrases,
-    percentage,
-)
+from safevar_sumo.questions.words import join_phrases, percentage, with_scope
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
@@ -163,12 +158,10 @@ def risk(
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
-    remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
-    verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
         question="risk",
         study=study,
-        verdict=verdict,
+        verdict=with_scope(study, left_out, verdict, criterion.remark),
         numbers=numbers,
         tables={"sensitivity": table},
     )

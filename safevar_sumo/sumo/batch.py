@@ -49,7 +49,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
         metrics=metrics,
-        **system.characteristics.changes_of(settings),
+        **system.characteristics.change_objectives(settings),
     )
 
 

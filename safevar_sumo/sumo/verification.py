@@ -126,9 +126,8 @@ def _compare(
     difference.
     """
     trace = runs.trace
-    last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
     collision = np.full(trace.speed.shape, np.nan)
-    collision[last, np.arange(len(last))] = runs.collision_speed
+    collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed
     recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
     recorded["collision"] = collision
     for name, values in recorded.items():

@@ -277,7 +277,7 @@ class CharacteristicSet:
         """Which characteristics differ from the original; bool, shape (N, n)."""
         return np.asarray(filtered != self.original)
 
-    def changes_of(self, settings: FloatArray) -> dict[str, Any]:
+    def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
         """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
         filtered = self.filter(settings)
         return {
