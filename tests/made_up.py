@@ -107,7 +107,7 @@ def seen(
 
 def original_of(system: Any) -> FloatArray:
     """The original vehicle as the only row of settings."""
-    return np.asarray(system.characteristics.original[np.newaxis])
+    return np.asarray(system.characteristics.original_settings)
 
 
 def drawn(system: Any, number: int, seed: int) -> FloatArray:

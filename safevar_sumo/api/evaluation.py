@@ -91,10 +91,10 @@ def evaluate(
 
     # Settings that may be simulated, as they are given or as a search would filter them.
     requested, index = _read_settings(settings, characteristics, beyond)
+    simulated = characteristics.filter(requested) if filtered else requested
     if not beyond:
         with about("settings"):
-            system.check_feasible(requested, filtered=filtered)
-    simulated = characteristics.filter(requested) if filtered else requested
+            system.region.check(simulated, otherwise=", or any with beyond=True")
     with open_progress(progress) as report_progress:
         evaluations = evaluate_with_workers(loaded_study, simulated, pool, jobs, report_progress)
 
@@ -149,14 +149,10 @@ def _read_settings(
             index = settings.index
         else:
             array = np.array(settings, dtype=float)
-            if not array.ndim:
-                raise InputError("settings", repr(settings), SETTINGS_FORMAT)
             if array.ndim != 2 or array.shape[1] != len(names):
-                raise InputError(
-                    "settings",
-                    f"an array of shape {array.shape}",
-                    f"shape (M, {len(names)}): {', '.join(names)}",
-                )
+                expected = f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
+                got = f"an array of shape {array.shape}" if array.ndim else repr(settings)
+                raise InputError("settings", got, expected)
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         kind = type(settings).__name__

@@ -159,8 +159,7 @@ class Simulation:
     @property
     def setting(self) -> dict[str, float]:
         """The simulated value of every characteristic in its table unit."""
-        names = self.pair.system.characteristics.names
-        return dict(zip(names, self.evaluation.settings[0].tolist(), strict=True))
+        return self.pair.system.characteristics.named(self.evaluation.settings[0])
 
     @cached_property
     def evaluation(self) -> Evaluations:
@@ -342,7 +341,8 @@ def changed_setting(
     with about("changes"):
         setting = system.characteristics.setting({} if changes is None else changes, beyond=beyond)
         if not beyond:
-            system.check_feasible(setting[np.newaxis], filtered=filtered)
+            simulated = system.characteristics.filter(setting) if filtered else setting
+            system.region.check(simulated[np.newaxis], otherwise=", or any with beyond=True")
         return setting
 
 

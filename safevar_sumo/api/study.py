@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
@@ -306,9 +305,7 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
 
     # An original vehicle that is unsafe itself needs no change.
     if not system.rater and not system.characteristics.scenario:
-        original = drive_and_score(
-            assemble(case.study), system.characteristics.original[np.newaxis]
-        )
+        original = drive_and_score(assemble(case.study), system.characteristics.original_settings)
         if case.unsafe.of(original)[0]:
             breach = case.unsafe.breach_in_words(original)
             return f"The original vehicle itself {breach}: no change is needed.", []
@@ -326,16 +323,14 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
     if failures.empty:
         return counts, []
-    fewest: dict[Any, Any] = failures.iloc[0].to_dict()
-    values = np.array([fewest[name] for name in names], dtype=float)
+    fewest = failures.iloc[0]
+    values = fewest[names].to_numpy(dtype=float)
     ending = _ending(system, case, fewest)
     printed = None if system.rater else _ending_as_printed(system, case, values, ending)
-    if printed is not None:
-        values = printed
 
     # What it changes.
-    by_name = dict(zip(names, values.tolist(), strict=True))
     are_printed = printed is not None
+    by_name = case.characteristics.named(values if printed is None else printed)
     texts = change_texts(case.characteristics, by_name, are_printed=are_printed)
     rows = [
         (item.name, item.unit, item.original, by_name[item.name])
@@ -349,13 +344,13 @@ def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tu
     return f"{counts} {fewest_in_words} {ending}{listed}.", rows
 
 
-def _ending(system: System, case: Case, row: Mapping[str, Any]) -> str:
+def _ending(system: System, case: Case, row: Any) -> str:
     """How a solution ends, in words, from its row of results."""
     if system.rater:
         return f"earns {row[RATING_POINTS.name]:.2f} points"
     if case.unsafe.is_of_impacts:
         return f"has an {impact_in_words(row[IMPACT_SPEED.name], row[IMPACT_EXCESS.name])}"
-    ending = ending_in_words(str(row["outcome"]), float(row["f_safe"]), system.contact)
+    ending = ending_in_words(str(row["outcome"]), float(row[SAFETY_DEGREE]), system.contact)
     bound = case.unsafe.bound
     return f"{ending}, {bound.measure} {row[bound.measure]:.3g}" if bound else ending
 
@@ -369,8 +364,7 @@ def _ending_as_printed(
     for further in FURTHER_DIGITS:
         printed = as_printed(system.characteristics, setting, further)
         found = drive_and_score(system, printed[np.newaxis])
-        metrics = {name: column[0] for name, column in found.metrics.items()}
-        row = {"outcome": found.outcome[0], "f_safe": found.f_safe[0], **metrics}
+        row = {name: column[0] for name, column in found.results.items()}
         is_unsafe = case.unsafe.of(found)[0] and not system.measuring.scoring.violation(found)[0]
         if is_unsafe and _ending(system, case, row) == ending:
             return printed

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain, groupby
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,8 +137,8 @@ def run_campaign(
 
     # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
     runs.sort(key=lambda run: run.key)
-    for algorithm, rows in groupby(runs, key=lambda run: run.key.algorithm):
-        if count := sum(run.discarded for run in rows):
+    for algorithm in study.search.labels:
+        if count := sum(run.discarded for run in runs if run.key.algorithm == algorithm):
             warn(
                 f"study {study.name!r}: {count} settings that {algorithm} returned are no"
                 " solutions: the original vehicle is not safe in their encounter, or an objective"

@@ -174,23 +174,15 @@ def _failed_evaluation(
     command.
     """
     characteristics = CharacteristicSet.of(study)
-    undefined = np.full(1, np.nan)
     setting = row[:, : len(characteristics)]  # without the ADS's parameters
-    filtered = characteristics.filter(setting)
     if isinstance(failure, UserCodeError):
         command = reproduction_command(study, setting[0])
         raise UserCodeError(
             failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal
         ) from None
-    return Evaluations(
-        settings=row,
-        outcome=np.array([Outcome.SIMULATOR_ERROR.value], dtype="U16"),
-        collision_speed=undefined,
-        metrics=dict.fromkeys(METRICS, undefined),
-        f_diff=characteristics.largest_change(filtered),
-        f_num_diff=characteristics.number_changed(filtered),
-        reasons={row[0].tobytes(): " ".join(str(failure).split())},
-    )
+    reasons = {row[0].tobytes(): " ".join(str(failure).split())}
+    changes = characteristics.change_objectives(setting)
+    return Evaluations.undefined(row, Outcome.SIMULATOR_ERROR, METRICS, reasons=reasons, **changes)
 
 
 def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:

@@ -22,7 +22,7 @@ from safevar_sumo.study import WHOLE, Study, keys_with, user_code
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.measuring import own_criterion
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
 
 STUDY_OF_AN_ADS = "smoke"
@@ -102,33 +102,22 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         return findings
     system = assemble(study)
     problems = find_problems(system)
-    if not problems:
-        return _unsafe_original(study, system)
-    words = sentence_on(problems, len(system.points))
-    if next(iter(problems.values())).reason is Reason.LATE:
-        where = _definition(study, "scenario.model", study.scenario.model)
-        return [Finding("meeting", words, where, "", "an encounter while the others are there")]
     where = _definition(study, "ads.model", study.ads.model)
-    return [
-        Finding(
-            "reaction", words, where, "", "a drive to the encounter, without braking for nobody"
-        )
-    ]
+    if problems:
+        words = sentence_on(problems, len(system.points))
+        if next(iter(problems.values())).reason is Reason.LATE:
+            where = _definition(study, "scenario.model", study.scenario.model)
+            return [Finding("meeting", words, where, "", "an encounter while the others are there")]
+        expected = "a drive to the encounter, without braking for nobody"
+        return [Finding("reaction", words, where, "", expected)]
 
-
-def _unsafe_original(study: Study, system: System) -> list[Finding]:
-    """A finding if the original vehicle is unsafe; none in a rated study, where all collide
-    in some cell.
-    """
-    if system.rater is not None:
-        return []
+    # In a rated study, every original vehicle collides in some cell.
     unsafe = own_criterion(study)
-    original = drive_and_score(system, system.characteristics.original[np.newaxis])
-    if not unsafe.of(original)[0]:
+    original = drive_and_score(system, system.characteristics.original_settings)
+    if system.rater is not None or not unsafe.of(original)[0]:
         return []
-    point = system.points[original.points[0]].name
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
-    where = _definition(study, "ads.model", study.ads.model)
+    point = system.points[original.points[0]].name
     return [Finding("original", words, where, point, "an original vehicle that is safe")]
 
 

@@ -209,7 +209,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     )
     problem = Problem(
         characteristics=system.characteristics,
-        original=drive_and_score(system, system.characteristics.original[np.newaxis]),
+        original=drive_and_score(system, system.characteristics.original_settings),
         population=min(study.search.population, MAX_POPULATION),
         evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
         region=system.region,

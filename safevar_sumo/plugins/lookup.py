@@ -279,16 +279,6 @@ def _is_of_libraries(entry: str) -> bool:
     return bool(entry) and not is_user_file(os.path.join(entry, ""))
 
 
-def _keywords(target: type) -> Sequence[str] | None:
-    """The keywords that a class takes; None if it takes any, or refuses others by itself."""
-    if issubclass(target, msgspec.Struct):
-        forbids = target.__struct_config__.forbid_unknown_fields
-        return None if forbids else target.__struct_encode_fields__
-    accepted = inspect.signature(target).parameters.values()
-    takes_any = any(one.kind is one.VAR_KEYWORD for one in accepted)
-    return None if takes_any else [one.name for one in accepted]
-
-
 def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> Any:
     """An instance of a class.
 
@@ -305,10 +295,12 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         If the class does not take the parameters.
     """
     with user_errors(subject()), np.errstate(), end_if_longer(member.time_limit, "`__init__`"):
-        for parameter in parameters:  # a user's class need not forbid what it does not have
-            if (names := _keywords(member.target)) is not None:
+        if member.code is not None:  # a class of the package forbids what it does not have
+            accepted = inspect.signature(member.target).parameters
+            takes_any = any(one.kind is one.VAR_KEYWORD for one in accepted.values())
+            for parameter in () if takes_any else parameters:
                 problem = f"{key}.{parameter}: {name} has no such parameter"
-                check_name("", problem, parameter, names)
+                check_name("", problem, parameter, accepted)
         if issubclass(member.target, msgspec.Struct):
             return convert_table(parameters, member.target, key)
         try:

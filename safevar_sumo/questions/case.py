@@ -86,7 +86,7 @@ class Case:
     def settings(self) -> FloatArray:
         """The original vehicle, then the solutions; shape (1 + M, n)."""
         solutions = self.solutions[[*self.characteristics.names]].to_numpy(dtype=float)
-        return np.concatenate([self.characteristics.original[np.newaxis], solutions])
+        return np.concatenate([self.characteristics.original_settings, solutions])
 
     def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
         """The case of another form of its study, in which its settings have been simulated
@@ -159,9 +159,11 @@ class Case:
                 f" keeps at least {self.study.scenario.margin:g} m of clearance (scenario.margin)"
             )
         valid = feasible.dropna(subset=[objective.name for objective in self.scoring.objectives])
-        unsafe = self.unsafe.number_in_words(int(self.unsafe.rows(valid).sum()))
-        settings = f"{number_of(len(valid), 'setting')} that have a value of every objective"
-        return f"the algorithms returned none of {settings}; of these, {unsafe}"
+        return (
+            f"the algorithms returned none of {number_of(len(valid), 'setting')} that have a value"
+            " of every objective; of these,"
+            f" {self.unsafe.number_in_words(int(self.unsafe.rows(valid).sum()))}"
+        )
 
     def require_solutions(self) -> None:
         """Raise `UnanswerableError` if there is no solution."""

@@ -97,14 +97,11 @@ def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
     members = model.evaluator.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
-    worst = np.zeros(len(runs), dtype=int) if runs.worst_points is None else runs.worst_points
     fit = f" (parameter set {model.fit})" if model.fit else ""
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
-        point = points[worst[row]]
-        values = dict(
-            zip(members.scenario.names, settings[row, ~members.of_vehicle].tolist(), strict=True)
-        )
+        point = points[runs.points[row]]
+        values = members.scenario.named(settings[row, ~members.of_vehicle])
         scenario = encounter(point, values).scenario
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])

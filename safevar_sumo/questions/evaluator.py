@@ -22,12 +22,12 @@ from safevar_sumo.campaign.questions import (
 )
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
+from safevar_sumo.sumo.measuring import criterion_of
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
@@ -94,16 +94,8 @@ class Evaluator:
         if is_feasible.all():
             return self._evaluate_shown(settings, stage, self._verified)
         infeasible = settings[~is_feasible]
-        filtered = self.characteristics.filter(infeasible)
-        undefined = np.full(np.count_nonzero(~is_feasible), np.nan)
-        not_simulated = Evaluations(
-            settings=infeasible,
-            outcome=np.full(len(infeasible), Outcome.INFEASIBLE.value, dtype="U16"),
-            collision_speed=undefined,
-            metrics=dict.fromkeys(METRICS, undefined),
-            f_diff=self.characteristics.largest_change(filtered),
-            f_num_diff=self.characteristics.number_changed(filtered),
-        )
+        changes = self.characteristics.change_objectives(infeasible)
+        not_simulated = Evaluations.undefined(infeasible, Outcome.INFEASIBLE, METRICS, **changes)
         simulated = self._evaluate_shown(settings[is_feasible], stage, self._verified)
         both = Evaluations.concatenate([simulated, not_simulated])
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
@@ -198,7 +190,7 @@ class Evaluator:
             return self.evaluate(settings, stage)
         of_vehicle = self.characteristics.of_vehicle
         encounters = np.concatenate(
-            [self.characteristics.original[np.newaxis], self.critical_encounters]
+            [self.characteristics.original_settings, self.critical_encounters]
         )
         pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(
             -1, settings.shape[1]
@@ -283,7 +275,7 @@ class Evaluator:
             If the study searches its scenario, and the original vehicle is not safe in the original
             encounter.
         """
-        evaluations = self.evaluate(self.characteristics.original[np.newaxis], "original vehicle")
+        evaluations = self.evaluate(self.characteristics.original_settings, "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
             problem = (
                 "scenario.search: the original vehicle is not safe in the encounter of the original"
@@ -331,19 +323,8 @@ class Evaluator:
         return Unsafe.default_among(evaluations, original)
 
     def parse_criterion(self, text: Unsafe | str) -> Unsafe:
-        """Parse the criterion that an option states.
-
-        Raises what `Unsafe.parse` raises, and an error if the criterion is about points and the
-        study is not rated.
-        """
-        criterion = Unsafe.parse(text)
-        if criterion.points is not None and not is_rated(self.study):
-            raise InputError(
-                "unsafe",
-                f"{text!r}: study {self.study.name!r} is not rated and has no points",
-                "collision or below=X",
-            )
-        return criterion
+        """Parse the criterion that an option states; raises what `criterion_of` raises."""
+        return criterion_of(text, self.study)
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

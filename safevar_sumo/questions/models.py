@@ -175,7 +175,7 @@ def models_of(
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         original = model.evaluator.evaluate(
-            evaluator.characteristics.original[np.newaxis], "original with each parameter set"
+            evaluator.characteristics.original_settings, "original with each parameter set"
         )
         if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
             left_out.append(model._replace(unsafe=unsafe))

@@ -183,7 +183,7 @@ def _assess_at_point(
     verdicts = dict[str, FloatArray]()
     if approach is None:
         return np.full((len(settings), len(drivers)), np.nan)
-    with_original = np.concatenate([system.characteristics.original[np.newaxis], settings])
+    with_original = np.concatenate([system.characteristics.original_settings, settings])
     scenario = system.points[0].scenario
     is_led = scenario.pre_crash in (PreCrash.LEAD_DECELERATING, PreCrash.CUT_IN)
     is_searched = len(system.characteristics.scenario) > 0
@@ -216,7 +216,7 @@ def approach_parameters(system: System) -> JsonObject | None:
     and holds that speed, so that both are at the same position when the danger begins. If the run
     begins at speed, the driver keeps that speed.
     """
-    trace = drive_worst(system, system.characteristics.original[np.newaxis]).trace
+    trace = drive_worst(system, system.characteristics.original_settings).trace
     speed = trace.speed[:, 0]
     is_braking = trace.brake[:, 0] > 0
     if speed[0] > 0 or not speed.any():

@@ -163,7 +163,7 @@ def _variant(
     # Changes to it.
     if changes:
         with about("set"):
-            values = dict(zip(characteristics.names, setting.tolist(), strict=True))
+            values = characteristics.named(setting)
             values |= {
                 key: value
                 for key, (value,) in read_changes(changes, characteristics, single=True).items()

@@ -147,10 +147,7 @@ def nearest_limits(
     seed = models.own.evaluator.study.search.seed
     judges = judges_of(models.members, NEAREST_STAGE)
     # The specified limits in all encounters, all other characteristics as in the original.
-    ends = [
-        np.where(members.of_vehicle, members.original, last)
-        for last in (members.lower, members.upper)
-    ]
+    ends = [members.with_original_vehicle(last) for last in (members.lower, members.upper)]
     stated = list[tuple[int, int, float]]()
     for name, limit in limits.items():
         column = members.names.index(name)

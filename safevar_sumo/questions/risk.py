@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
@@ -34,13 +36,8 @@ from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import (
-    constraints_in_words,
-    counted_in_words,
-    join_phrases,
-    percentage,
-)
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.questions.words import join_phrases, percentage, with_scope
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
 
@@ -70,8 +67,8 @@ OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsa
 """What varies, by the beginning of the names of its columns; another measure may stand in place of
 the safety degree.
 """
-MEASURE = "measure"
-"""The attribute of the table that holds the measure whose variance it splits, in words."""
+OF_WHAT = "of_what"
+"""The attribute of the table that says what varies, as `OUTPUTS` does."""
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
@@ -155,38 +152,32 @@ def risk(
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
         f"{NO_PROBABILITY if not study.variation else ''}"
-        f"{_bound_in_words(failures, high, total, confidence)}"
+        f"{'' if failures else _bound_in_words(high, total, confidence)}"
     )
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
-    remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
-    verdict = " ".join([verdict, *filter(None, remarks)])
     return Answer(
         question="risk",
         study=study,
-        verdict=verdict,
+        verdict=with_scope(study, left_out, verdict, criterion.remark),
         numbers=numbers,
         tables={"sensitivity": table},
     )
 
 
-def _bound_in_words(failures: int, high: float, total: int, confidence: float) -> str:
-    """What a sample without an unsafe vehicle says, and how many vehicles would say more; "" if a
-    vehicle is unsafe. Clopper and Pearson's upper end of 0 of n is
-    1 - ((1 - confidence) / 2)^(1 / n).
+def _bound_in_words(high: float, total: int, confidence: float) -> str:
+    """What a sample without an unsafe vehicle says, and how many vehicles would say more. Clopper
+    and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
     """
-    if failures:
-        return ""
     words = f" No vehicle is unsafe, so the share is at most {percentage(high)} %."
     needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
-    if total >= needed:
-        return words
-    return (
-        f"{words} To show at most {percentage(RARE)} %, {needed:,} vehicles are needed of which"
-        " none is unsafe (--samples)."
+    further = (
+        f" To show at most {percentage(RARE)} %, {needed:,} vehicles are needed of which none is"
+        " unsafe (--samples)."
     )
+    return f"{words}{further if total < needed else ''}"
 
 
 def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
@@ -200,7 +191,7 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     # The largest share, of all orders if it is known.
     first = table.iloc[0]
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
-    in_words = OUTPUTS | {"degree": table.attrs[MEASURE]}
+    in_words = table.attrs[OF_WHAT]
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
         name = first["characteristic"]
@@ -264,25 +255,16 @@ def sobol_indices(
     evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
     is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
 
-    def indices_of(output: FloatArray) -> Indices:
-        options = {
-            "calc_second_order": False,
-            "num_resamples": RESAMPLES,
-            "conf_level": confidence,
-            "seed": seed,
-        }
-        indices: Indices = analysis.analyze(problem, output[is_complete], **options)
-        return indices
-
-    # Indices of both outputs, over the complete rows.
-    measure, outputs = _outputs(evaluations, criterion, is_complete)
-    found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
-    return _table(
-        names,
-        measure,
-        found,
-        {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")},
+    indices_of = partial(
+        analysis.analyze,
+        problem,
+        calc_second_order=False,
+        num_resamples=RESAMPLES,
+        conf_level=confidence,
+        seed=seed,
     )
+    kinds = {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")}
+    return _table(names, evaluations.take(is_complete), criterion, indices_of, kinds)
 
 
 def given_data_indices(
@@ -296,11 +278,7 @@ def given_data_indices(
 
     # Characteristics that vary in the sample.
     varies = np.ptp(drawn.settings, axis=0) > 0
-    names = [
-        name
-        for name, it_varies in zip(evaluator.characteristics.names, varies, strict=True)
-        if it_varies
-    ]
+    names = [*compress(evaluator.characteristics.names, varies)]
     problem = {
         "num_vars": len(names),
         "names": [str(number) for number in range(len(names))],
@@ -318,72 +296,58 @@ def given_data_indices(
             )
         return indices
 
-    # Indices of both outputs, with what is correlated.
-    measure, outputs = _outputs(drawn, criterion, np.ones(len(drawn), dtype=bool))
-    found = {name: indices_of(output) for name, output in outputs.items() if output is not None}
-    return _table(
-        names,
-        measure,
-        found,
-        {
-            "first": ("S1", "first order, with everything that is correlated with it"),
-            "total": UNDEFINED,
-        },
-    )
-
-
-def _outputs(
-    evaluations: Evaluations, criterion: Unsafe, counts: BoolArray
-) -> tuple[str, dict[str, FloatArray | None]]:
-    """The criterion's measure in words, or the safety degree where the measure is undefined for a
-    vehicle, such as one that collides; and the outputs by name, None where there are no indices.
-    """
-    values = evaluations.column(criterion.measure)
-    measure = OUTPUTS["degree"] if criterion.measure == F_SAFE.name else criterion.measure
-    if not np.isfinite(values[counts]).all():
-        measure, values = OUTPUTS["degree"], evaluations.f_safe
-
-    # Outputs that vary enough.
-    is_unsafe = criterion.of(evaluations)
-    failures = int(is_unsafe[counts].sum())
-    is_defined = counts.any() and np.ptp(values[counts]) > 0
-    has_outcomes = MIN_OUTCOMES <= failures <= counts.sum() - MIN_OUTCOMES
-    return measure, {
-        "degree": values if is_defined else None,
-        "unsafe": is_unsafe.astype(float) if has_outcomes else None,
-    }
+    first = "S1", "first order, with everything that is correlated with it"
+    return _table(names, drawn, criterion, indices_of, {"first": first, "total": UNDEFINED})
 
 
 def _table(
     names: list[str],
-    measure: str,
-    found: Mapping[str, Indices],
-    indices: dict[str, tuple[str, str]],
+    evaluations: Evaluations,
+    criterion: Unsafe,
+    indices_of: Callable[[FloatArray], Indices],
+    kinds: dict[str, tuple[str, str]],
 ) -> pd.DataFrame:
-    """A row for each characteristic, the one that decides most of the measure first; `indices` maps
+    """A row for each characteristic, the one that decides most of the measure first; `kinds` maps
     an index to SALib's key and its meaning. Readers see the name of a measure other than the safety
     degree above its column.
     """
-    columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
+    # The criterion's measure, or the safety degree where the measure is undefined for a vehicle,
+    # such as one that collides.
+    degree = evaluations.f_safe
+    output_names = dict(OUTPUTS)
+    own = evaluations.column(criterion.measure)
+    if criterion.measure != F_SAFE.name and np.isfinite(own).all():
+        degree = own
+        output_names["degree"] = criterion.measure
+
+    # Outputs that vary enough have indices.
+    is_unsafe = criterion.of(evaluations)
+    failures = int(is_unsafe.sum())
+    found = dict[str, Indices]()
+    if len(degree) and np.ptp(degree) > 0:
+        found["degree"] = indices_of(degree)
+    if MIN_OUTCOMES <= failures <= len(degree) - MIN_OUTCOMES:
+        found["unsafe"] = indices_of(is_unsafe.astype(float))
 
     # An index of each output, with its interval.
+    columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
-    for output, of_what in (OUTPUTS | {"degree": measure}).items():
+    for output, of_what in output_names.items():
         of_output = found.get(output, {})
-        for index, (key, meaning) in indices.items():
+        for index, (key, meaning) in kinds.items():
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            head = "" if of_what in OUTPUTS.values() else f"{measure} {index}"
+            head = f"{of_what} {index}" if of_what == criterion.measure else ""
             meaning = f"share of the variance of {of_what}: {meaning}"
             columns |= with_interval(name, Column("-", meaning, ".2f", head=head))
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
-    last = "degree_first" if indices["total"] == UNDEFINED else "degree_total"
+    last = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
     table = tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
-    table.attrs[MEASURE] = measure
+    table.attrs[OF_WHAT] = output_names
     return table

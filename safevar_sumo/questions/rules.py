@@ -21,12 +21,7 @@ from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import (
-    constraints_in_words,
-    counted_in_words,
-    join_phrases,
-    percentage,
-)
+from safevar_sumo.questions.words import join_phrases, percentage, with_scope
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -136,8 +131,7 @@ def rules(
         "interval": [low, high],
     }
     left_out = int(evaluations.infeasible.sum())
-    remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
-    verdict = " ".join([verdict, *filter(None, remarks)])
+    verdict = with_scope(study, left_out, verdict, criterion.remark)
     return Answer(
         question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
     )

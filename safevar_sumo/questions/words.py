@@ -154,6 +154,12 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     return [own, *demanded_in_words(study), *left]
 
 
+def with_scope(study: Study, left_out: int, *sentences: str) -> str:
+    """Sentences of a verdict on sampled vehicles, and which vehicles and encounters count."""
+    scope = [*counted_in_words(study, left_out), *constraints_in_words(study)]
+    return " ".join(filter(None, [*sentences, *scope]))
+
+
 def demanded_in_words(study: Study) -> list[str]:
     """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
     other study.

@@ -205,6 +205,11 @@ class Trace:
     vehicle_width: float = 0.0
     pedal: FloatArray = field(default_factory=lambda: ZERO)
 
+    @property
+    def last_active(self) -> IntArray:
+        """The last active sample of each of N vehicles, shape (N,)."""
+        return np.asarray(len(self.time) - 1 - np.argmax(self.active[::-1], axis=0))
+
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
         arrays = {item.name: getattr(self, item.name) for item in fields(self)}
@@ -341,9 +346,7 @@ class SimulationRuns:
         trace = self.trace
         # In the last active sample and the one before.
         vehicles = np.arange(len(self.collision_speed))
-        last_sample = (
-            len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
-        )  # the last active one
+        last_sample = trace.last_active
         sample_before = np.maximum(last_sample - 1, 0)
         obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
         speed = trace.speed - obstacle_speed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -135,14 +135,21 @@ class Evaluations:
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
         """Empty evaluations, for settings of `n` characteristics."""
-        empty_array = np.zeros(0)
+        no_changes = dict.fromkeys(("f_diff", "f_num_diff"), np.zeros(0))
+        return cls.undefined(np.zeros((0, n)), "", metrics, **no_changes)
+
+    @classmethod
+    def undefined(
+        cls, settings: FloatArray, outcome: str, metrics: Iterable[str], **further: Any
+    ) -> Evaluations:
+        """Evaluations of settings that were not simulated, all with one outcome."""
+        undefined = np.full(len(settings), np.nan)
         return cls(
-            settings=np.zeros((0, n)),
-            outcome=np.zeros(0, dtype="U16"),
-            collision_speed=empty_array,
-            metrics=dict.fromkeys(metrics, empty_array),
-            f_diff=empty_array,
-            f_num_diff=empty_array,
+            settings=settings,
+            outcome=np.full(len(settings), outcome, dtype="U16"),
+            collision_speed=undefined,
+            metrics=dict.fromkeys(metrics, undefined),
+            **further,
         )
 
     @classmethod

@@ -132,8 +132,7 @@ class Comparison:
         """Every change in words, with its unit and share."""
         characteristics = self.system.characteristics
         # The changed vehicle follows the original, which is alone without a change.
-        setting = self.evaluations.settings[-1].tolist()
-        return change_texts(characteristics, dict(zip(characteristics.names, setting, strict=True)))
+        return change_texts(characteristics, characteristics.named(self.evaluations.settings[-1]))
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""

@@ -8,7 +8,7 @@ import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -144,18 +144,15 @@ def _with_next_place(actor: Poses) -> Poses:
     """An actor with a place one step after its end, where an even change of speed leads: between
     the places beside it, a reader finds the speed at the end.
     """
-    moves = np.diff([actor.x, actor.y], axis=1)
-    if moves.shape[1] < 2 or not moves[:, -1].any():
+    lengths = np.hypot(*np.diff([actor.x[-3:], actor.y[-3:]]))
+    if len(lengths) < 2 or not lengths[1]:
         return actor
-    before, last = np.hypot(*moves[:, -2:])
-    x, y = moves[:, -1] * max(2 - before / last, 0.0)
-    time = round(2 * actor.time[-1] - actor.time[-2], TIME_DECIMALS)
-    return actor._replace(
-        time=np.append(actor.time, time),
-        x=np.append(actor.x, actor.x[-1] + x),
-        y=np.append(actor.y, actor.y[-1] + y),
-        heading=np.append(actor.heading, actor.heading[-1]),
-    )
+    share = max(2 - lengths[0] / lengths[1], 0.0)
+    longer = dict[str, Any]()
+    for name, step in {"time": 1.0, "x": share, "y": share, "heading": 0.0}.items():
+        values = getattr(actor, name)
+        longer[name] = np.append(values, values[-1] + step * (values[-1] - values[-2]))
+    return actor._replace(**{**longer, "time": np.round(longer["time"], TIME_DECIMALS)})
 
 
 def open_drive(network: NetworkFiles) -> str:
@@ -298,7 +295,7 @@ def export(
     setting = target.setting(system)
     vehicle = system.characteristics.vehicle
     of_vehicle = setting[system.characteristics.of_vehicle]
-    values = dict(zip(vehicle.names, of_vehicle.tolist(), strict=True))
+    values = vehicle.named(of_vehicle)
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
     comparison = comparison_of(

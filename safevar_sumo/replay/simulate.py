@@ -178,7 +178,7 @@ def show_simulation(
         values = read_changes(changes, system.characteristics, beyond=beyond)
         requested = _combine(values, target.setting(system), system)
         if changes and not beyond:  # what a study or results hold has been checked
-            system.check_feasible(requested, filtered=False, switch="--beyond")
+            system.region.check(requested, otherwise=", or any with --beyond")
 
     # Files that cannot be written are refused first.
     if trace is not None:
@@ -361,7 +361,7 @@ def _sweep(study: Study, system: System, settings: FloatArray, names: list[str])
     # All settings, and the original vehicle first.
     characteristics = system.characteristics
     evaluations = evaluate_with_workers(
-        study, np.concatenate([characteristics.original[np.newaxis], settings])
+        study, np.concatenate([characteristics.original_settings, settings])
     )
     contact = system.contact
     no_verdict = why_no_verdict(system)

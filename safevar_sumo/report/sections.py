@@ -420,9 +420,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         yield {
             "title": f"{name}{reason}: {comparison.verdict(last)}",
             "point": comparison.point.name,
-            "changes": change_texts(
-                characteristics, dict(zip(characteristics.names, setting.tolist(), strict=True))
-            ),
+            "changes": change_texts(characteristics, characteristics.named(setting)),
             "differences": differences,
             "player": player_data(lay_out_scene(comparison)),
         }

@@ -66,11 +66,9 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
     remedy: ShortText = ""
 
 
-def unit_text(unit: str, layout: str = " {}") -> str:
-    """A unit as text after a number or, in another `layout`, after a name; empty for a pure
-    number.
-    """
-    return "" if unit in ("-", "") else layout.format(unit)
+def unit_text(unit: str) -> str:
+    """A unit as text after a number; empty for a pure number."""
+    return "" if unit in ("-", "") else f" {unit}"
 
 
 class _Distribution(Table, frozen=True, tag_field="distribution"):

@@ -44,14 +44,12 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
                 metrics[name] = np.where(
                     is_invalid, np.nan, measure.function(runs, system.metrics_table)
                 )
-    filtered = system.characteristics.filter(settings)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
         metrics=metrics,
-        f_diff=system.characteristics.largest_change(filtered),
-        f_num_diff=system.characteristics.number_changed(filtered),
+        **system.characteristics.change_objectives(settings),
     )
 
 
@@ -204,14 +202,13 @@ def open_points_world(
     (point,) = system.points
     step = system.scenes.step
     n, n_searched = encounters.shape
-    names = system.characteristics.scenario.names
 
     # The scenario in each encounter, and a network for it.
     scenarios = [point.scenario]
     if n_searched:
         scenarios = [
-            encounter(point, dict(zip(names, values, strict=True))).scenario
-            for values in encounters.tolist()
+            encounter(point, system.characteristics.scenario.named(values)).scenario
+            for values in encounters
         ]
     networks = networks_for(scenarios)
 

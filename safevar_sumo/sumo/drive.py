@@ -165,9 +165,7 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> Fleet:
     n = len(settings)
 
     # Constants of the vehicles on these roads.
-    characteristics = dict(
-        zip(system.characteristics.names, np.ascontiguousarray(settings.T), strict=True)
-    )
+    characteristics = system.characteristics.columns(settings)
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
 

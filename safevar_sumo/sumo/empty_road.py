@@ -56,14 +56,14 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     the obstacle is not what keeps it from a collision. Neither is it where nothing happens to a
     vehicle that keeps its speed.
     """
-    original = system.characteristics.original[np.newaxis]
+    original = system.characteristics.original_settings
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), original)
     except SimulationError:  # the study's own simulations decide, and report their errors
         return {}
     # A searched scenario is the one of the original encounter.
     members = system.characteristics
-    values = dict(zip(members.scenario.names, original[:, ~members.of_vehicle].T, strict=True))
+    values = members.scenario.columns(members.scenario.original_settings)
     points = [encounter(point, values) if values else point for point in system.points]
     return {
         point.name: problem
@@ -92,16 +92,6 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
     )
 
 
-def _stays_beside(runs: SimulationRuns, end: int) -> bool:
-    """Whether nobody is in the way of the only vehicle at the samples before `end`, or comes nearer
-    to it in the last step.
-    """
-    trace = runs.trace
-    width = np.broadcast_to(trace.obstacle_width, trace.gap.shape)[:end, 0]
-    beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + width) / 2
-    return bool((beside > 0).all() and beside[-1] >= beside[-2:][0])
-
-
 def _problem(
     runs: SimulationRuns, test_speed: float | None, uneventful: str | None
 ) -> EmptyRoadFault | None:
@@ -118,19 +108,27 @@ def _problem(
     gap, speed, brake, position = (
         values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
     )
+    obstacle_speed, obstacle_width = (
+        np.broadcast_to(values, trace.gap.shape)[:end, 0]
+        for values in (trace.obstacle_speed, trace.obstacle_width)
+    )
 
     # Does it brake for nothing?
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
     # Does it get to the encounter at its speed?
-    approach = speed[-1] - np.broadcast_to(trace.obstacle_speed, trace.gap.shape)[:end, 0][-1]
+    approach = speed[-1] - obstacle_speed[-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
     meets_undisturbed = keeps_speed and uneventful == ""
     if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
         return None
-    if gap[-1] <= 0 and not uneventful and _stays_beside(runs, end):
+
+    # Does nobody come into its way, or nearer to it at the end?
+    beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
+    stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
+    if gap[-1] <= 0 and not uneventful and stays_beside:
         words = "meets nobody: whoever is there stays beside its way, and comes no nearer to it"
         return EmptyRoadFault(Reason.LATE, words)
     if gap[-1] <= 0 or (keeps_speed and is_alone):

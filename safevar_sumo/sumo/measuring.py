@@ -22,7 +22,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     checked_measure,
 )
-from safevar_sumo.metrics.unsafe import COLLISION
+from safevar_sumo.metrics.unsafe import COLLISION, CriterionLike
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
@@ -82,11 +82,11 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
 
     # The one of its own criterion.
-    bound = own_criterion(study).bound
-    if bound is not None:
+    if (bound := own_criterion(study).bound) is not None:
+        known = OPTIONAL_METRICS | named.computed
         problem = f"{CRITERION_KEY} = {study.unsafe.criterion!r}: there is no such metric"
-        check_name("", problem, bound.measure, {*named.computed, *OPTIONAL_METRICS})
-        named.look_up(bound.measure, CRITERION_KEY, {**metrics, **named.computed})
+        check_name("", problem, bound.measure, known)
+        named.computed.setdefault(bound.measure, known[bound.measure])
 
     # Objectives, each once.
     shipped = {**metrics, **OBJECTIVES}
@@ -95,38 +95,38 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     ]
     if IMPACT_EXCESS.name in named.computed:
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)  # sentences have both
-    names = [objective.name for objective in objectives]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        written = [
-            repr(text)
-            for text, name in zip(study.search.objectives, names, strict=True)
-            if name == twice
-        ]
-        problem = f"{' and '.join(written)} are the same objective"
-        if len(set(written)) == 1:
-            problem = f"{written[0]} is given {'twice' if len(written) == 2 else 'several times'}"
-        raise InputError("", f"search.objectives: {problem}", "each objective once")
+    texts = dict[str, list[str]]()
+    for objective, text in zip(objectives, study.search.objectives, strict=True):
+        texts.setdefault(objective.name, []).append(repr(text))
+    for same in texts.values():
+        if len(same) > 1:
+            problem = f"{OBJECTIVES_KEY}: {' and '.join(same)} are the same objective"
+            raise InputError("", problem, "each objective once")
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
 
 
 def own_criterion(study: Study) -> Unsafe:
-    """The study's own criterion; without one, a collision.
+    """The study's own criterion; without one, a collision. Raises what `criterion_of` raises."""
+    text = study.unsafe.criterion or COLLISION
+    try:
+        return criterion_of(text, study)
+    except InputError as error:
+        raise InputError("", f"{CRITERION_KEY} = {error.problem}", error.legal) from None
+
+
+def criterion_of(text: CriterionLike, study: Study) -> Unsafe:
+    """A criterion that is stated for a study.
 
     Raises
     ------
     InputError
         If it is no criterion, or about points of a study that is not rated.
     """
-    text = study.unsafe.criterion or COLLISION
-    try:
-        criterion = Unsafe.parse(text)
-    except InputError as error:
-        raise InputError("", f"{CRITERION_KEY} = {text!r}", error.legal) from None
+    criterion = Unsafe.parse(text)
     if criterion.points is not None and not is_rated(study):
-        problem = f"{CRITERION_KEY} = {text!r}: the study is not rated and has no points"
-        raise InputError("", problem, "collision or below=X")
+        problem = f"{text!r}: study {study.name!r} is not rated and has no points"
+        raise InputError("unsafe", problem, "collision or below=X")
     return criterion
 
 

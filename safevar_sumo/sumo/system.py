@@ -140,8 +140,7 @@ class System:
         if not encounters.shape[1]:
             return self
         (point,) = self.points
-        columns = np.ascontiguousarray(encounters.T)
-        values = dict(zip(self.characteristics.scenario.names, columns, strict=True))
+        values = self.characteristics.scenario.columns(encounters)
         return replace(
             self.at(encounter(point, values)), characteristics=self.characteristics.vehicle
         )
@@ -155,17 +154,6 @@ class System:
             allowed_impact_speed=point.allowed_impact_speed,
             matrix=(),
             rater=None,
-        )
-
-    def check_feasible(
-        self, settings: FloatArray, *, filtered: bool, switch: str = "beyond=True"
-    ) -> None:
-        """Refuse settings, shape (M, n), that violate a constraint; raises the errors of
-        `FeasibleRegion.check`.
-        """
-        self.region.check(
-            self.characteristics.filter(settings) if filtered else settings,
-            otherwise=f", or any with {switch}",
         )
 
     @property
@@ -208,7 +196,7 @@ class System:
 
     @property
     def _has_tau(self) -> bool:
-        return self.vehicle.sumo_type(self._prepared_original()).tau is not None
+        return self.vehicle.sumo_type(self._prepared()).tau is not None
 
     def _remarks_on_driver(self) -> list[str]:
         """Remarks on the headway `tau` and on what SUMO's driver does not know."""
@@ -238,11 +226,12 @@ class System:
             return []
 
         # Does the largest deceleration still rise at the end of the domain?
-        column = members.names.index(DECEL)
-        settings = np.tile(members.original, (2, 1))
-        settings[:, column] = members.upper[column] * np.array([NEARLY, 1.0])
+        upper = members.upper[members.names.index(DECEL)]
         friction = max(point.weather.road_friction for point in self.points)
-        nearly, highest = self.vehicle.sumo_type(self._prepared(settings, friction)).decel.tolist()
+        nearly, highest = (
+            self.vehicle.sumo_type(self._prepared(friction, decel=np.array([value]))).decel[0]
+            for value in (NEARLY * upper, upper)
+        )
         if highest > nearly:
             return []
         return [
@@ -251,18 +240,16 @@ class System:
         ]
 
     def _has_limited_range(self) -> bool:
-        sensors = self.vehicle.sensors(self._prepared_original())
+        sensors = self.vehicle.sensors(self._prepared())
         return sensors is not None and bool(np.isfinite(sensors.reach).all())
 
-    def _prepared_original(self) -> Prepared:
-        """The constants of the original vehicle."""
-        return self._prepared(self.characteristics.vehicle.original[np.newaxis], 1.0)
-
-    def _prepared(self, settings: FloatArray, friction: float) -> Prepared:
-        """The constants of N vehicles, shape (N, k), on a road with this factor on its friction."""
-        columns = np.ascontiguousarray(settings.T)
-        values = dict(zip(self.characteristics.vehicle.names, columns, strict=True))
-        return self.vehicle.prepare(values, friction, 0.1)  # time step 0.1 s
+    def _prepared(self, friction: float = 1.0, **changes: FloatArray) -> Prepared:
+        """The constants of the original vehicle with changes, on a road with this factor on its
+        friction.
+        """
+        members = self.characteristics.vehicle
+        original = members.columns(members.original_settings)
+        return self.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
 
 
 def assemble(study: Study) -> System:

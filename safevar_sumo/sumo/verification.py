@@ -126,9 +126,8 @@ def _compare(
     difference.
     """
     trace = runs.trace
-    last = len(trace.time) - 1 - np.argmax(trace.active[::-1], axis=0)
     collision = np.full(trace.speed.shape, np.nan)
-    collision[last, np.arange(len(last))] = runs.collision_speed
+    collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed
     recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
     recorded["collision"] = collision
     for name, values in recorded.items():
@@ -139,8 +138,8 @@ def _compare(
             differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():
             sample, row = np.argwhere(differs)[0]
-            pairs = zip(system.characteristics.names, settings[row].tolist(), strict=True)
-            setting = ", ".join(f"{key} = {value:.17g}" for key, value in pairs)
+            values_of = system.characteristics.named(settings[row]).items()
+            setting = ", ".join(f"{key} = {value:.17g}" for key, value in values_of)
             raise InputError(
                 system.source,
                 f"{name.replace('_', ' ')} at {trace.time[sample]:g} s is {values[sample, row]:.9g}"

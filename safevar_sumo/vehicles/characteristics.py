@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -229,6 +230,11 @@ class CharacteristicSet:
     def original(self) -> FloatArray:
         return self._column("original")
 
+    @property
+    def original_settings(self) -> FloatArray:
+        """The original setting alone, shape (1, n)."""
+        return self.original[np.newaxis]
+
     @cached_property
     def lower(self) -> FloatArray:
         return self._column("lower")
@@ -253,6 +259,14 @@ class CharacteristicSet:
         values.flags.writeable = False
         return values
 
+    def named(self, setting: FloatArray) -> dict[str, float]:
+        """The values of a setting, shape (n,), by name."""
+        return dict(zip(self.names, setting.tolist(), strict=True))
+
+    def columns(self, settings: FloatArray) -> dict[str, FloatArray]:
+        """The values of N settings, shape (N, n), by name, each of shape (N,)."""
+        return dict(zip(self.names, np.ascontiguousarray(settings.T), strict=True))
+
     def filter(self, settings: FloatArray) -> FloatArray:
         """Reset each value that differs from the original by no more than the threshold (method
         section 2).
@@ -262,6 +276,14 @@ class CharacteristicSet:
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
         return np.asarray(filtered != self.original)
+
+    def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
+        """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
+        filtered = self.filter(settings)
+        return {
+            "f_diff": self.largest_change(filtered),
+            "f_num_diff": self.number_changed(filtered),
+        }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
         """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w

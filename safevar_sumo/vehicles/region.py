@@ -184,7 +184,7 @@ def region_of(study: Study) -> FeasibleRegion:
     # The original vehicle satisfies every constraint.
     with about(f"{subject()}: the original vehicle"):
         required = "; the original vehicle must satisfy every constraint"
-        region.check(characteristics.original[np.newaxis], otherwise=required)
+        region.check(characteristics.original_settings, otherwise=required)
 
     # Random settings that do are not too rare.
     shape = (N_PROBES, len(characteristics))

@@ -110,9 +110,9 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     study = load_study("smoke")
     wrong = msgspec.structs.replace(study, ads=ModelTable(model="world_on_roads"), spread={})
     with pytest.raises(InputError, match="world_on_roads") as caught:
-        carry_out(evaluate_settings, [(Task(study=wrong), SUN.original[np.newaxis])], pool)
+        carry_out(evaluate_settings, [(Task(study=wrong), SUN.original_settings)], pool)
     assert "expected" in str(caught.value)
-    assert carry_out(evaluate_settings, [(Task(study=study), SUN.original[np.newaxis])], pool)[
+    assert carry_out(evaluate_settings, [(Task(study=study), SUN.original_settings)], pool)[
         0
     ].valid.all()
 
@@ -125,7 +125,7 @@ WITH_USER_CODE = msgspec.structs.replace(
 
 def settings(number: int) -> FloatArray:
     """Settings whose first value tells which it is."""
-    rows = np.repeat(SUN.original[np.newaxis], number, axis=0)
+    rows = np.repeat(SUN.original_settings, number, axis=0)
     rows[:, 0] = 4300 + np.arange(number)
     return rows
 

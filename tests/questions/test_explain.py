@@ -261,9 +261,9 @@ def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_need
     evaluator = made_up_evaluator(1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high))
     (causes,) = find_minimal_causes(evaluator, np.array([[value]]), COLLISION)
     found = find_cause_limits(evaluator, causes, COLLISION)
-    _, (rounded,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
+    (rounded,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
     number_format = CAUSE_COLUMNS["boundary"].number_format  # type: ignore[union-attr]
-    for values in (rounded.boundary, rounded.single_boundary):
+    for values in (rounded["boundary"], rounded["single_boundary"]):
         assert cell_text(values["a"], number_format) == printed
         assert low < values["a"] < high
 

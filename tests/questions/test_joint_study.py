@@ -211,10 +211,7 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name), jobs=2) as judging:
         members, model = judging.characteristics, Model(0, judging, Unsafe())
         vehicle = np.array(
-            [
-                {**dict(zip(members.names, members.original, strict=True)), **WORN[name]}[one]
-                for one in members.names
-            ]
+            [{**members.named(members.original), **WORN[name]}[one] for one in members.names]
         )
         box = Box(
             judging.region,

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import Bounds, differential_evolution
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
@@ -27,10 +28,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
 from tests.made_up import HARDEST_BRAKING
 
-WORST, STEPS, ROUNDS = 6, 20, 12
-"""Settings from which the other optimiser searches on, neighbours that it tries at once, and how
-often.
-"""
+ROUNDS = 12
+"""Number of generations of the other optimiser."""
 MANUAL = re.compile(r"(at least|at most) (\d+(?:\.\d+)?)")
 """A limit in a sentence of a maintenance manual."""
 FEW_TESTS = {
@@ -88,8 +87,8 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
         "All corner cases in 32,768 encounters",
     ),
 }
-"""By what is special: study, what is changed of it, what is asked, random settings of the
-other optimiser, and what is said.
+"""By what is special: study, what is changed of it, what is asked, simulations of the other
+optimiser in each parameter set, and what is said.
 """
 Judge = Callable[[FloatArray], FloatArray]
 
@@ -119,33 +118,24 @@ def judge_of(study: Study, unsafe: Unsafe, margin: float) -> Judge:
 def worst_within(
     lower: FloatArray, upper: FloatArray, judges: list[Judge], simulations: int, seed: int
 ) -> float:
-    """The least that settings between two ends leave, shape (n,), by any of some judges: random
-    settings, then local search from the six worst.
+    """The least that settings between two ends leave, shape (n,), by any of some judges: SciPy's
+    differential evolution, from random settings, half of whose values are at ends.
     """
     rng = np.random.default_rng(seed)
-    n = len(lower)
-    # Random settings, half of whose values are at ends, each by a random judge.
-    shares = rng.random((simulations, n))
+    shares = rng.random((simulations // ROUNDS, len(lower)))
     shares = np.where(rng.random(shares.shape) < 0.5, np.round(shares), shares)
-    settings = lower + shares * (upper - lower)
-    of_judge = rng.integers(len(judges), size=len(settings))
-    left = np.full(len(settings), np.inf)
-    for number, judge in enumerate(judges):
-        left[of_judge == number] = judge(settings[of_judge == number])
-    # From the six worst, steps of some values, which become smaller.
-    order = np.argsort(left)[:WORST]
-    best = [(left[row], settings[row], judges[of_judge[row]]) for row in order]
-    step = 0.3
-    for _ in range(ROUNDS):
-        for place, (least, setting, judge) in enumerate(best):
-            is_moved = rng.random((STEPS, n)) < rng.choice([0.15, 0.3, 0.6])
-            moves = rng.normal(0.0, step, (STEPS, n)) * is_moved * (upper - lower)
-            near = np.clip(setting + moves, lower, upper)
-            of_near = judge(near)
-            if of_near.min() < least:
-                best[place] = of_near.min(), near[np.argmin(of_near)], judge
-        step *= 0.9
-    return float(min(least for least, _, _ in best))
+    found = differential_evolution(
+        lambda columns: np.min([judge(columns.T) for judge in judges], axis=0),
+        Bounds(lower, upper),
+        init=lower + shares * (upper - lower),
+        maxiter=ROUNDS,
+        tol=0,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        seed=seed,
+    )
+    return float(found.fun)
 
 
 @pytest.mark.slow

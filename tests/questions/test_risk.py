@@ -17,7 +17,7 @@ import pytest
 from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
-from safevar_sumo.questions.risk import deciding_in_words
+from safevar_sumo.questions.risk import OUTPUTS, deciding_in_words
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray
@@ -203,7 +203,7 @@ def test_the_verdict_says_which_shares_are_unsure() -> None:
         for end, x in zip(("", LOW, HIGH), row, strict=True)
     }
     frame = pd.DataFrame({"characteristic": ["a"], **values})
-    frame.attrs = {"measure": "the safety degree"}
+    frame.attrs = {"of_what": OUTPUTS}
     words = deciding_in_words(frame, 120)
     assert (
         "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %)." in words

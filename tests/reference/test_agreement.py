@@ -121,7 +121,7 @@ METRICS = {
 
 def table(characteristics: CharacteristicSet, columns: list[str]) -> pd.DataFrame:
     return (
-        pd.DataFrame(np.repeat(characteristics.original[np.newaxis], 3, axis=0), columns=columns)
+        pd.DataFrame(np.repeat(characteristics.original_settings, 3, axis=0), columns=columns)
         .assign(**METRICS)
         .astype(object)
     )

@@ -13,12 +13,12 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import scipy
 from hypothesis import given, strategies as st
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
@@ -54,8 +54,7 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
         "a whole width of f_safe away from one of two"
     )
     assert result.loc[("rs", 0), "hypervolume"] == pytest.approx(1.1 * 0.1 * 1.1)
-    search = msgspec.structs.replace(case.study.search, reference_point=2.0)
-    study = msgspec.structs.replace(case.study, search=search)
+    study = load_study(case.study, search={"reference_point": 2.0})
     wide = compute_indicators(dataclasses.replace(case, study=study))
     assert wide.loc[("rs", 0), "hypervolume"] == pytest.approx(2 * 1 * 2)
 

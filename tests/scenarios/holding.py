@@ -55,7 +55,7 @@ def driven(
     """
     system = replace(system, scenario=scenario, matrix=(), ads=ads or Hold())
     return drive_worst(
-        system, system.characteristics.original[np.newaxis] if settings is None else settings
+        system, system.characteristics.original_settings if settings is None else settings
     )
 
 

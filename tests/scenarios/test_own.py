@@ -68,11 +68,10 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
     system = assemble(mine(in_tmp, SEARCH))
     settings = drawn(system, 6, 4)
     found = drive_and_score(system, settings)
-    names = system.characteristics.scenario.names
     of_vehicle = system.characteristics.of_vehicle
-    assert names == ("scooter", "gap")
+    assert system.characteristics.scenario.names == ("scooter", "gap")
     for row, setting in enumerate(settings):
-        parameters = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
+        parameters = system.characteristics.scenario.named(setting[~of_vehicle])
         alone = assemble(
             load_study(
                 "wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}

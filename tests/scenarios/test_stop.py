@@ -33,10 +33,7 @@ def stops(weather: Any, *speeds: float, **tables: Any) -> System:
 
 def distances(system: System, **changes: float) -> FloatArray:
     """Stopping distances of the original vehicle with some changes, from every speed [m]."""
-    values = (
-        dict(zip(system.characteristics.names, system.characteristics.original, strict=True))
-        | changes
-    )
+    values = system.characteristics.named(system.characteristics.original) | changes
     results = simulate_all_points(system, np.array([[*values.values()]]))
     return np.array([result.evaluations.metrics["stopping_distance"][0] for result in results])
 

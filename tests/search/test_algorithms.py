@@ -84,7 +84,7 @@ def begun(
     scoring: Scoring = PUBLISHED_SCORING,
     characteristics: CharacteristicSet = SUN,
 ) -> Iterator[Any]:
-    original = sphere(characteristics, characteristics.original[np.newaxis])
+    original = sphere(characteristics, characteristics.original_settings)
     problem = Problem(
         characteristics=characteristics,
         original=original,
@@ -260,7 +260,7 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
 
 
 def problem() -> Problem:
-    original = evaluated(TWO, TWO.original[np.newaxis], np.array([5.0]))
+    original = evaluated(TWO, TWO.original_settings, np.array([5.0]))
     return Problem(characteristics=TWO, original=original, evaluations=1000, population=POPULATION)
 
 

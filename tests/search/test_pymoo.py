@@ -187,9 +187,7 @@ def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
         runs=1,
         parameters=options,
     )
-    study = msgspec.structs.replace(
-        study, search=msgspec.structs.replace(study.search, parameters={**options, **STOPS})
-    )
+    study = load_study(study, search={"parameters": {**options, **STOPS}})
     with pytest.warns(
         UserWarning, match="less than 90% of a run's evaluations are simulated"
     ) as warned:

@@ -101,7 +101,7 @@ def standard_problem(
     scoring = StandardScoring(standard)
     return Problem(
         characteristics=unit,
-        original=evaluated(unit, unit.original[np.newaxis], np.zeros(1)),
+        original=evaluated(unit, unit.original_settings, np.zeros(1)),
         evaluations=evaluations,
         population=population,
         scoring=scoring,

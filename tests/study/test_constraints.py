@@ -45,7 +45,7 @@ at_most = 9.2
 
 def is_feasible(values: Mapping[str, float]) -> bool:
     """The region of `BOUND`, written once more; what is not there is the original's."""
-    by = {**dict(zip(SUN.names, SUN.original.tolist(), strict=True)), **values}
+    by = {**SUN.named(SUN.original), **values}
     return (
         700 - 1e-6 <= by["mass"] - by["maxBrakeTorque"] <= 1100 + 1e-6
         and by["tireFric"] - 0.5 * by["radius"] >= -16.4 - 1e-6

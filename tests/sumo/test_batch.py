@@ -56,7 +56,7 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(
 ) -> None:
     characteristics = any_system.characteristics
     n = len(characteristics)
-    ends = np.repeat(characteristics.original[np.newaxis], 2 * n, axis=0)
+    ends = np.repeat(characteristics.original_settings, 2 * n, axis=0)
     ends[np.arange(n), np.arange(n)] = characteristics.lower
     ends[np.arange(n, 2 * n), np.arange(n)] = characteristics.upper
     run = drive_worst(any_system, ends[any_system.region.feasible(ends)])

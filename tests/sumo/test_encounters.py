@@ -128,10 +128,9 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
     system = assemble(joint)
     settings = drawn(system, 4, 3)
     evaluations = drive_and_score(system, settings)
-    names = system.characteristics.scenario.names
     of_vehicle = system.characteristics.of_vehicle
     for row, setting in enumerate(settings):
-        values = dict(zip(names, setting[~of_vehicle].tolist(), strict=True))
+        values = system.characteristics.scenario.named(setting[~of_vehicle])
         weather = {name: values.pop(name) for name in WEATHER}
         base, scenario, _ = CASES[case]
         parameters = {**scenario.get("parameters", {}), **values}
@@ -163,9 +162,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
         alone = drive_and_score(system, settings[[row]])
         for name, values in together.results.items():
             np.testing.assert_array_equal(alone.results[name], values[[row]])
-    beside = simulate(
-        "sun_joint", dict(zip(system.characteristics.names, settings[0].tolist(), strict=True))
-    )
+    beside = simulate("sun_joint", system.characteristics.named(settings[0]))
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )

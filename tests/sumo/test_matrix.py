@@ -128,10 +128,8 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
 ) -> None:
     """Euro NCAP's tolerance applies until the ADS acts."""
     vehicle = SUN.vehicle
-    original = SUN.characteristics.original
-    prepared = vehicle.prepare(
-        dict(zip(SUN.characteristics.names, original[:, np.newaxis], strict=True)), 1.0, 0.05
-    )
+    original = SUN.characteristics.columns(SUN.characteristics.original_settings)
+    prepared = vehicle.prepare(original, 1.0, 0.05)
     state = vehicle.at_speed(prepared, np.array([50 / 3.6]))
     all_open = np.ones(1, dtype=bool)
     robot = DrivingRobot([Point(CarToCar(speed=50), SUN.weather)], vehicle, prepared, state, 0.05)

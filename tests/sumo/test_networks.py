@@ -185,7 +185,7 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
 
 
 def load_original(study: str) -> np.ndarray:
-    return assemble(load_study(study)).characteristics.original[np.newaxis]
+    return assemble(load_study(study)).characteristics.original_settings
 
 
 def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:

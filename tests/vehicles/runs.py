@@ -97,7 +97,7 @@ def _rolling(state: Any, prepared: Any, speed: float) -> Any:
 
 
 def original(model: str, n: int = 1) -> FloatArray:
-    return np.repeat(SYSTEMS[model].characteristics.original[np.newaxis], n, axis=0)
+    return np.repeat(SYSTEMS[model].characteristics.original_settings, n, axis=0)
 
 
 def ends(model: str, name: str, points: int = 5) -> FloatArray:

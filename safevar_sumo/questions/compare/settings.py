@@ -251,7 +251,7 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
     # Lines from the original to sampled settings.
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))
-    starts = np.where(members.of_vehicle, members.original, ends)
+    starts = members.with_original_vehicle(ends)
     shares = np.full(len(ends), 0.5)
     step = 0.5
     rounds = list[Pairs]()

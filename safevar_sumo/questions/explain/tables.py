@@ -185,7 +185,7 @@ def causes_table(
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
-    causes, limits = printed_limits(Model(0, evaluator, unsafe), causes, limits)
+    printed = printed_limits(Model(0, evaluator, unsafe), causes, limits)
     elsewhere = np.zeros(len(causes), dtype=bool)
     if causes and study.scenario.search:
         at_original = [cause._replace(encounter={}) for cause in causes]
@@ -199,6 +199,7 @@ def causes_table(
             **solutions[["solution", "avoided_by"]].iloc[solution_of[index]],
             **causes[index]._asdict(),
             **limits[index]._asdict(),
+            **printed[index],
             "size": len(causes[index].changes),
             "elsewhere": bool(elsewhere[index]),
             "robust_share": robust[index],
@@ -215,47 +216,38 @@ def causes_table(
 
 def printed_limits(
     model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
-) -> tuple[list[Cause], list[Limits]]:
-    """Causes and their limits with boundaries and encounters as they are printed: rounded to the
-    unsafe side, with as many digits as the vehicle needs to be unsafe.
+) -> list[dict[str, dict[str, float]]]:
+    """The columns encounter, boundary and single_boundary of causes as they are printed: rounded to
+    the unsafe side, with as many digits as the vehicle needs to be unsafe.
     """
-    boundaries = [
-        cause._replace(changes=limit.boundary) for cause, limit in zip(causes, limits, strict=True)
-    ]
-    rounded = _as_unsafe(model, boundaries)
-    causes = [
-        cause._replace(encounter=one.encounter) for cause, one in zip(causes, rounded, strict=True)
-    ]
+    pairs = list(zip(causes, limits, strict=True))
+    printed = _as_printed(model, [limit.boundary | cause.encounter for cause, limit in pairs])
 
     # Each change alone at its boundary, in the printed encounter.
     alone = [
-        cause._replace(changes={**cause.changes, name: value})
-        for cause, limit in zip(causes, limits, strict=True)
+        values | cause.changes | {name: value}
+        for values, (cause, limit) in zip(printed, pairs, strict=True)
         for name, value in limit.single_boundary.items()
     ]
-    found = iter(_as_unsafe(model, alone))
-    return causes, [
-        limit._replace(
-            boundary=one.changes,
-            single_boundary={name: next(found).changes[name] for name in limit.single_boundary},
-        )
-        for one, limit in zip(rounded, limits, strict=True)
+    found = iter(_as_printed(model, alone))
+    return [
+        {
+            "encounter": {name: values[name] for name in cause.encounter},
+            "boundary": {name: values[name] for name in cause.changes},
+            "single_boundary": {name: next(found)[name] for name in cause.changes},
+        }
+        for values, cause in zip(printed, causes, strict=True)
     ]
 
 
-def _as_unsafe(model: Model, causes: Sequence[Cause]) -> list[Cause]:
-    """Causes with the values that `describe` prints, or with their own where it prints none."""
+def _as_printed(model: Model, vehicles: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """Values of vehicles, all else as in the original, as `describe` prints them, or as they are
+    where it prints none.
+    """
     members = model.evaluator.characteristics
-    settings = {str(row): one for row, one in enumerate(settings_of(members, causes))}
+    settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
     settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
-    rounded = []
-    for cause, setting in zip(causes, settings.values(), strict=True):
-        values = dict(zip(members.names, setting.tolist(), strict=True))
-        changes, encounter = (
-            {name: values[name] for name in part} for part in (cause.changes, cause.encounter)
-        )
-        rounded.append(cause._replace(changes=changes, encounter=encounter))
-    return rounded
+    return [members.named(one) for one in settings.values()]
 
 
 def _holding(

@@ -126,7 +126,7 @@ def rq33(case: Case) -> pd.DataFrame:
     """
     changes = changes_of(case, critical_solutions(case))
     vehicle = case.characteristics.vehicle
-    originals = dict(zip(vehicle.names, vehicle.original, strict=True))
+    originals = vehicle.named(vehicle.original)
     values = {
         (name, direction): np.where(np.sign(column) == sign, column, np.nan)
         for name, column in zip(originals, changes.T, strict=True)

@@ -289,11 +289,12 @@ def _test_opponents(
     samples = {**_samples(case, choices, over_runs), **further}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
     # causes.
-    metrics = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
-    further_ones = {name: better for name, better in BETTER.items() if (first, name) in samples}
+    directions = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
+    directions = MORE_IS_BETTER | directions | BETTER
     rows = []
-    directions = MORE_IS_BETTER | metrics | further_ones
     for baseline, (metric, more_is_better) in product(others, directions.items()):
+        if metric in BETTER and (first, metric) not in samples:
+            continue
         test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
         test = test.oriented(larger_is_better=more_is_better)
         runs = _finished_runs(case, first), _finished_runs(case, baseline)
@@ -365,11 +366,10 @@ def describe_runs_without_solutions(case: Case) -> str:
 
     # How many runs of each algorithm have solutions.
     found = case.solutions.groupby("algorithm")["run"].nunique()
-    counts = [(name, found.get(name, 0), _finished_runs(case, name)) for name in case.algorithms]
     texts = [
-        f"{case.title_of(name)} {number} of {runs}"
-        for name, number, runs in counts
-        if number < runs
+        f"{case.title_of(name)} {found.get(name, 0)} of {runs}"
+        for name in case.algorithms
+        if found.get(name, 0) < (runs := _finished_runs(case, name))
     ]
     if not texts:
         return ""
