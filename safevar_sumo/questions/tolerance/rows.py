@@ -204,7 +204,8 @@ def _broken_in_words(
                 break
         words = "the car is unsafe" if failure is None else failure.words
         value = end if failure is None else failure.setting[members.names.index(item.name)]
-        return f"{item.name} {limit_text(item, value)}: {words} (outside by {limit_text(item, round(by, 9))})"
+        outside = limit_text(item, round(by, 9))
+        return f"{item.name} {limit_text(item, value)}: {words} (outside by {outside})"
     assert together is not None
     model, setting = next(iter(together.broken.values()))
     found = describe(model, {item.name: setting}, together.specified)
