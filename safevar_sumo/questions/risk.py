@@ -163,12 +163,14 @@ def risk(
     verdict += deciding_in_words(table, failures)
     remarks = [criterion.remark, *counted_in_words(study, left_out), *constraints_in_words(study)]
     verdict = " ".join([verdict, *filter(None, remarks)])
+    has_shares = table.drop(columns="characteristic").notna().any(axis=None)
     return Answer(
         question="risk",
         study=study,
         verdict=verdict,
         numbers=numbers,
         tables={"sensitivity": table},
+        folded=() if has_shares else ("sensitivity",),
     )
 
 
