@@ -158,12 +158,14 @@ def risk(
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
+    has_shares = table.drop(columns="characteristic").notna().any(axis=None)
     return Answer(
         question="risk",
         study=study,
         verdict=with_scope(study, left_out, verdict, criterion.remark),
         numbers=numbers,
         tables={"sensitivity": table},
+        folded=() if has_shares else ("sensitivity",),
     )
 
 

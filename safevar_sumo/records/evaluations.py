@@ -130,6 +130,7 @@ class Evaluations:
             metrics={name: values[rows] for name, values in self.metrics.items()},
             cells=None if self.cells is None else self.cells.of(rows),
             worst_points=None if self.worst_points is None else self.worst_points[rows],
+            reasons=dict(self.reasons),  # user code has a view, which no process can send
         )
 
     @classmethod

@@ -53,12 +53,14 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
 @pytest.mark.parametrize("confidence", [0.9, 0.99])
 def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: float) -> None:
     """And that nothing decides: all vehicles of the plant have one safety degree."""
-    verdict = of(nowhere, samples=200, confidence=confidence).verdict
+    answer = of(nowhere, samples=200, confidence=confidence)
+    verdict = answer.verdict
     (told,) = re.findall(r"at most 0\.01 %, ([\d,]+) vehicles are needed of which", verdict)
     needed = int(told.replace(",", ""))
     highest = [clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)]
     assert highest[1] <= 1e-4 < highest[0]
     assert "No vehicle was found that changes the safety degree" in verdict
+    assert "What decides" not in answer.render("text"), "a table without a share"
     assert "No vehicle is unsafe" not in of(box, samples=200).verdict
 
 

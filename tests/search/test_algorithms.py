@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import zip_longest
@@ -17,6 +18,7 @@ from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.plugins import read_only
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.search.baselines import _Ranges
@@ -289,3 +291,9 @@ def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], m
 def test_options_change_what_a_search_asks_for(options: dict[str, object]) -> None:
     asked, usual = (list(begun(built("nsga2", **one), 1, 200)) for one in (options, {}))
     assert not np.array_equal(asked[-2], usual[-2])
+
+
+def test_what_user_code_was_sent_and_returns_can_go_to_another_process() -> None:
+    sent = read_only(dataclasses.replace(sphere(SUN, np.ones((2, len(SUN)))), reasons={b"1": "?"}))
+    returned = pickle.loads(pickle.dumps(sent.take([1])))
+    assert (len(returned), returned.reasons) == (1, {b"1": "?"})
