@@ -142,14 +142,11 @@ def compare(
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
-    of_originals, difference = compare_originals(evaluators, originals, criteria, titles[0])
-    differences = (
-        compare_counts(counts, titles[0]),
-        compare_limits(alone, evaluator.characteristics.vehicle.members),
-        difference,
-        compare_values(tested.quantity, tested.p, tested.a12),
-    )
-    difference = Difference.joined(differences)
+    of_originals, of_new_cars = compare_originals(evaluators, originals, criteria, titles[0])
+    of_counts = compare_counts(counts, titles[0])
+    of_limits = compare_limits(alone, evaluator.characteristics.vehicle.members)
+    of_values = compare_values(tested.quantity, tested.p, tested.a12)
+    difference = Difference.joined([of_counts, of_limits, of_new_cars, of_values])
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **_numbers(criteria[0], counts, tested, difference, alone["change"]),
