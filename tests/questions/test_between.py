@@ -114,7 +114,7 @@ def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
     options = ("--characteristics", names, "--attack", "1000")
     rows = [
         json_of("tolerance", name, *options, "--fits", fits)["tables"]["limits"]["rows"]
-        for fits in ("0", "2", "6", "12")
+        for fits in (("0", "2", "3") if name == "ahead.toml" else ("0", "2", "6", "12"))
     ]
     for fewer, more in pairwise(rows):
         for before, after in zip(fewer, more, strict=True):
@@ -122,10 +122,10 @@ def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
                 assert before[f"{kind}_low"] <= after[f"{kind}_low"]
                 assert before[f"{kind}_high"] >= after[f"{kind}_high"]
     if name == "ahead.toml":
-        check_at_whole_speeds(ahead, rows[-1])
+        check_at_whole_speeds(ahead, rows[-1], 3)
 
 
-def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]]) -> None:
+def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -> None:
     """Corners and random cars at whole speeds: what the original survives with a parameter set, all
     of them survive with it.
     """
@@ -142,7 +142,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]]) -> None:
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])
     (test,) = study.matrix.tests
     speeds = {"speed": [float(speed) for speed in range(50, 61)]}
-    for number, of_set in enumerate(studies_of_sets(study)):
+    for number, of_set in enumerate(studies_of_sets(study)[:fits]):
         model = Model(number, Evaluator(of_set, InlinePool(), verified=0), Unsafe())
         denser = with_tests(model, [msgspec.structs.replace(test, over=speeds)])
         for result in simulate_all_points(denser.evaluator.system, cars):

@@ -259,7 +259,7 @@ def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() 
     page = Path("page.html").read_text()
     replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)
     assert replays
-    assert all("in its encounter: collides" in one for one in replays)
+    assert all("in its encounter: collides" in one for one in replays), replays
     assert "Each vehicle drives in its own encounter (distance)" in page
     run("evidence", "results", "--out", "pack.zip", *ask)
     assert json_of("verify", "pack.zip")["numbers"]["differs"] == 0

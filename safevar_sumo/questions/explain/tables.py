@@ -10,6 +10,7 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.causes import (
+    BOUNDARIES,
     OTHER_SETS,
     Cause,
     Limits,
@@ -221,7 +222,18 @@ def printed_limits(
     the unsafe side, with as many digits as the vehicle needs to be unsafe.
     """
     pairs = list(zip(causes, limits, strict=True))
-    printed = _as_printed(model, [limit.boundary | cause.encounter for cause, limit in pairs])
+    exact = [limit.boundary | cause.encounter for cause, limit in pairs]
+    printed = _as_printed(model, exact)
+
+    # An encounter is rounded only where the whole changes are unsafe in it, too.
+    whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
+    members = model.evaluator.characteristics
+    settings = np.array([members.setting(one, beyond=True) for one in whole])
+    is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
+    printed = [
+        rounded if fails else rounded | values
+        for rounded, values, fails in zip(printed, exact, is_unsafe, strict=True)
+    ]
 
     # Each change alone at its boundary, in the printed encounter.
     alone = [

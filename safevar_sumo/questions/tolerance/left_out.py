@@ -75,9 +75,7 @@ def original_reach(evaluator: Evaluator, by: Parameter, unsafe: Unsafe) -> Origi
     study = evaluator.study
     contact = Unsafe(contact=unsafe.contact)
     if by.name not in study.scenario.search:
-        results = simulate_all_points(
-            evaluator.system, evaluator.characteristics.original_settings
-        )
+        results = simulate_all_points(evaluator.system, evaluator.characteristics.original_settings)
         runs = [(result.point, result.evaluations) for result in results]
         keeps = largest_tried(by, [(point, not unsafe.of(found)[0]) for point, found in runs])
         return OriginalReach(

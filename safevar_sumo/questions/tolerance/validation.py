@@ -114,7 +114,7 @@ class Validator:
             if validation.failures or not self.budget:
                 return validation
             worst = first[np.argsort(robustness, kind="stable")]
-            rng = Stream.JOINT_LIMITS.generator(self.seed, self.model.fit, attempt)
+            rng = Stream.JOINT_LIMITS.generator(self.seed, attempt, self.model.fit)
             validation = self._search(validation, worst[:KNOWN_BETWEEN], worst[:KNOWN], rng)
             if is_searched and not validation.failures:
                 validation, _ = self._test(validation, corners)
@@ -127,7 +127,7 @@ class Validator:
         box = validation.box
         corners = self._corners(box, attempt)
         rngs = [
-            Stream.VALIDATION.generator(self.seed, self.model.fit, attempt, number)
+            Stream.VALIDATION.generator(self.seed, attempt, number, self.model.fit)
             for number in range(confirmations if self.budget else 0)
         ]
         total = len(corners) + confirmations * self.budget
