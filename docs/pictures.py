@@ -37,7 +37,7 @@ COMMANDS = {
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
     "report.png": (
         f"{PROGRAM} study autoware_july --runs 1 --evaluations 100 --quiet && "
-        f"{PROGRAM} report results/autoware_july --ask 'tolerance --fits 0' --out page.html && "
+        f"{PROGRAM} report results/autoware_july --ask tolerance --out page.html && "
         f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null"
     ),
 }

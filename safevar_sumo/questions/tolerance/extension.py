@@ -105,7 +105,7 @@ class Extension:
     def cut(self, box: Box, clearance: float) -> Box:
         """The largest box within a box without its known failures that was found: they are cut off
         in several orders, first those that leave the least choice of a limit to move in. Limits
-        keep off failures by a `clearance`, as a share of a move.
+        keep off failures by a `clearance` above 0, as a share of a move.
         """
         search = self.search
         sides = search.sides_of(box)

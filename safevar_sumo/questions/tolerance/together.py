@@ -296,7 +296,7 @@ class JointSearch:
         extension = Extension(search)
         met = list[Model]()
         for attempt in range(MAX_CUTS):
-            box = extension.cut(outer, RETREAT_OF_SET * attempt)
+            box = extension.cut(outer, RETREAT_OF_SET * (attempt + 1))
             validation, proof = self._pass(validator, box, attempt)
             if not validation.failures:
                 passed = {**self.found.validations, model.fit: validation}
