@@ -294,6 +294,25 @@ class Limit(Table, frozen=True, kw_only=True):
         return low, high
 
 
+class UnmeasuredValue(Table, frozen=True, kw_only=True):
+    """The `value` of a characteristic of a vehicle in which it was not measured, in its unit;
+    `source` says where the value comes from, or that it is an assumption.
+    """
+
+    value: float
+    source: Annotated[str, Meta(max_length=400)] = ""
+
+
+def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:
+    """Refuse values of unknown characteristics, or outside of their domains."""
+    for name, value in values.items():
+        check_name("", f"unmeasured.{name}: there is no such characteristic", name, rows)
+        row = rows[name]
+        if not row.lower <= value <= row.upper:
+            legal = f"a number in [{row.lower:g}, {row.upper:g}]{unit_text(row.unit)}"
+            raise InputError("", f"unmeasured.{name} = {value:g} is outside its domain", legal)
+
+
 def limits_of(
     texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None
 ) -> dict[str, Limit]:

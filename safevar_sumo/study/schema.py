@@ -18,8 +18,10 @@ from safevar_sumo.study.characteristics import (
     Domain,
     Limit,
     PositiveNumber,
+    UnmeasuredValue,
     check_constraints,
     check_limits,
+    check_unmeasured,
     check_variation,
     mistake,
 )
@@ -324,9 +326,11 @@ class Study(Table, frozen=True, kw_only=True):
     for a vehicle that differs from the original by the full width of a domain; `variation` and
     `correlations` state how characteristics vary in the world, by name: uniformly by default;
     `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits`
-    are the values, by name, up to which characteristics may wear in service; `repair` states what a
-    repair of the ADS may change; `wider` names a study of the same vehicle in a wider scope, in
-    which limits are tried as well; `unsafe` is what the study calls so.
+    are the values, by name, up to which characteristics may wear in service; `unmeasured` are the
+    values, by name, of characteristics that were not measured in a vehicle, each a number or a
+    table: a study that extends this one does not inherit them; `repair` states what a repair of the
+    ADS may change; `wider` names a study of the same vehicle in a wider scope, in which limits are
+    tried as well; `unsafe` is what the study calls so.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
@@ -353,6 +357,7 @@ class Study(Table, frozen=True, kw_only=True):
     correlations: Annotated[list[Correlation], WITHOUT_EFFECT] = []
     constraints: list[Constraint] = []
     limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
+    unmeasured: Annotated[dict[str, float | UnmeasuredValue], WITHOUT_EFFECT, OF_STUDY] = {}
     repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
     wider: Annotated[str, WITHOUT_EFFECT, OF_STUDY] = ""
     unsafe: Annotated[UnsafeTable, WITHOUT_EFFECT] = UnsafeTable()
@@ -370,6 +375,7 @@ class Study(Table, frozen=True, kw_only=True):
         check_variation(self.domains, self.variation, self.correlations)
         check_constraints(self.domains, self.constraints)
         check_limits(rows, self.limits, table="limits.")
+        check_unmeasured(rows, self.unmeasured_values)
         if len({len(values) for values in self.spread.values()}) > 1 or not all(
             self.spread.values()
         ):
@@ -407,6 +413,14 @@ class Study(Table, frozen=True, kw_only=True):
     def domains(self) -> dict[str, Domain]:
         """What a search varies: the vehicle's characteristics, then parameters of the scenario."""
         return {**self.vehicle.characteristics, **self.scenario.search}
+
+    @property
+    def unmeasured_values(self) -> dict[str, float]:
+        """The values of `unmeasured`, without their sources."""
+        return {
+            name: one.value if isinstance(one, UnmeasuredValue) else one
+            for name, one in self.unmeasured.items()
+        }
 
     @property
     def source(self) -> str:

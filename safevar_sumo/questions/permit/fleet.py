@@ -1,0 +1,357 @@
+"""The list of cars of `permit`: a file, a frame, a mapping or typed values become vehicle settings;
+whatever cannot be read without doubt is refused before anything is simulated.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
+from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
+
+CAR = "car"
+"""Natural header of the column that names the cars, which the answer has, too."""
+NEW = "new"
+"""Value of `--others`: a characteristic without a value is as in the original vehicle."""
+TYPED, THIS_CAR = "--set", "this car"
+"""The option of typed values, and the name of the car that has them."""
+SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma"}
+"""Separators of columns: the first one that the header has outside of quotation marks is meant."""
+SEPARATOR_LINE = re.compile(r"sep=(.)\r?\n", re.IGNORECASE)
+"""First line of a file by which Excel knows the separator."""
+NUMBERS = {
+    ".": re.compile(NUMBER_PATTERN, re.ASCII),
+    ",": re.compile(NUMBER_PATTERN.replace(r"\.", ","), re.ASCII),
+}
+"""Numbers by their decimal mark."""
+
+
+class Fleet(NamedTuple):
+    """The cars of a list, in its order.
+
+    Attributes
+    ----------
+    names
+        Names of the cars.
+    settings
+        Values of all characteristics of the vehicle, in the study's order, shape (K, n).
+    measured
+        Which of them the list states, shape (K, n).
+    table
+        The list as it was given: all columns, as text.
+    """
+
+    names: list[str]
+    settings: FloatArray
+    measured: BoolArray
+    table: pd.DataFrame
+
+
+class _Cells(NamedTuple):
+    """A list as text: the place of its header and of each row in errors, and the separator of its
+    columns, empty if it is no file.
+    """
+
+    place: str
+    header: list[str]
+    places: list[str]
+    rows: list[list[str]]
+    separator: str = ""
+
+
+def read_fleet(
+    study: Study,
+    vehicle: CharacteristicSet,
+    cars: str | Path | pd.DataFrame | Mapping[Any, Any] | None,
+    values: Sequence[str],
+    *,
+    others: str | None,
+    ignore: Sequence[str],
+    answer_columns: Collection[str],
+) -> Fleet:
+    """Read a list of cars, or the values of one car.
+
+    Parameters
+    ----------
+    vehicle
+        The characteristics of the study's vehicle.
+    cars
+        A CSV file, a frame, or a mapping from a car's name to its values by characteristic; None
+        for the car that `values` describe. The first column of file and frame names the car.
+    values
+        Texts NAME=VALUE of one car.
+    others
+        "new" for the original's value where a characteristic has no value in the list and under
+        `[unmeasured]`; None to refuse such a list.
+    ignore
+        Columns that are not read.
+    answer_columns
+        Columns of the answer, whose names no column of the list has.
+
+    Raises
+    ------
+    InputError
+        If the list cannot be read, or has unknown columns, values that are no numbers, outside of
+        their domains or missing, cars that are twice or without a name, or cars that violate a
+        constraint.
+    """
+    if others not in (None, NEW):
+        raise InputError("--others", repr(others), NEW)
+    if cars is None:
+        with about(TYPED):
+            typed = {
+                name: one for name, (one,) in read_changes(values, vehicle, single=True).items()
+            }
+        cells = _cells_of_mapping({THIS_CAR: typed}, TYPED)
+    elif isinstance(cars, pd.DataFrame):
+        cells = _cells_of_frame(cars)
+    elif isinstance(cars, Mapping):
+        cells = _cells_of_mapping(cars, "cars")
+    else:
+        cells = _cells_of_file(Path(check_text("cars", cars)))
+    if not cells.rows:
+        raise InputError(cells.place, "no car", "at least one car")
+
+    # The columns, the names in the first one, and the values.
+    naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
+    names = _names(cells, naming)
+    settings, measured = _values(cells, columns, vehicle)
+    settings = _completed(cells, settings, study, vehicle, others)
+    _check_constraints(cells, settings, study, vehicle)
+    table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
+    return Fleet(names, settings, measured, table)
+
+
+def _cells_of_file(path: Path) -> _Cells:
+    """The cells of a CSV file, as Excel and others write it; `places` are numbers of lines."""
+    # A text in UTF-8.
+    try:
+        content = path.read_bytes()
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}"
+        raise InputError(path, problem, "a list of cars (CSV)") from None
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        expected = 'UTF-8; in Excel: save as "CSV UTF-8"'
+        raise InputError(f"{path}, line {line}", "is not encoded in UTF-8", expected) from None
+
+    # The separator, by Excel's first line or by the header.
+    stated = SEPARATOR_LINE.match(text)
+    lines = io.StringIO(text[stated.end() :] if stated else text, newline="")
+    first = 1 if stated else 0
+    head = re.sub('"[^"]*"', "", lines.readline())
+    lines.seek(0)
+    separator = stated[1] if stated else next((one for one in SEPARATORS if one in head), "")
+    place = f"{path}, line {first + 1}"
+    if separator not in SEPARATORS or separator not in head:
+        expected = f"a header with a {', '.join(SEPARATORS.values())} between its columns"
+        raise InputError(place, repr(head.strip()), expected)
+
+    # Records, each with its first line.
+    reader = csv.reader(lines, delimiter=separator, strict=True)
+    records = list[tuple[int, list[str]]]()
+    start = 0
+    try:
+        for record in reader:
+            records.append((first + start + 1, record))
+            start = reader.line_num
+    except csv.Error as error:
+        raise InputError(f"{path}, line {first + start + 1}", str(error), "CSV") from None
+    while len(records) > 1 and not any(cell.strip() for cell in records[-1][1]):
+        records.pop()
+    header = records[0][1]
+    for line, record in records:
+        if len(record) != len(header):
+            expected = f"{len(header)} fields, as in the header"
+            if len(record) > len(header) and separator == ",":
+                expected += "; a decimal comma is read only with semicolons between the columns"
+            raise InputError(f"{path}, line {line}", f"{len(record)} fields", expected)
+    places = [f"{path}, line {line}" for line, _ in records[1:]]
+    return _Cells(place, header, places, [record for _, record in records[1:]], separator)
+
+
+def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
+    """The cells of a frame, in which a missing value is an empty cell."""
+    rows = [
+        ["" if missing else _text(cell) for cell, missing in zip(row, empty, strict=True)]
+        for row, empty in zip(
+            frame.itertuples(index=False, name=None), frame.isna().to_numpy(), strict=True
+        )
+    ]
+    places = [f"cars, row {label}" for label in frame.index]
+    return _Cells("cars", [str(name) for name in frame.columns], places, rows)
+
+
+def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
+    """The cells of a mapping, in which None is an empty cell, as is a value that a car lacks."""
+    for car, values in cars.items():
+        if not isinstance(values, Mapping):
+            raise InputError(place, f"{car!r}: {values!r}", "a mapping of values by characteristic")
+    columns = list(dict.fromkeys(name for values in cars.values() for name in values))
+    rows = [
+        [_text(car), *(_text(values.get(name)) for name in columns)] for car, values in cars.items()
+    ]
+    places = [place if place == TYPED else f"{place}, {car!r}" for car in cars]
+    return _Cells(place, [CAR, *map(str, columns)], places, rows)
+
+
+def _text(cell: object) -> str:
+    """A value as text, a number with all its digits."""
+    if isinstance(cell, Real) and not isinstance(cell, bool):
+        return str(int(cell)) if isinstance(cell, Integral) else repr(float(cell))
+    return "" if cell is None else str(cell)
+
+
+def _columns(
+    cells: _Cells,
+    study: Study,
+    vehicle: CharacteristicSet,
+    ignore: Sequence[str],
+    answer_columns: Collection[str],
+) -> tuple[int, dict[int, int]]:
+    """The column that names the cars, and the numbers of characteristics by column."""
+    with about(cells.place):
+        # Columns that are read, by name and unit; the first one names the cars.
+        header = [text.strip() for text in cells.header]
+        for name in ignore:
+            check_name("", f"--ignore {name}: there is no such column", name, header)
+        names = [text if text in ignore else text.partition("[")[0].strip() for text in header]
+        read = [column for column, text in enumerate(header) if text not in ignore]
+        naming = read[0] if read else 0
+        is_one = names[naming] in vehicle.names
+        looks = "" if is_one else did_you_mean(names[naming], vehicle.names)
+        has_numbers = all(NUMBERS["."].fullmatch(row[naming].strip()) for row in cells.rows)
+        if not read or is_one or (looks and has_numbers):
+            problem = f"the first column is {header[naming]!r}"
+            raise InputError("", f"{problem}{looks}", "a first column that names the car")
+
+        # Each name once, and none that means something else.
+        tests = study.matrix.tests if study.matrix else []
+        varied = {*study.scenario.search, *(name for test in tests for name in test.over)}
+        for column, name in enumerate(names):
+            if names.count(name) > 1:
+                raise InputError("", f"the column {name!r} is there twice", "each column once")
+            if column in read and name in varied:
+                problem = f"the column {name!r} is a parameter that the study itself varies"
+                raise InputError("", problem, "characteristics of the vehicle, or --ignore")
+            if name in answer_columns and (column, name) != (naming, CAR):
+                problem = f"the column {name!r} has the name of a column of the answer"
+                raise InputError("", problem, "another name")
+        return naming, {
+            column: _characteristic(names[column], header[column], vehicle) for column in read[1:]
+        }
+
+
+def _characteristic(name: str, header: str, vehicle: CharacteristicSet) -> int:
+    """The number of the characteristic that a column's header names, with its unit or none."""
+    problem = f"the column {header!r} is no characteristic"
+    check_name("", problem, name, vehicle.names, "; --ignore leaves a column out")
+    number = vehicle.names.index(name)
+    unit = vehicle.members[number].unit
+    _, bracket, stated = header.partition("[")
+    if bracket and stated.removesuffix("]").strip() != unit:
+        raise InputError("", f"the column {header!r} has another unit", f"{name} [{unit}]")
+    return number
+
+
+def _names(cells: _Cells, naming: int) -> list[str]:
+    """The names of the cars."""
+    places = dict[str, str]()
+    for row, place in zip(cells.rows, cells.places, strict=True):
+        name = row[naming].strip()
+        with about(f"{place}, column {cells.header[naming].strip()!r}"):
+            if not name or not name.isprintable():
+                raise InputError("", f"{name!r} is no name of a car", "a text of one line")
+            if name in places:
+                first = f"a name that no other car has ({places[name]})"
+                raise InputError("", f"the car {name!r} is there twice", first)
+        places[name] = place
+    return list(places)
+
+
+def _values(
+    cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet
+) -> tuple[FloatArray, BoolArray]:
+    """The values of all cells, nan where one is empty, and which cells have one."""
+    # Commas are decimal marks of the whole file where semicolons separate its columns.
+    stated = [row[column].strip() for row in cells.rows for column in columns]
+    has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
+    mark = "," if cells.separator == ";" and has_commas else "."
+    settings = np.full((len(cells.rows), len(vehicle)), np.nan)
+    for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
+        for column, number in columns.items():
+            if text := row[column].strip():
+                with about(f"{place}, column {cells.header[column].strip()!r}"):
+                    setting[number] = _number(text, mark, vehicle.members[number])
+    return settings, ~np.isnan(settings)
+
+
+def _number(text: str, mark: str, characteristic: Characteristic) -> float:
+    """The value of a cell; refuses what is no number with the decimal mark, or outside of the
+    domain.
+    """
+    if not NUMBERS[mark].fullmatch(text):
+        domain = f"[{characteristic.lower:g}, {characteristic.upper:g}]{characteristic.suffix}"
+        marks = "a decimal comma, as others of the file" if mark == "," else "a decimal point"
+        if "," in text and mark != ",":
+            marks += "; a decimal comma is read only with semicolons between the columns"
+        problem = f"{text!r} is no number with {marks.partition(';')[0]}"
+        raise InputError("", problem, f"a number in {domain}, with {marks}")
+    value = float(text.replace(",", "."))
+    characteristic.check(value, switch="")
+    return value
+
+
+def _completed(
+    cells: _Cells,
+    settings: FloatArray,
+    study: Study,
+    vehicle: CharacteristicSet,
+    others: str | None,
+) -> FloatArray:
+    """Settings with the study's values of what was not measured, then the original's if the user
+    says so; whatever still lacks a value is refused.
+    """
+    unmeasured = study.unmeasured_values
+    stated = np.array([unmeasured.get(name, np.nan) for name in vehicle.names])
+    if others == NEW:
+        stated = np.where(np.isnan(stated), vehicle.original, stated)
+    settings = np.where(np.isnan(settings), stated, settings)
+    missing = np.isnan(settings)
+    if lacking := np.flatnonzero(missing.any(axis=1)).tolist():
+        names = ", ".join(vehicle.names[number] for number in np.flatnonzero(missing.any(axis=0)))
+        problem = f"no value of {names}, neither measured nor under [unmeasured] of the study"
+        if len(settings) > 1:
+            problem += f" ({len(lacking)} of {len(settings)} cars lack one)"
+        expected = "a value for each car, or --others new: as in the original vehicle"
+        raise InputError(cells.places[lacking[0]], problem, expected)
+    return settings
+
+
+def _check_constraints(
+    cells: _Cells, settings: FloatArray, study: Study, vehicle: CharacteristicSet
+) -> None:
+    """Refuse a car that violates a constraint among the vehicle's characteristics."""
+    with about(study.source):
+        region = region_of(study)
+    within = [one for one in region.bounds if {*one.constraint.sum} <= {*vehicle.names}]
+    region = replace(region, bounds=tuple(within))
+    cars = np.repeat(region.characteristics.original_settings, len(settings), axis=0)
+    cars[:, region.characteristics.of_vehicle] = settings
+    for car, place in zip(cars, cells.places, strict=True):
+        with about(place):
+            region.check(car[np.newaxis])
