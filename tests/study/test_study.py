@@ -136,6 +136,19 @@ def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> 
     assert read_study(tables_of(study)).limits == study.limits
 
 
+def test_what_was_not_measured_changes_no_result_and_is_not_inherited(in_tmp: Path) -> None:
+    stated = {"decel": {"value": 8, "source": "assumption"}, "mass": 1600}
+    study = read_study("native", unmeasured=stated)
+    assert study.unmeasured_values == {"decel": 8, "mass": 1600}
+    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(read_study("native")))
+    assert read_study(tables_of(study)).unmeasured == study.unmeasured
+    write_study(in_tmp / "mine.toml", study, "")
+    assert read_study("mine.toml").unmeasured == study.unmeasured
+    assert not read_study({"extends": "mine.toml", "name": "heir"}).unmeasured
+    for name in ("wear_joint", "wear_fleet"):
+        assert all(one.source for one in read_study(name).unmeasured.values())  # type: ignore[union-attr]
+
+
 def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
     study = read_study(

@@ -1,0 +1,180 @@
+"""Lists of cars are read alike in every dialect, and refused where they could be misread."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, strategies as st
+
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
+from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+JOINT = sv.load_study("wear_joint")
+LIMIT = [{"sum": {"payload": 1, "payloadCentre": -100}, "at_most": 200, "unit": "kg"}]
+BOUND = sv.load_study("wear_joint", constraints=LIMIT)
+UNMEASURED = ("brakeResponse", "payloadCentre", "sensorRange", "sensorLatency")
+MEASURED = ("treadDepth", "brakeTorque", "payload")
+DIALECTS = [
+    (separator, decimal, encoding, end)
+    for separator, decimal in ((",", "."), (";", "."), (";", ","))
+    for encoding, end in (("utf-8", "\n"), ("utf-8-sig", "\r\n"))
+]
+
+
+def read(cars: Any, *values: str, study: Study = JOINT, **options: Any) -> Fleet:
+    options = {"others": None, "ignore": (), **options}
+    vehicle = CharacteristicSet.of(study).vehicle
+    answer = ("car", "up_to", "verdict", "because")
+    return read_fleet(study, vehicle, cars, values, **options, answer_columns=answer)
+
+
+def written(folder: Path, text: str | bytes) -> Path:
+    path = folder / "fleet.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+@given(
+    rows=st.lists(
+        st.tuples(
+            st.text("aä0 ,;\"'=-", min_size=1).map(str.strip).filter(bool),
+            st.floats(1.6, 8.0),
+            st.floats(0.5, 1.0),
+            st.floats(75, 525),
+        ),
+        min_size=1,
+        unique_by=lambda row: row[0],
+    )
+)
+def test_a_frame_that_is_written_in_any_dialect_is_read_alike(
+    rows: list[Any], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    frame = pd.DataFrame(rows, columns=["plate", *MEASURED])
+    fleet = read(frame)
+    names = CharacteristicSet.of(JOINT).vehicle.names
+    columns = [names.index(name) for name in MEASURED]
+    assert fleet.names == list(frame["plate"])
+    assert np.array_equal(fleet.settings[:, columns], frame[list(MEASURED)].to_numpy())
+    assert set(np.flatnonzero(fleet.measured[0])) == set(columns)
+    path = tmp_path_factory.mktemp("fleet") / "fleet.csv"
+    for separator, decimal, encoding, end in DIALECTS:
+        frame.to_csv(
+            path, index=False, sep=separator, decimal=decimal, encoding=encoding, lineterminator=end
+        )
+        again = read(str(path))
+        assert again.names == fleet.names
+        assert np.array_equal(again.settings, fleet.settings)
+
+
+def test_cars_are_read_from_files_of_excel_frames_mappings_and_the_command_line(
+    tmp_path: Path,
+) -> None:
+    excel = (
+        "\ufeffsep=;\r\nplate;payload [kg];brakeTorque;note;treadDepth [mm]\r\n"
+        '007;75;0,9;"a;b";3,5\r\n8;75;1;;4\r\n;;;;\r\n\r\n'
+    )
+    fleet = read(written(tmp_path, excel), ignore=("note",))
+    assert fleet.names == ["007", "8"]
+    assert list(fleet.table) == ["plate", "payload [kg]", "brakeTorque", "note", "treadDepth [mm]"]
+    assert fleet.table["note"].tolist() == ["a;b", ""]
+    assert fleet.table["brakeTorque"].tolist() == ["0,9", "1"], "as it was given"
+    values = {"treadDepth": 3.5, "brakeTorque": 0.9, "payload": 75}
+    stated = {**values, **JOINT.unmeasured_values}
+    expected = [stated[name] for name in CharacteristicSet.of(JOINT).vehicle.names]
+    assert fleet.settings[0].tolist() == expected
+    assert dict(
+        zip(JOINT.vehicle.characteristics, fleet.measured[0], strict=True)
+    ) == dict.fromkeys(MEASURED, True) | dict.fromkeys(UNMEASURED, False)
+    typed = [f"{name}={value}" for name, value in values.items()]
+    for other in (read({"007": values}), read(None, *typed)):
+        assert other.settings.tolist() == [expected]
+    assert other.names == ["this car"]
+
+
+def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user_says_so() -> None:
+    frame = pd.DataFrame({"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": ["20", ""]})
+    told = r"row 0: no value of treadDepth, brakeTorque, payload, .* \(2 of 2 cars lack one\)"
+    with pytest.raises(InputError, match=told):
+        read(frame)
+    fleet = read(frame, others="new")
+    members = CharacteristicSet.of(JOINT).vehicle
+    first, second = map(members.named, fleet.settings)
+    originals = members.named(members.original)
+    assert (first["treadDepth"], first["sensorRange"]) == (3, 20)
+    assert second == {**originals, **JOINT.unmeasured_values}
+    assert fleet.measured.sum() == 2
+
+
+HEAD = "car,treadDepth,brakeTorque,payload\n"
+REFUSED = [
+    ("", "line 1: ''"),
+    (HEAD, "line 1: no car"),
+    ("car|treadDepth\na|3\n", "line 1: 'car|treadDepth'"),
+    ("sep=|\ncar|treadDepth\na|3\n", "line 2: 'car|treadDepth'"),
+    (HEAD.encode() + b"\xe4,3,1,75\n", "line 2: is not encoded in UTF-8"),
+    (HEAD + 'a,"3,1,75\n', "line 2: unexpected end"),
+    (HEAD + "a,3,1\n", "line 2: 3 fields"),
+    (HEAD + "a,3,1,75\n\nb,3,1,75\n", "line 3: 0 fields"),
+    (HEAD + "a,3,5,1,75\n", "decimal comma"),
+    (HEAD + 'a,"3,5",1,75\n', "line 2, column 'treadDepth': '3,5' is no number"),
+    (HEAD.replace(",", "\t") + "a\t3,5\t1\t75\n", "'3,5' is no number"),
+    (HEAD.replace(",", ";") + "a;3,5;0.9;75\n", "'0.9' is no number with a decimal comma"),
+    (HEAD.replace(",", ";") + "a;3;1;1.234,5\n", "'1.234,5' is no number"),
+    (HEAD.replace(",", ";") + "a;3;1;1,234.5\n", "'1,234.5' is no number"),
+    (HEAD + 'a,"1,234.5",1,75\n', "'1,234.5' is no number"),
+    *((f"{HEAD}a,{text},1,75\n", f"'{text}' is no number") for text in ("nan", "0x3", "1_0", "3m")),
+    (HEAD + "a,1e999,1,75\n", "treadDepth = inf"),
+    (HEAD + "a,9,1,75\n", "line 2, column 'treadDepth': treadDepth = 9.0 is outside its domain"),
+    (HEAD + "a,3,1,75\na,3,1,75\n", "line 3, column 'car': the car 'a' is there twice"),
+    (HEAD + " ,3,1,75\n", "'' is no name"),
+    (HEAD.replace("payload", "treadDepth [mm]") + "a,3,1,3\n", "'treadDepth' is there twice"),
+    (HEAD.replace("treadDepth", "treadDepth [in]") + "a,3,1,75\n", "treadDepth [mm]"),
+    (HEAD.replace("treadDepth", "treadDept") + "a,3,1,75\n", "did you mean 'treadDepth'?"),
+    (HEAD.replace("payload", "speed") + "a,3,1,40\n", "'speed' is a parameter"),
+    (HEAD.replace("payload", "up_to") + "a,3,1,40\n", "a column of the answer"),
+    ("plate,car,treadDepth\na,b,3\n", "a column of the answer"),
+    ("treadDepth,payload\n3,75\n", "the first column is 'treadDepth'"),
+    ("treadDept,payload\n3,75\n", "did you mean 'treadDepth'?"),
+    (pd.DataFrame({"treadDepth": [3]}, index=["a"]), "cars: the first column is 'treadDepth'"),
+    (pd.DataFrame({"car": ["a"], "treadDepth": [np.inf]}), "cars, row 0, column 'treadDepth'"),
+    ({"a": {"treadDepth": np.nan}}, "cars, 'a', column 'treadDepth': 'nan'"),
+    ({"a": {"treadDepth": True}}, "'True' is no number"),
+    ({7: {"treadDepth": 3}, "7": {"treadDepth": 3}}, "the car '7' is there twice"),
+    ({"a": 3}, "cars: 'a': 3"),
+    ({}, "cars: no car"),
+    (3, "cars: 3"),
+]
+
+
+@pytest.mark.parametrize(("cars", "told"), REFUSED, ids=[told for _, told in REFUSED])
+def test_what_may_be_misread_is_refused_with_its_place(
+    cars: Any, told: str, tmp_path: Path
+) -> None:
+    given_cars = written(tmp_path, cars) if isinstance(cars, str | bytes) else cars
+    with pytest.raises(InputError, match=re.escape(told)):
+        read(given_cars, others="new")
+
+
+def test_options_and_constraints_are_refused_too(tmp_path: Path) -> None:
+    path = written(tmp_path, HEAD + "a,3,1,75\nb,3,1,525\n")
+    for told, options in (
+        ("there is no such column; did you mean 'payload'?", {"ignore": ["payloa"]}),
+        ("--others: 'old'", {"others": "old"}),
+    ):
+        with pytest.raises(InputError, match=re.escape(told)):
+            read(path, **options)
+    told = r"line 3: violates a constraint: payload - 100 payloadCentre = 385 kg"
+    with pytest.raises(InputError, match=told):
+        read(path, study=BOUND, others="new")
+    with pytest.raises(InputError, match="--set: no value of brakeTorque, payload"):
+        read(None, "treadDepth=3")
+    with pytest.raises(InputError, match="cannot be read"):
+        read(tmp_path / "gone.csv")
