@@ -7,10 +7,11 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import zip_longest
 from pathlib import Path
-from shlex import split
+from shlex import join, split
 from typing import Any, NamedTuple
 
 import msgspec
@@ -52,6 +53,8 @@ from safevar_sumo.terminal import Progress
 STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
 """Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
+LISTS, CARS = "lists", "--cars"
+"""The folder of the lists of cars in a pack, and the option of a question that names one."""
 SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
 MALFORMED = (
     LookupError,
@@ -155,6 +158,12 @@ class Packed:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
 
+        # Each question about cars has its list in the pack.
+        named = [name for name in map(list_in, self.packed.questions) if name]
+        packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
+        if sorted(named) != sorted(packed):
+            raise ValueError(f"{LISTS}: {packed or 'nothing'} instead of {named or 'nothing'}")
+
     def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
         """Refuse a table of solutions with columns or rows that are missing, new or there twice."""
         expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {
@@ -181,9 +190,18 @@ class Packed:
             add_import_folders(self._places)
             shown = self.shown
             case = shown if has_criterion(text, self.packed.unsafe) else self.case
-            self._answers[text] = answer_to(
-                text, [case], [self._directory], None, self._jobs, self._progress
-            )
+            with temporary_folder() as folder:
+                placed = text
+                if name := list_in(text):
+                    path = Path(folder, name)
+                    path.parent.mkdir()
+                    path.write_bytes(self.files[name])
+                    placed = with_list(text, str(path))
+                answer = answer_to(
+                    placed, [case], [self._directory], None, self._jobs, self._progress
+                )
+            command = answer.command.replace(f"{folder}/", "")
+            self._answers[text] = replace(answer, command=command)
         return self._answers[text]
 
     def _answer_json(self, text: str) -> bytes:
@@ -284,6 +302,19 @@ class Packed:
             if ":" in name.partition(" ")[0]
         ]
         return [*files, *user_code_names(study), *named]
+
+
+def list_in(text: str) -> str:
+    """The list of cars that a question names; empty without one."""
+    words = split(text)
+    return words[words.index(CARS) + 1] if CARS in words else ""
+
+
+def with_list(text: str, path: str) -> str:
+    """A question that names a list of cars, about another list."""
+    words = split(text)
+    words[words.index(CARS) + 1] = path
+    return join(words)
 
 
 def read_table(content: bytes) -> pd.DataFrame:

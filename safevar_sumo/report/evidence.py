@@ -16,9 +16,10 @@ from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion, Jobs, with_criterion
+from safevar_sumo.questions.ask import Criterion, Jobs, parse_question, with_criterion
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.measure import cases_by
+from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import number_of
@@ -29,6 +30,7 @@ from safevar_sumo.report.claims import (
     CODE,
     DIFFERS,
     FILES,
+    LISTS,
     MALFORMED,
     PAGE,
     SAME,
@@ -40,7 +42,9 @@ from safevar_sumo.report.claims import (
     count_solutions,
     csv_of,
     json_bytes,
+    list_in,
     packed_answer,
+    with_list,
 )
 from safevar_sumo.report.pack import (
     DESCRIPTION,
@@ -67,6 +71,7 @@ def evidence(
     out: Path,
     ask: tuple[str, ...] = (),
     unsafe: Criterion = None,
+    with_names: bool = False,
     jobs: Jobs = None,
     progress: bool | Progress = False,
     fresh: bool = False,
@@ -86,6 +91,9 @@ def evidence(
     unsafe
         What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a
         metric such as "drac > 6".
+    with_names
+        Pack lists of cars as they are; by default the pack calls the cars "car 1", "car 2" and so
+        on, and leaves the columns that a question ignores empty.
     jobs
         Number of worker processes, by default one for each core.
     progress
@@ -114,7 +122,9 @@ def evidence(
     files = dict[str, bytes]()
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
+            described, own_files = _pack_study(
+                number, directory, ask, unsafe, with_names, jobs, show
+            )
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -126,6 +136,7 @@ def _pack_study(
     directory: Path,
     ask: Sequence[str],
     unsafe: str | None,
+    with_names: bool,
     jobs: int | None,
     progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
@@ -144,7 +155,7 @@ def _pack_study(
     # The questions, by the criterion that the user gave.
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
-    questions = list(dict.fromkeys(asked))
+    questions, lists = _with_lists(list(dict.fromkeys(asked)), with_names)
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
     described = PackedStudy(
@@ -153,11 +164,28 @@ def _pack_study(
 
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
-    files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **code}
+    files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
     show_part = partial(show_within, progress, study.name, 0.0, 1.0)
     packed = Packed(described, files, study.origin.places, jobs, show_part)
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
+
+
+def _with_lists(questions: Sequence[str], with_names: bool) -> tuple[list[str], dict[str, bytes]]:
+    """Questions about the lists of cars as a pack holds them, and these lists by their names in the
+    pack.
+    """
+    found = list[str]()
+    lists = dict[str, bytes]()
+    for text in questions:
+        if path := list_in(text):
+            name = f"{LISTS}/{len(lists) + 1}.csv"
+            ignored = parse_question(text)[1].get("ignore", ())
+            own = list_without_names(Path(path), ignored)
+            lists[name] = Path(path).read_bytes() if with_names else own
+            text = with_list(text, name)
+        found.append(text)
+    return found, lists
 
 
 def _files_of_user(
@@ -316,10 +344,11 @@ def _unpack(
         if name.startswith(prefix)
     }
     code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
+    lists = {name for name in own_files if name.startswith(f"{LISTS}/")}
 
     # Exactly the files of a study, readable, as the description says.
     try:
-        if wrong := FILES ^ (own_files.keys() - code.keys()):
+        if wrong := FILES ^ (own_files.keys() - code.keys() - lists):
             raise ValueError(
                 f"{min(wrong)} {'belongs to no claim' if min(wrong) in own_files else 'is missing'}"
             )

@@ -151,7 +151,7 @@ def _runs(
     )
 
 
-class Fleet(NamedTuple):
+class RoadVehicles(NamedTuple):
     """Vehicles on the road: their constants, their ADS and their first motion."""
 
     prepared: Prepared
@@ -159,7 +159,7 @@ class Fleet(NamedTuple):
     motion: VehicleStates
 
 
-def enter(system: System, settings: FloatArray, world: VehicleWorld) -> Fleet:
+def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehicles:
     """Put the vehicles of N settings, shape (N, n), onto the road."""
     vehicle = system.vehicle
     n = len(settings)
@@ -172,9 +172,11 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> Fleet:
     # Who drives: full braking, the driving system, or a controller that SUMO calls.
     ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
     if not isinstance(ads, TraciController):
-        return Fleet(prepared, ads, world.enter(types))
+        return RoadVehicles(prepared, ads, world.enter(types))
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
-    return Fleet(prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion)
+    return RoadVehicles(
+        prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion
+    )
 
 
 def _check_finite(

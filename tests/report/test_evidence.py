@@ -58,6 +58,23 @@ population = 5
 evaluations = 20
 runs = 1
 """
+OF_CARS = """
+import safevar_sumo as sv
+from safevar_sumo.questions.answer import Answer, contents
+from safevar_sumo.questions.permit.fleet import read_fleet
+
+
+@sv.question
+@contents()
+def named(subject, evaluator, *, cars: str | None = None, ignore: tuple[str, ...] = ()) -> Answer:
+    vehicle = evaluator.characteristics.vehicle
+    options = {"others": "new", "ignore": ignore, "answer_columns": ()}
+    fleet = read_fleet(evaluator.study, vehicle, cars, (), **options)
+    verdict = ", ".join(fleet.names)
+    return Answer(
+        question="of_cars:named", study=evaluator.study, verdict=verdict, numbers={}, tables={}
+    )
+"""
 DAMAGES = tomllib.loads(Path(__file__).with_name("damages.toml").read_text())["damage"]
 
 
@@ -218,6 +235,33 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
         command, capture_output=True, text=True, check=True
     )  # in a process that never had the module
     assert done.stdout.startswith("7 of 7 claims are the same")
+
+
+def test_a_pack_holds_a_list_of_cars_without_their_names_unless_it_is_told(
+    slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("of_cars.py").write_text(OF_CARS)
+    list_of_cars = "plate;mass;driver\nM-XY 1;2100,5;Ada\nM-XY 2;2200;Bob\n"
+    Path("fleet.csv").write_text(list_of_cars)
+    monkeypatch.syspath_prepend(str(in_tmp))
+    ask = "of_cars:named --cars fleet.csv --ignore driver"
+    for options, told, packed in (
+        ((), "car 1, car 2", ["plate;mass;driver", "car 1;2100,5;", "car 2;2200;"]),
+        (("--with-names",), "M-XY 1, M-XY 2", list_of_cars.splitlines()),
+    ):
+        run("evidence", str(slippery), "--ask", ask, "--out", "it.zip", *options)
+        texts = texts_of(Path("it.zip"))
+        (answer,) = json.loads(texts["1-slippery/answers.json"])
+        assert answer["verdict"] == told
+        assert "--cars lists/1.csv --ignore driver" in answer["command"]
+        assert texts["1-slippery/lists/1.csv"].decode().replace('"', "").splitlines() == packed
+        named = [name for name, text in texts.items() if b"M-XY" in text or b"Ada" in text]
+        assert bool(named) == bool(options)
+        assert len(verified("it.zip", "--run-code")) == 7
+    named_elsewhere = changed(
+        Path("it.zip"), Path("bad.zip"), DESCRIPTION, lambda text: text.replace("lists/1", "fleet")
+    )
+    refused("verify", named_elsewhere, "--run-code", message="1.csv")
 
 
 @pytest.mark.slow

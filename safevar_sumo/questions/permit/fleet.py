@@ -135,6 +135,23 @@ def read_fleet(
     return Fleet(names, settings, measured, table)
 
 
+def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
+    """A file as `read_fleet` reads it, with other names of its cars, and with empty cells in its
+    columns that are ignored.
+    """
+    cells = _cells_of_file(path)
+    is_read = [text.strip() not in ignore for text in cells.header]
+    text = io.StringIO()
+    writer = csv.writer(text, "unix", delimiter=cells.separator)
+    writer.writerow(cells.header)
+    for number, row in enumerate(cells.rows, 1):
+        kept = [cell if read else "" for cell, read in zip(row, is_read, strict=True)]
+        if any(is_read):
+            kept[is_read.index(True)] = f"{CAR} {number}"
+        writer.writerow(kept)
+    return text.getvalue().encode()
+
+
 def _cells_of_file(path: Path) -> _Cells:
     """The cells of a CSV file, as Excel and others write it; `places` are numbers of lines."""
     # A text in UTF-8.
