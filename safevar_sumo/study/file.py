@@ -280,7 +280,9 @@ def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stu
     dropped = [
         f"[{key}]"
         for key, value in base.tables.items()
-        if parts and isinstance(value, dict) and key not in tables
+        if parts
+        and isinstance(value, dict)
+        and key not in {*tables, *keys_with(OF_STUDY, Study)}  # which no study inherits
     ]
     if dropped:
         differences = " and a different ".join("ADS" if key == "ads" else key for key in parts)
