@@ -39,6 +39,7 @@ COMMANDS_BY_GROUP = {
     "Further questions": {
         "rules": "questions.rules:rules",
         "compare": "questions.compare:compare",
+        "permit": "questions.permit:permit",
         "repair": "questions.repair:repair",
         "rating": "questions.rating:rating",
     },

@@ -171,6 +171,8 @@ class Answer:
         Names of tables that readers see only if they ask for them; JSON and CSV have all.
     command
         The command line that gives this answer.
+    listing
+        What CSV has unless a table is named; by default the first table.
     draw
         Draws the answer; by default the values of the first table with their intervals.
     """
@@ -184,6 +186,7 @@ class Answer:
     folded: tuple[str, ...] = ()
     command: str = ""
     tested: str = ""
+    listing: pd.DataFrame | None = field(default=None, compare=False)
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
     def to_dict(self) -> JsonObject:
@@ -244,7 +247,8 @@ class Answer:
         """
         # A table as CSV, or the answer with this table alone.
         if form == "csv":
-            return self.table(table).map(csv_cell).to_csv(index=False, lineterminator="\n")
+            frame = self.table(table) if table or self.listing is None else self.listing
+            return frame.map(csv_cell).to_csv(index=False, lineterminator="\n")
         if table is not None:
             return self.only(table).render(form)
         if form == "json":

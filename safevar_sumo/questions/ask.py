@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
-    for name in ("compare", "explain", "rating", "repair", "risk", "rules", "tolerance")
+    for name in ("compare", "explain", "permit", "rating", "repair", "risk", "rules", "tolerance")
 } | {"validate": "safevar_sumo.reference.agreement"}
 """The module of each question, whose function has the question's name."""
 
@@ -76,6 +76,8 @@ Criterion = Annotated[str | None, CRITERION]
 metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
 setting collides, else half of the original's safety degree; of a rated study, any point lost.
 """
+CARS_FILE = "FILE.csv"
+"""A list of cars: its path, or in the library also a DataFrame or a mapping."""
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
@@ -142,7 +144,8 @@ class Option(NamedTuple):
             if twice := next((text for text in values if values.count(text) > 1), None):
                 raise InputError(self.name, f"{twice!r} is given twice", "each value once")
             return values
-        if value is None or self.kind is bool or self.metavar == CRITERION:
+        is_object = self.metavar == CARS_FILE and not isinstance(value, str)
+        if value is None or is_object or self.kind is bool or self.metavar == CRITERION:
             return value
         if self.kind not in (int, float):
             return check_text(self.name, value)

@@ -19,8 +19,8 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import searchable_in
-from safevar_sumo.study import Domain, MatrixTest
+from safevar_sumo.scenarios import Scenario, searchable_in
+from safevar_sumo.study import Domain, MatrixTest, Study
 from safevar_sumo.sumo.system import assemble
 
 DECIMALS = 2
@@ -137,19 +137,23 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
         return []
     tests = list[MovingTest]()
     for test, points in points_of_tests(study, assemble(study).points):
-        scenario = points[0].scenario
-        domains = {
-            name: Domain(
-                unit=searchable_in(scenario)[name].unit,
-                original=float(test.over[name][0]),
-                lower=float(min(test.over[name])),
-                upper=float(max(test.over[name])),
-            )
-            for name in moving_axes(study, test, scenario)
-        }
+        domains = domains_of_axes(study, test, points[0].scenario)
         if domains:
             tests.append(MovingTest(model, test, domains, new_car))
     return tests
+
+
+def domains_of_axes(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
+    """The axes of a test that move, each from its least to its greatest value."""
+    return {
+        name: Domain(
+            unit=searchable_in(scenario)[name].unit,
+            original=float(test.over[name][0]),
+            lower=float(min(test.over[name])),
+            upper=float(max(test.over[name])),
+        )
+        for name in moving_axes(study, test, scenario)
+    }
 
 
 def with_random_places(

@@ -56,7 +56,7 @@ def describe(
         rows = np.array(
             [as_printed(members, setting, further, within) for setting in waiting.values()]
         )
-        found = _failing(model, rows)
+        found = failures_at(model, rows)
         failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
         waiting = {name: setting for name, setting in waiting.items() if name not in failures}
     return failures
@@ -90,7 +90,7 @@ def as_printed(
     return printed
 
 
-def _failing(model: Model, settings: FloatArray) -> dict[int, Failure]:
+def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
     points = model.evaluator.system.points
     points = tuple(points[number] for number in model.points) or points

@@ -39,6 +39,7 @@ class Stream(IntEnum):
     VALIDATION = 15  # further falsifications of joint limits that passed one
     ORDERS_OF_CUTS = 16  # orders in which counterexamples are cut off a box
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
+    PERMIT = 18  # falsification of the speed up to which a car may drive
 
     def generator(self, seed: int, *counts: int) -> np.random.Generator:
         """The generator of a draw, by the seed of the study's search and what counts the draws."""

@@ -1,0 +1,250 @@
+"""May this car drive? For each of several measured cars the greatest speed up to which it is safe
+in every encounter of the study, in every parameter set, whether or not the original is safe there.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+
+from safevar_sumo.errors import InputError, about
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.output import check_writable, whole_file
+from safevar_sumo.questions.answer import Answer, contents
+from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
+from safevar_sumo.questions.permit.answer import PermitAnswer
+from safevar_sumo.questions.permit.encounters import Span, span_of
+from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
+from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
+from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch
+from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study, limits_of, unit_text
+from safevar_sumo.vehicles import CharacteristicSet
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
+
+MOST_VALUES = 10_000
+"""Largest number of values of a grid."""
+NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
+ALL_CARS = "all cars within these limits"
+"""How the only row is called that stands for limits."""
+
+
+@question
+@contents(
+    *("unsafe", "margin", "scope", "cars", "drive", "limited", "stop", "fits", "attacked"),
+    *("step", "need", "not_driven_above", "rough"),
+    cars=CARS,
+    sets=SETS,
+)
+def permit(
+    subject: Study | Case,
+    evaluator: Evaluator,
+    *,
+    cars: Annotated[Any, CARS_FILE] = None,
+    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
+    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    others: Literal["new"] | None = None,
+    ignore: Annotated[tuple[str, ...], "COLUMN"] = (),
+    need: Annotated[str | None, '"50 km/h"'] = None,
+    by: Annotated[str | None, "NAME"] = None,
+    step: Annotated[float, Range(0, 1000, is_open=True)] = 1.0,
+    margin: Margin = None,
+    unsafe: Criterion = None,
+    fits: Annotated[int | None, Range(0, 1000)] = None,
+    attack: Annotated[int, Range(1000, 100_000_000)] = LEAST_SIMULATIONS,
+    quick: bool = False,
+    out: Annotated[str | None, "FILE.csv"] = None,
+) -> Answer:
+    """Find the greatest speed up to which each of several measured cars is safe.
+
+    Up to this speed a car is safe in every encounter of the study, in every parameter set of the
+    vehicle model, whether or not the original vehicle is safe there. Unless --unsafe says
+    otherwise, it keeps the margin with the study's own parameter set, and touches nobody with any
+    other.
+
+    Parameters
+    ----------
+    cars
+        A list of measured cars, as CSV: the first column names the car, each other one is a
+        characteristic in the study's unit.
+    set
+        A value that was measured on a single car, in place of a list; may be repeated.
+    limits
+        All cars within limits such as "treadDepth >= 3", in place of a list; may be repeated.
+    others
+        What a characteristic is that was not measured, and for which the study states no value
+        under [unmeasured]: as in a new car. Without this option it is an error.
+    ignore
+        A column of the list that is no characteristic; may be repeated.
+    need
+        A speed that the cars have to drive, with its unit; exit code 3 if one of them may not.
+    by
+        Another searched parameter, or axis of the matrix, in place of the speed.
+    step
+        Distance of the speeds that are tried, to which the answer is rounded down.
+    margin
+        Clearance that every car must keep with the study's own parameter set [m], as in
+        `tolerance`.
+    unsafe
+        What is unsafe: a collision, a safety degree below X, or a metric beyond a limit.
+    fits
+        Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
+    attack
+        Number of simulations for each car and parameter set that search for an unsafe encounter up
+        to the speed found.
+    quick
+        A rough answer: the speeds of the grid alone, without this search and without repairs. No
+        car may drive without a limit.
+    out
+        A file for the list of cars, in the order of the input and with all its columns.
+    """
+    study = evaluator.study
+    span = span_of(study, by)
+    needed = _needed(need, span)
+    values = _grid(span, step)
+    members = evaluator.characteristics.vehicle
+    _check_forms(cars, set, limits, out)
+    fleet = read_cars(study, cars, set, limits, others, ignore)
+    asked = [Cars.one(setting) for setting in fleet.settings]
+    if limits:
+        asked = [_within(members, limits, study, fleet.settings[0])]
+    models = models_of(
+        evaluator, _criterion(evaluator, unsafe, margin), fits, with_unsafe_originals=True
+    )
+    search = PermitSearch(models, span, values, 0 if quick else attack)
+    repairs = [] if quick or limits else [REPAIR_STAGE]
+    evaluator.plan({**dict.fromkeys(search.stages(), 1.0), **dict.fromkeys(repairs, 6.0)})
+    new_car, *permits = search.reach(
+        [Cars.one(members.original), *asked], [-np.inf, *[None] * len(asked)]
+    )
+    if new_car.up_to is None:
+        words = failures_in_words([new_car.least.failure])[0].sentence
+        problem = f"the new car is not safe at {span.low:g}{unit_text(span.unit)}: {words}"
+        raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
+    repaired: list[tuple[int, Permit] | None] = [None] * len(permits)
+    if repairs:
+        repaired = search.repair_first(fleet.settings, fleet.measured, members.original, permits)
+    result = PermitAnswer(
+        study=study,
+        span=span,
+        need=needed,
+        step=step,
+        models=models,
+        search=search,
+        new_car=new_car,
+        is_quick=quick,
+        is_box=bool(limits),
+    )
+    answer = result.of(fleet, permits, repaired)
+    if out is not None:
+        with whole_file(Path(out), "out") as file:
+            file.write_text(answer.render("csv"), encoding="utf-8")
+    return answer
+
+
+def read_cars(
+    study: Study,
+    cars: Any,
+    values: Sequence[str],
+    limits: Sequence[str],
+    others: str | None,
+    ignore: Sequence[str],
+) -> Fleet:
+    """The cars that are asked for; with limits one car at the original's values of those that are
+    limited, and at the stated ones of all others.
+    """
+    members = CharacteristicSet.of(study).vehicle
+    if limits:
+        rows = study.vehicle.characteristics
+        with about("limits"):
+            names = limits_of(limits, rows)
+        cars = {ALL_CARS: {name: rows[name].original for name in names}}
+    columns = [column for column in CARS if column != "car"]
+    return read_fleet(
+        study, members, cars, values, others=others, ignore=ignore, answer_columns=columns
+    )
+
+
+def _check_forms(
+    cars: object, values: Sequence[str], limits: Sequence[str], out: str | None
+) -> None:
+    """Refuse several forms of cars, and none; and a file that is to be written in place of the
+    list.
+    """
+    given = [
+        flag
+        for flag, value in (("--cars", cars is not None), ("--set", values), ("--limits", limits))
+        if value
+    ]
+    if len(given) != 1:
+        raise InputError(
+            "permit", f"{join_phrases(given) or 'no car'} given", "--cars, --set or --limits"
+        )
+    if out is None:
+        return
+    path = Path(out)
+    if isinstance(cars, str | Path) and path.exists() and path.samefile(cars):
+        raise InputError("out", f"{out} is the list itself", "another file")
+    check_writable(path, "out", (".csv",))
+
+
+def _needed(text: str | None, span: Span) -> float | None:
+    """The value that an option needs, in the study's unit."""
+    if text is None:
+        return None
+    match = NEED.fullmatch(text)
+    if (
+        match is None
+        or (match[2] or "") != span.unit
+        or not span.low <= float(match[1]) <= span.high
+    ):
+        example = f"{span.high:g} {span.unit}".strip()
+        legal = f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"'
+        raise InputError("need", repr(text), legal)
+    return float(match[1])
+
+
+def _grid(span: Span, step: float) -> FloatArray:
+    """The ends of the range, and all multiples of the step between them."""
+    if (span.high - span.low) / step > MOST_VALUES:
+        legal = f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}"
+        raise InputError("step", f"{step:g}", legal)
+    first, last = np.floor(span.low / step), np.ceil(span.high / step)
+    multiples = np.round(step * np.arange(first, last + 1), 9)
+    inside = multiples[(multiples > span.low) & (multiples < span.high)]
+    return np.unique([span.low, *inside, span.high])
+
+
+def _within(
+    members: CharacteristicSet, limits: Sequence[str], study: Study, others: FloatArray
+) -> Cars:
+    """All cars within limits, with stated values of all other characteristics."""
+    lower, upper = others.copy(), others.copy()
+    for name, limit in limits_of(limits, study.vehicle.characteristics).items():
+        column = members.names.index(name)
+        item = members.members[column]
+        lower[column] = item.lower if limit.at_least is None else limit.at_least
+        upper[column] = item.upper if limit.at_most is None else limit.at_most
+    return Cars.within(lower, upper, study.search.seed)
+
+
+def _criterion(evaluator: Evaluator, unsafe: str | None, margin: float | None) -> Unsafe:
+    """What is unsafe: the stated criterion, or else a collision or less than the margin."""
+    criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
+    check_margin(criterion, margin)
+    criterion = replace(criterion, contact=evaluator.system.contact)
+    if not criterion.is_collision or (margin is None and unsafe is not None):
+        return criterion
+    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))

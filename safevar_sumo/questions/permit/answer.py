@@ -1,0 +1,201 @@
+"""The answer to the question which cars may drive: its verdict, its numbers, its tables, and the
+list that fleet software reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.permit.encounters import Span
+from safevar_sumo.questions.permit.fleet import Fleet
+from safevar_sumo.questions.permit.rows import (
+    CARS,
+    DRIVE,
+    LIMITED,
+    SETS,
+    STOP,
+    because,
+    failures_in_words,
+    set_rows,
+    verdict_of,
+)
+from safevar_sumo.questions.permit.search import Permit, PermitSearch
+from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.up_to import study_up_to
+from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.results import identity_digest
+from safevar_sumo.study import Study, unit_text
+from safevar_sumo.sumo.system import assemble
+
+DIGEST = "study_digest"
+"""The column of the list that holds the digest of the study, its models and versions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PermitAnswer:
+    """What an answer is made of, beside its rows."""
+
+    study: Study
+    span: Span
+    need: float | None
+    step: float
+    models: Models
+    search: PermitSearch
+    new_car: Permit
+    is_quick: bool
+    is_box: bool
+
+    def of(
+        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
+    ) -> Answer:
+        """The answer about the cars of a list, in its order, each with its best repair."""
+        span = self.span
+        rows = self._rows(fleet, permits, repaired)
+        cars = tabulate("The cars, those that stop first", _in_unit(CARS, span), rows)
+        counts = {
+            verdict: int((cars["verdict"] == verdict).sum()) for verdict in (DRIVE, LIMITED, STOP)
+        }
+        too_slow = 0
+        if self.need is not None:
+            too_slow = int((~(cars["up_to"].astype(float) >= self.need)).sum())
+        ordered = cars.sort_values("up_to", kind="stable", na_position="first", ignore_index=True)
+        ordered.attrs = cars.attrs
+        unit = unit_text(span.unit)
+        scope = scope_of(study_up_to(self.study, f"{span.name}={span.high!r}"))
+        own = self.models.own.unsafe
+        slower = f"{number_of(too_slow, 'car')} may not drive {self.need or 0:g}{unit}"
+        return Answer(
+            question="permit",
+            study=self.study,
+            verdict=" ".join(self._sentences(len(rows), counts, too_slow, scope)),
+            tested=self._tested(),
+            numbers={
+                "unsafe": str(own),
+                "margin": own.keep,
+                "scope": scope,
+                "cars": len(rows),
+                **{name: counts[verdict] for name, verdict in NUMBERS.items()},
+                "fits": len(self.models.members),
+                "attacked": self.search.attacked,
+                "step": self.step,
+                "need": self.need,
+                "not_driven_above": span.high,
+                "rough": self.is_quick,
+            },
+            tables={
+                "cars": ordered,
+                "sets": tabulate(
+                    "By parameter set",
+                    _in_unit(SETS, span),
+                    set_rows(fleet.names, permits, with_car=self.is_box),
+                ),
+            },
+            folded=("sets",),
+            failures=(slower,) if too_slow else (),
+            listing=self._listing(cars, fleet),
+        )
+
+    def _rows(
+        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
+    ) -> list[tuple[Any, ...]]:
+        """A row of `CARS` for each car, in the order of the list."""
+        names = self.models.own.evaluator.characteristics.names
+        new_car = self.new_car.up_to
+        assert new_car is not None
+        words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)
+        is_proven = not self.is_quick
+        rows = list[tuple[Any, ...]]()
+        for name, permit, found, best in zip(fleet.names, permits, words, repaired, strict=True):
+            verdict = verdict_of(
+                permit.up_to, new_car, self.span.high, self.need, is_proven=is_proven
+            )
+            reason = because(permit, found, verdict, self.span, new_car, self.need)
+            after = (None, None) if best is None else (names[best[0]], best[1].up_to)
+            least = permit.least
+            fit = None if least.failure is None else least.fit
+            rows.append(
+                (
+                    *(name, permit.up_to, new_car, self.span.unit, verdict, reason),
+                    *(found.test, found.encounter, found.outcome, fit, *after),
+                )
+            )
+        return rows
+
+    def _sentences(
+        self, number: int, counts: Mapping[str, int], too_slow: int, scope: str
+    ) -> list[str]:
+        """The verdict: how many cars may drive, what is safe, and what was not driven."""
+        span = self.span
+        unit = unit_text(span.unit)
+        top = f"{span.high:g}{unit}"
+        as_new = f"the new car may drive up to {self.new_car.up_to:g}{unit}"
+        goal = top if self.need is None else f"{self.need:g}{unit}"
+        drive = f"{counts[DRIVE]} may drive {goal}, or as fast as the new car"
+        parts = [
+            *([drive] if not self.is_quick else []),
+            f"{counts[LIMITED]} up to a lower {span.name.replace('_', ' ')}",
+            f"{counts[STOP]} not even {span.low:g}{unit}",
+        ]
+        sentences = [f"Of {number_of(number, 'car')}, {join_phrases(parts)} ({as_new})."]
+        if self.need is not None:
+            sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
+        sentences.append(f"Safe means: {self._safe_in_words()}.")
+        if span.ending:
+            tests = join_phrases(span.ending)
+            sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")
+        if span.left_out:
+            sentences.append(
+                f"Not driven, as they begin above {top}: {join_phrases(span.left_out)}."
+            )
+        return [*sentences, f"Scope: {scope}."]
+
+    def _safe_in_words(self) -> str:
+        """What a safe car does, with the study's own parameter set and with the others."""
+        own = self.models.own.unsafe
+        others = len(self.models.members) - 1
+        if not own.is_collision:
+            return f"not {own.description}, in {number_of(others + 1, 'parameter set')}"
+        if not own.keep:
+            return f"no contact, in {number_of(others + 1, 'parameter set')}"
+        rest = f", and no contact with {number_of(others, 'other')}" if others else ""
+        return (
+            f"no contact and {own.keep:g} m of clearance with the study's own parameter set{rest}"
+        )
+
+    def _tested(self) -> str:
+        values = self.search.values
+        unit = unit_text(self.span.unit)
+        grid = (
+            f"{len(values)} values from {values[0]:g} to {values[-1]:g}{unit}, in every test alone"
+        )
+        attacked = f"{self.search.attacked:,} simulations that search for an unsafe encounter"
+        return f"{grid}; {'no search beside them' if self.is_quick else attacked}."
+
+    def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
+        """The list: the columns of the input, then those of the answer, in the input's order."""
+        manifest = manifest_now(self.study, assemble(self.study))
+        listing = pd.concat([fleet.table.reset_index(drop=True), cars.drop(columns="car")], axis=1)
+        listing[DIGEST] = identity_digest(manifest)[:12]
+        return listing
+
+
+NUMBERS = {"drive": DRIVE, "limited": LIMITED, "stop": STOP}
+"""The numbers that count cars, by what they may do."""
+
+
+def _in_unit(columns: Columns, span: Span) -> Columns:
+    """Columns with the unit of the parameter."""
+    named = dict(columns)
+    for name in ("up_to", "new_car_up_to", "up_to_after_repair"):
+        column = columns.get(name)
+        if isinstance(column, Column):
+            named[name] = column._replace(unit=span.unit)
+    return named

@@ -1,0 +1,260 @@
+"""The encounters of each test of a study, over a parameter such as the speed: every test is driven
+alone, and counts whether or not the original vehicle is safe in it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.errors import InputError, SimulationError, check_name
+from safevar_sumo.questions.between import domains_of_axes
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.sampling import sobol_points
+from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import assemble
+
+SPREAD_PLACES = 6
+"""Number of Sobol points over the other parameters that a vehicle meets at each speed."""
+MOST_ENDS = 4
+"""Number of them of whose ends all combinations are met, too, each with ends of the others."""
+MOST_VEHICLES = 16
+"""Number of vehicles that stand for a box at each of these places."""
+
+
+class Span(NamedTuple):
+    """The parameter over which vehicles are driven: its name and unit, the range that is driven,
+    from the least value to the least of the tests' greatest ones, and what ends there.
+
+    Attributes
+    ----------
+    ending
+        The names of the tests that end at `high`, where others go on.
+    left_out
+        The names of the tests that begin above `high`, and are not driven.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    ending: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+
+class EncounterRange(NamedTuple):
+    """The encounters of a test alone, with one parameter set.
+
+    Attributes
+    ----------
+    test
+        The name of the test; "" without a matrix.
+    model
+        The parameter set, with a study that has this test alone, and searches what may vary in it.
+    column
+        The column of the parameter in a setting; None where it has one value.
+    low, high
+        The range of the parameter; minus infinity where the test has no such parameter, and counts
+        at every value.
+    """
+
+    test: str
+    model: Model
+    column: int | None
+    low: float
+    high: float
+
+    @property
+    def number_of_characteristics(self) -> int:
+        return len(self.model.evaluator.characteristics.vehicle)
+
+    def box(self, lower: FloatArray, upper: FloatArray, up_to: float) -> Box | None:
+        """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
+        None where there is nothing to search: no such encounter, or one vehicle in one.
+        """
+        members = self.model.evaluator.characteristics
+        count = len(lower)
+        ends = (
+            np.concatenate([lower, members.lower[count:]]),
+            np.concatenate([upper, members.upper[count:]]),
+        )
+        if self.column is not None:
+            ends[1][self.column] = min(up_to, self.high)
+        if self.low > up_to or (ends[0] == ends[1]).all():
+            return None
+        return Box(self.model.evaluator.region, *ends)
+
+    def values_in(self, settings: FloatArray) -> FloatArray:
+        """The value of the parameter in each of M settings, shape (M,)."""
+        if self.column is None:
+            return np.full(len(settings), self.low)
+        return settings[:, self.column]
+
+    def places(self, value: float, attempt: int) -> FloatArray:
+        """Encounters at a value of the parameter, as they are printed, shape (P, searched
+        parameters): Sobol points and ends of all others; in another `attempt` there are others.
+        """
+        members = self.model.evaluator.characteristics
+        count = self.number_of_characteristics
+        others = [at for at in range(count, len(members)) if at != self.column]
+        points = unit_places(len(others), value, attempt)
+        settings = np.zeros((len(points), len(members)))
+        lower, upper = members.lower[others], members.upper[others]
+        settings[:, others] = lower + points * (upper - lower)
+        if self.column is not None:
+            settings[:, self.column] = value
+        return self.as_printed(settings)[:, count:]
+
+    def as_printed(self, settings: FloatArray) -> FloatArray:
+        """Settings with the encounters' values rounded as they are printed."""
+        members = self.model.evaluator.characteristics
+        rounded = settings.copy()
+        for column in range(self.number_of_characteristics, len(members)):
+            item = members.members[column]
+            values = np.round(settings[:, column], item.digits)
+            rounded[:, column] = np.clip(values, item.lower, item.upper)
+        return rounded
+
+    def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
+        """What settings leave to the limit, shape (M,), in encounters as they are printed.
+
+        Raises
+        ------
+        SimulationError
+            If one cannot be simulated: then no car may be called safe.
+        """
+        rows = self.as_printed(settings)
+        evaluations = self.model.evaluate(rows, stage)
+        if evaluations.failed.any():
+            row = int(np.argmax(evaluations.failed))
+            reason = evaluations.reason(row)
+            raise SimulationError(f"a car cannot be simulated in test {self.test!r}: {reason}")
+        robustness = self.model.robustness_by(evaluations)
+        return np.where(self.model.evaluator.region.feasible(rows), robustness, np.inf)
+
+
+@lru_cache(maxsize=4096)
+def unit_places(dimensions: int, value: float, attempt: int) -> FloatArray:
+    """Sobol points and corners in the unit cube, shape (P, dimensions), for a value of a parameter
+    and an attempt.
+    """
+    if not dimensions:
+        return np.zeros((1, 0))
+    seed = zlib.crc32(np.array([value, attempt]).tobytes())
+    corners = np.array([*product((0.0, 1.0), repeat=min(dimensions, MOST_ENDS))])
+    others = dimensions - corners.shape[1]
+    further = np.random.default_rng(seed).integers(0, 2, size=(len(corners), others))
+    spread = sobol_points(SPREAD_PLACES, dimensions, seed)
+    return np.concatenate([spread, np.hstack([corners, further])])
+
+
+def span_of(study: Study, by: str | None) -> Span:
+    """The parameter that is chosen, by default the speed, and the range that all tests share.
+
+    Raises
+    ------
+    InputError
+        If the study has no such parameter; the candidates are named.
+    """
+    matrix = study.matrix
+    if matrix is not None and matrix.protocol:
+        problem = f"study {study.name!r} is rated, and drives each test at speeds of its own"
+        raise InputError(study.source, problem, "a study that is not rated")
+    points = assemble(study).points
+    tests = [] if matrix is None else points_of_tests(study, points)
+    axes = {
+        test.name: {name: values for name, values in test.over.items() if _are_numbers(values)}
+        for test, _ in tests
+    }
+    of_axes = [name for over in axes.values() for name in over]
+    candidates = [*dict.fromkeys([*study.scenario.search, *of_axes])]
+    name = by or SPEED_DIMENSION
+    if by is None and name not in candidates:
+        problem = f"study {study.name!r} varies no {name}, so a parameter has to be chosen by --by"
+        raise InputError("by", problem, ", ".join(candidates) or "a study that varies a speed")
+    check_name("by", f"study {study.name!r} varies no {name}", name, candidates)
+
+    # A searched parameter has one range for all tests.
+    domain = study.scenario.search.get(name)
+    if domain is not None:
+        return Span(name, domain.unit, domain.lower, domain.upper)
+
+    # An axis ends at the least of the tests' greatest values.
+    ends = {
+        test: (float(min(over[name])), float(max(over[name])))
+        for test, over in axes.items()
+        if name in over
+    }
+    high = min(last for _, last in ends.values())
+    scenario = next(own[0].scenario for test, own in tests if name in axes[test.name])
+    searchable = searchable_in(scenario)
+    goes_on = any(last > high for _, last in ends.values())
+    return Span(
+        name=name,
+        unit=searchable[name].unit if name in searchable else "",
+        low=min(low for low, _ in ends.values()),
+        high=high,
+        ending=tuple(test for test, (_, last) in ends.items() if goes_on and last == high),
+        left_out=tuple(test for test, (low, _) in ends.items() if low > high),
+    )
+
+
+def _are_numbers(values: list[float | str]) -> bool:
+    return all(type(value) in (int, float) for value in values)
+
+
+def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
+    """The encounters of each test of a model alone, up to the end of the range that is driven."""
+    ranges = list[EncounterRange]()
+    for test, alone, fixed in _tests_alone(model.evaluator.study, span.name):
+        evaluator = model.evaluator.for_study(alone, verified=0)
+        members = evaluator.characteristics
+        low = high = fixed
+        column = None
+        if span.name in alone.scenario.search:
+            column = members.names.index(span.name)
+            low, high = float(members.lower[column]), float(members.upper[column])
+        if low <= span.high:
+            # At points that are selected no original decides whether an encounter counts.
+            own = Model(model.fit, evaluator, model.unsafe, points=(0,))
+            ranges.append(EncounterRange(test, own, column, low, min(high, span.high)))
+    return ranges
+
+
+def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
+    """Each test of a study at each combination of its axes that do not move, as a study of its own
+    that searches those that do; with its name and its value of a parameter, minus infinity where it
+    has none.
+    """
+    matrix = study.matrix
+    if matrix is None:
+        yield "", study, -np.inf
+        return
+    for test, points in points_of_tests(study, assemble(study).points):
+        domains = domains_of_axes(study, test, points[0].scenario)
+        fixed = {name: values for name, values in test.over.items() if name not in domains}
+        weathers = [[weather] for weather in test.weathers] or [[]]
+        for weather, *place in product(weathers, *fixed.values()):
+            over = dict(zip(fixed, place, strict=True))
+            of_axes = {name: [value] for name, value in over.items()}
+            alone = replace_in(test, over=of_axes, weathers=weather)
+            searched = {**study.scenario.search, **domains}
+            yield (
+                test.name,
+                replace_in(
+                    study,
+                    matrix=replace_in(matrix, tests=[alone], point=""),
+                    scenario=replace_in(study.scenario, search=searched),
+                ),
+                float(over[by]) if by in over else -np.inf,
+            )

@@ -1,0 +1,144 @@
+"""The rows of the answer: what each car may drive, and why no faster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.counterexamples import failures_at
+from safevar_sumo.questions.permit.encounters import Span
+from safevar_sumo.questions.permit.search import Permit
+from safevar_sumo.questions.permit.speeds import LimitingFailure
+from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
+from safevar_sumo.scenarios import searchable_in
+from safevar_sumo.study import unit_text
+
+DRIVE, LIMITED, STOP = "drive", "up to", "stop"
+"""Verdicts: as fast as was driven, as is needed, or as the new car; up to a speed; not at all."""
+CARS: Columns = {
+    "car": "name of the car",
+    "up_to": Column("", "greatest value up to which it is safe", ".10g", head="may drive up to"),
+    "new_car_up_to": Column("", "that of the new car", ".10g", is_shown=False),
+    "unit": Column("", "unit of these values", is_shown=False),
+    "verdict": "drive, up to, or stop",
+    "because": "why no faster",
+    "test": Column("", "the test that limits it", is_shown=False),
+    "encounter": Column("", "the encounter in which it is unsafe", is_shown=False),
+    "outcome": Column("", "what happens there", is_shown=False),
+    "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
+    "repair_first": "the measured characteristic that, as new again, raises the value most",
+    "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
+}
+SETS: Columns = {
+    "car": "name of the car",
+    "fit": Column("-", "number of the parameter set in [spread]; 0 is the study's own", "d"),
+    "up_to": Column("", "greatest value up to which it is safe with this set", ".10g"),
+    "test": "the test that limits it",
+    "encounter": "the encounter in which it is unsafe",
+    "outcome": "what happens there",
+}
+
+
+class FailureInWords(NamedTuple):
+    """A failure: its test, its encounter, what happens, and a sentence without its end."""
+
+    test: str | None = None
+    encounter: str | None = None
+    outcome: str | None = None
+    sentence: str = ""
+
+
+def failures_in_words(
+    failures: Sequence[LimitingFailure | None], *, with_car: bool = False
+) -> list[FailureInWords]:
+    """Failures, simulated once more as they are printed; `with_car` names the car's values, too."""
+    found = [FailureInWords()] * len(failures)
+    of_range = dict[int, list[int]]()
+    for number, failure in enumerate(failures):
+        if failure is not None:
+            of_range.setdefault(id(failure.encounters), []).append(number)
+    for numbers in of_range.values():
+        known = [failure for number in numbers if (failure := failures[number]) is not None]
+        model = known[0].encounters.model
+        members = model.evaluator.characteristics
+        point = model.evaluator.system.points[0]
+        rows = np.array([failure.setting for failure in known])
+        described = failures_at(model, rows)
+        runs = model.evaluate(rows, "what fails first")
+        for row, number in enumerate(numbers):
+            setting = rows[row]
+            words = described[row].words.partition(" (parameter set")[0]
+            if with_car:
+                values = dict(zip(members.vehicle.names, setting.tolist(), strict=False))
+                changes = change_texts(members.vehicle, values, are_printed=True)
+                words = f"with {join_phrases(changes or ['no change'])}, {words}"
+            axes = {
+                name: value
+                for name, value in point.parameters
+                if name not in ("test", "weather") and name not in members.names
+            }
+            units = searchable_in(point.scenario)
+            numbers_of = {**axes, **members.scenario.named(setting[~members.of_vehicle])}
+            texts = [
+                f"{name} {value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
+                if isinstance(value, int | float)
+                else f"{name} {value}"
+                for name, value in numbers_of.items()
+            ]
+            found[number] = FailureInWords(
+                test=known[row].encounters.test or None,
+                encounter=", ".join(texts) or None,
+                outcome=model.unsafe.breach_in_words(runs.take(np.array([row]))),
+                sentence=words,
+            )
+    return found
+
+
+def verdict_of(
+    up_to: float | None, new_car: float, top: float, need: float | None, *, is_proven: bool
+) -> str:
+    """What a car may do; without a falsification none may drive without a limit."""
+    if up_to is None:
+        return STOP
+    is_enough = up_to >= min(top if need is None else need, top, new_car)
+    return DRIVE if is_enough and is_proven else LIMITED
+
+
+def because(
+    permit: Permit,
+    words: FailureInWords,
+    verdict: str,
+    span: Span,
+    new_car: float,
+    need: float | None,
+) -> str:
+    """Why a car may drive no faster, in one sentence for a foreman."""
+    unit = unit_text(span.unit)
+    up_to = permit.up_to
+    if up_to is None:
+        return f"Not even at {span.low:g}{unit}: {words.sentence}."
+    if not words.sentence:
+        return f"Safe up to {up_to:g}{unit}, the greatest value that was driven."
+    sentence = words.sentence[:1].upper() + words.sentence[1:]
+    if verdict != DRIVE:
+        return f"{sentence}."
+    if need is not None and up_to >= need:
+        return f"Safe up to {up_to:g}{unit}, and {need:g}{unit} is needed."
+    return f"As fast as the new car, which is safe up to {new_car:g}{unit}: {words.sentence}."
+
+
+def set_rows(
+    names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
+) -> list[tuple[Any, ...]]:
+    """The rows of `SETS`."""
+    reached = [
+        (name, each) for name, permit in zip(names, permits, strict=True) for each in permit.reached
+    ]
+    words = failures_in_words([each.failure for _, each in reached], with_car=with_car)
+    return [
+        (name, each.fit, each.up_to, found.test, found.encounter, found.outcome)
+        for (name, each), found in zip(reached, words, strict=True)
+    ]

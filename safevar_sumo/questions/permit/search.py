@@ -1,0 +1,209 @@
+"""The greatest speeds of cars in all parameter sets, and the repair that raises a speed most."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.permit.encounters import EncounterRange, Span, ranges_of
+from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
+from safevar_sumo.records import BoolArray, FloatArray
+
+REPAIR_STAGE = "cars with one part as new"
+
+
+class Reached(NamedTuple):
+    """How far a car is safe in a parameter set: the greatest value, None if it is not safe at the
+    least; and the failure that limits it, if one was found.
+    """
+
+    fit: int
+    up_to: float | None
+    failure: LimitingFailure | None
+
+
+class Permit(NamedTuple):
+    """What is known of a car: how far it is safe in each parameter set."""
+
+    reached: Sequence[Reached]
+
+    @property
+    def least(self) -> Reached:
+        """The parameter set that limits it most."""
+        return min(self.reached, key=lambda each: _order(each.up_to))
+
+    @property
+    def up_to(self) -> float | None:
+        return self.least.up_to
+
+    @property
+    def order(self) -> float:
+        """What decides which of two values is greater."""
+        return _order(self.up_to)
+
+
+def _order(value: float | None) -> float:
+    """Values in their order; None, of a car that is not safe at all, is the least."""
+    return -np.inf if value is None else value
+
+
+class PermitSearch:
+    """The search for the greatest values of a parameter up to which cars are safe.
+
+    Attributes
+    ----------
+    values
+        The values of the grid.
+    attacked
+        Number of simulations of the falsification so far.
+    """
+
+    def __init__(self, models: Models, span: Span, values: FloatArray, budget: int) -> None:
+        self.values = values
+        self.attacked = 0
+        self._models = models
+        self._span = span
+        self._budget = budget
+        self._ranges = dict[int, list[EncounterRange]]()
+        self._models_in_order = [*models.members]
+
+    def stages(self) -> list[str]:
+        """The phases of progress."""
+        return [self._stage(model.fit) for model in self._models.members]
+
+    def _stage(self, fit: int) -> str:
+        return f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"
+
+    def reach(
+        self, cars: Sequence[Cars], above: Sequence[float | None], stage: str = ""
+    ) -> list[Permit]:
+        """How far each of the cars is safe, whichever others are asked for with it.
+
+        A car of which only the least value counts, where it is `above` one, is driven no further
+        in a parameter set than in those before, and in no further set once it is not.
+        """
+        found = list[list[Reached]]([] for _ in cars)
+        top = float(self.values[-1])
+        for model in self._models_in_order:
+            # The cars that are still of interest, and how far.
+            permits = [Permit(reached) for reached in found]
+            waiting = [
+                car
+                for car, permit in enumerate(permits)
+                if not permit.reached or (least := above[car]) is None or permit.order > least
+            ]
+            caps = [
+                permits[car].order if found[car] and above[car] is not None else top
+                for car in waiting
+            ]
+            if not waiting:
+                break
+            if model.fit not in self._ranges:
+                self._ranges[model.fit] = ranges_of(model, self._span)
+            name = stage or self._stage(model.fit)
+            search = SpeedSearch(
+                self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name
+            )
+            with model.evaluator.stage(name):
+                search.drive_grid()
+                if self._budget:
+                    search.falsify(self._budget)
+            self.attacked += search.attacked
+            for number, car in enumerate(waiting):
+                failure = search.failures[number]
+                found[car].append(Reached(model.fit, search.up_to(number), failure))
+        return [Permit(reached) for reached in found]
+
+    def repair_first(
+        self,
+        settings: FloatArray,
+        measured: BoolArray,
+        original: FloatArray,
+        permits: Sequence[Permit],
+    ) -> list[tuple[int, Permit] | None]:
+        """For each of K cars, shape (K, n), the measured characteristic that, as in the original,
+        raises its value most, with the car as it is then; None where no single one does.
+
+        A repaired car first meets the encounters that limit the car, or another repair: what it
+        could reach at most decides which repair is driven next, and whether another one is at all.
+        """
+        # First the parameter sets that limit most cars.
+        limiting = Counter(permit.least.fit for permit in permits)
+        self._models_in_order.sort(key=lambda model: -limiting[model.fit])
+        top = float(self.values[-1])
+        bounds = list[dict[int, float]]()
+        failures = list[list[LimitingFailure]]()
+        best = list[tuple[int, Permit] | None]([None] * len(settings))
+        for row, permit in enumerate(permits):
+            worn = np.flatnonzero(measured[row] & (settings[row] != original))
+            is_limited = permit.up_to is None or permit.up_to < top
+            bounds.append(dict.fromkeys(worn.tolist() if is_limited else [], np.inf))
+            failures.append([each.failure for each in permit.reached if each.failure is not None])
+        while any(bounds):
+            self._lower(bounds, failures, settings, original)
+            # The most promising repair of each car, unless a better one is known.
+            chosen = dict[int, int]()
+            for row, of_car in enumerate(bounds):
+                known = self._best_of(permits[row], best[row]).order
+                for column in [column for column, most in of_car.items() if most <= known]:
+                    del of_car[column]
+                if of_car:
+                    chosen[row] = max(of_car, key=of_car.__getitem__)
+                    del of_car[chosen[row]]
+            cars = [
+                Cars.one(_with_original(settings[row], column, original))
+                for row, column in chosen.items()
+            ]
+            above = [self._best_of(permits[row], best[row]).order for row in chosen]
+            driven = self.reach(cars, above, REPAIR_STAGE) if cars else []
+            for (row, column), permit, known in zip(chosen.items(), driven, above, strict=True):
+                if permit.order > known:
+                    best[row] = column, permit
+                failures[row] = [
+                    each.failure for each in permit.reached if each.failure is not None
+                ]
+        return best
+
+    def _best_of(self, permit: Permit, repaired: tuple[int, Permit] | None) -> Permit:
+        """A car with its best repair so far, or as it is."""
+        return permit if repaired is None else repaired[1]
+
+    def _lower(
+        self,
+        bounds: Sequence[dict[int, float]],
+        failures: Sequence[Sequence[LimitingFailure]],
+        settings: FloatArray,
+        original: FloatArray,
+    ) -> None:
+        """Lower what each repair could reach at most, by the failures of other cars that it does
+        not avoid.
+        """
+        rows = dict[int, list[tuple[int, int, float, FloatArray]]]()
+        ranges = {id(each): each for of_fit in self._ranges.values() for each in of_fit}
+        for row, of_car in enumerate(bounds):
+            for failure in failures[row]:
+                for column in of_car:
+                    setting = failure.setting.copy()
+                    setting[: len(original)] = _with_original(settings[row], column, original)
+                    rows.setdefault(id(failure.encounters), []).append(
+                        (row, column, failure.value, setting)
+                    )
+        for number, of_range in rows.items():
+            driven = np.array([setting for _, _, _, setting in of_range])
+            robustness = ranges[number].robustness(driven, REPAIR_STAGE)
+            for (row, column, value, _), left in zip(of_range, robustness.tolist(), strict=True):
+                if left < 0:
+                    below = self.values[self.values < value]
+                    most = float(below[-1]) if len(below) else -np.inf
+                    bounds[row][column] = min(bounds[row][column], most)
+
+
+def _with_original(setting: FloatArray, column: int, original: FloatArray) -> FloatArray:
+    """A car with one of its characteristics as in the original."""
+    repaired = setting.copy()
+    repaired[column] = original[column]
+    return repaired

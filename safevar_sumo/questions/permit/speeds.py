@@ -1,0 +1,258 @@
+"""The search for the greatest value of a parameter, such as the speed, up to which each of several
+cars is safe with one parameter set.
+
+First all cars meet the encounters of a grid. Then a falsification searches the encounters below
+what was found for each of them. Nothing is assumed to be monotone: one failure at 33 km/h means "up
+to 32".
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.falsify import falsify_all
+from safevar_sumo.questions.permit.encounters import MOST_VEHICLES, EncounterRange
+from safevar_sumo.questions.sampling import Stream, sobol_points
+from safevar_sumo.records import FloatArray
+
+BLOCK = 8
+"""Number of values of the grid that cars meet before those that failed are left out; more for few
+cars.
+"""
+EFFICIENT = 512
+"""Number of cars times values that fill a batch: a smaller one costs hardly less."""
+KEPT = 32
+"""Number of the worst encounters of the grid with which the falsification of a car begins."""
+GENERATIONS = 2
+"""Number of generations of a falsification."""
+LEAST_BUDGET = 64
+"""Fewest simulations of a falsification of one car in one test."""
+SPREAD = 128
+"""Number of cars that stand for all within limits, beside those at their corners."""
+
+
+class Cars(NamedTuple):
+    """A car, or all cars within limits.
+
+    Attributes
+    ----------
+    lower, upper
+        The least and greatest values of the vehicle's characteristics, shape (n,).
+    vehicles
+        The cars that meet the encounters of the grid, shape (V, n).
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    vehicles: FloatArray
+
+    @classmethod
+    def one(cls, values: FloatArray) -> Cars:
+        """A car with these values of its characteristics."""
+        return cls(values, values, values[np.newaxis])
+
+    @classmethod
+    def within(cls, lower: FloatArray, upper: FloatArray, seed: int) -> Cars:
+        """All cars within limits: those at Sobol points and at as many corners drive the grid."""
+        points = sobol_points(SPREAD, len(lower), seed)
+        points = np.concatenate([np.round(points), points])
+        return cls(lower, upper, np.unique(lower + points * (upper - lower), axis=0))
+
+    @property
+    def number(self) -> int:
+        """A number by which random numbers of these cars are drawn: it does not depend on others
+        that are asked for with them.
+        """
+        return zlib.crc32(np.concatenate([self.lower, self.upper]).tobytes())
+
+
+class LimitingFailure(NamedTuple):
+    """The unsafe encounter at the least value of the parameter that was found: the value, the test,
+    the setting, shape (n,), and what it leaves to the limit.
+    """
+
+    value: float
+    encounters: EncounterRange
+    setting: FloatArray
+    robustness: float
+
+
+class SpeedSearch:
+    """The search with one parameter set.
+
+    Attributes
+    ----------
+    failures
+        The limiting failure of each of the cars; None where none was found.
+    attacked
+        Number of simulations of the falsification.
+
+    A car is driven no further than up to its cap, the greatest value that is of interest.
+    """
+
+    def __init__(
+        self,
+        ranges: Sequence[EncounterRange],
+        cars: Sequence[Cars],
+        values: FloatArray,
+        caps: Sequence[float],
+        stage: str,
+    ) -> None:
+        self.failures: list[LimitingFailure | None] = [None] * len(cars)
+        self.attacked = 0
+        self._ranges = ranges
+        self._cars = cars
+        self._values = values
+        self._caps = caps
+        self._stage = stage
+        self._met: list[list[list[tuple[FloatArray, FloatArray]]]] = [
+            [[] for _ in ranges] for _ in cars
+        ]
+
+    def up_to(self, car: int) -> float | None:
+        """The greatest value of the grid below the limiting failure of a car, at most its cap; None
+        if it fails at the least.
+        """
+        failure = self.failures[car]
+        is_safe = self._values <= self._caps[car]
+        if failure is not None:
+            is_safe &= self._values < failure.value
+        return float(self._values[is_safe][-1]) if is_safe.any() else None
+
+    def drive_grid(self) -> None:
+        """Have all cars meet the encounters of the grid, from low values to high ones, each up to
+        the first block in which it fails.
+        """
+        rest = self._values
+        while len(rest):
+            alive = [
+                car
+                for car, found in enumerate(self.failures)
+                if found is None and rest[0] <= self._caps[car]
+            ]
+            size = max(BLOCK, EFFICIENT // max(len(alive), 1))
+            block, rest = rest[:size], rest[size:]
+            for number, encounters in enumerate(self._ranges):
+                places = self._places(encounters, block)
+                if places and alive:
+                    self._drive(number, alive, np.concatenate(places))
+
+    def _places(self, encounters: EncounterRange, block: FloatArray) -> list[FloatArray]:
+        """The encounters of a test at the values of a block. The least value of a test, which may
+        be its only one, is driven with the next value of the grid.
+        """
+        begin = max(encounters.low, self._values[0])
+        next_value = self._values[np.searchsorted(self._values, begin)]
+        values = [begin] if next_value in block else []
+        if encounters.column is not None:
+            values += [v for v in block.tolist() if encounters.low < v <= encounters.high]
+        return [encounters.places(value, 0) for value in values]
+
+    def _drive(self, number: int, cars: Sequence[int], places: FloatArray) -> None:
+        """Have cars meet encounters of a test, and keep what they met and what fails."""
+        encounters = self._ranges[number]
+        rows = [self._settings(car, places) for car in cars]
+        robustness = encounters.robustness(np.concatenate(rows), self._stage)
+        ends = np.cumsum([len(of_car) for of_car in rows])[:-1]
+        for car, own, left in zip(cars, rows, np.split(robustness, ends), strict=True):
+            self._note(car, encounters, own, left)
+            self._met[car][number].append((own, left))
+
+    def _worst(self, car: int, number: int, box: Box) -> FloatArray:
+        """The worst encounters of a test that a car has met within a box."""
+        met = self._met[car][number]
+        settings = np.concatenate([np.zeros((0, len(box.lower))), *(own for own, _ in met)])
+        robustness = np.concatenate([np.zeros(0), *(left for _, left in met)])
+        is_inside = box.holds(settings) & np.isfinite(robustness)
+        order = np.argsort(robustness[is_inside], kind="stable")
+        return np.asarray(settings[is_inside][order][:KEPT])
+
+    def _at_value(self, car: int, number: int, attempt: int) -> FloatArray:
+        """A car in other encounters of a test at its value."""
+        encounters = self._ranges[number]
+        up_to = self.up_to(car)
+        assert up_to is not None
+        return self._settings(car, encounters.places(min(up_to, encounters.high), attempt))
+
+    def _settings(self, car: int, places: FloatArray) -> FloatArray:
+        """The settings in which the vehicles of a car meet encounters, some of them in each."""
+        vehicles = self._cars[car].vehicles
+        many = min(len(vehicles), MOST_VEHICLES)
+        chosen = np.arange(many * len(places)) % len(vehicles)
+        return np.hstack([vehicles[chosen], np.repeat(places, many, axis=0)])
+
+    def _note(
+        self, car: int, encounters: EncounterRange, settings: FloatArray, robustness: FloatArray
+    ) -> bool:
+        """Keep the failure of a car at the least value, of several the worst; whether it fails."""
+        failing = np.flatnonzero(robustness < 0)
+        if not len(failing):
+            return False
+        values = encounters.values_in(settings[failing])
+        first = np.lexsort((robustness[failing], values))[0]
+        row = failing[first]
+        found = float(values[first]), float(robustness[row])
+        known = self.failures[car]
+        if known is None or found < (known.value, known.robustness):
+            self.failures[car] = LimitingFailure(found[0], encounters, settings[row], found[1])
+        return True
+
+    def falsify(self, budget: int) -> None:
+        """Search encounters of each car up to its value, with a budget for each, until nothing is
+        found.
+
+        A test without a failure up to some value has none up to a lower one, so only those that
+        fail are searched again. What is found is a value of the grid, at which all tests were
+        driven.
+        """
+        cars = range(len(self._cars))
+        waiting = [[car for car in cars if self.up_to(car) is not None] for _ in self._ranges]
+        attempt = 0
+        while any(waiting):
+            attempt += 1
+            waiting = [
+                self._falsify_test(number, of_test, budget, attempt)
+                for number, of_test in enumerate(waiting)
+            ]
+
+    def _falsify_test(
+        self, number: int, waiting: Sequence[int], budget: int, attempt: int
+    ) -> list[int]:
+        """Falsify that cars are safe in a test up to their values; those that are not."""
+        encounters = self._ranges[number]
+        boxes = dict[int, Box]()
+        for car in waiting:
+            up_to = self.up_to(car)
+            own = self._cars[car]
+            box = None if up_to is None else encounters.box(own.lower, own.upper, up_to)
+            if box is not None:
+                boxes[car] = box
+        if not boxes:
+            return []
+
+        # All cars side by side, each first in its worst encounters, and at its value elsewhere.
+        known = [
+            [np.concatenate([self._worst(car, number, box), self._at_value(car, number, attempt)])]
+            for car, box in boxes.items()
+        ]
+        stream = encounters.model.fit, number, attempt
+        rngs = [Stream.PERMIT.generator(self._cars[car].number, *stream) for car in boxes]
+        share = max(budget // len(self._ranges), LEAST_BUDGET)
+        judge = partial(encounters.robustness, stage=self._stage)
+        generation = max(share // GENERATIONS, LEAST_BUDGET)
+        failing = list[int]()
+        for car, found in zip(
+            boxes,
+            falsify_all([*boxes.values()], [judge], known, share, rngs, generation),
+            strict=True,
+        ):
+            self.attacked += found.simulated
+            settings = encounters.as_printed(found.settings)
+            failing += [car] if self._note(car, encounters, settings, found.robustness) else []
+        return failing

@@ -1,0 +1,255 @@
+"""Which cars may drive, and how fast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.permit import permit
+from safevar_sumo.questions.permit.encounters import EncounterRange, ranges_of, span_of
+from safevar_sumo.questions.permit.search import PermitSearch
+from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool, json_of, printed_by, refused
+
+SHORT = """
+extends = "wear_joint"
+name = "short"
+title = "A child from behind a parked car on a wet road"
+[scenario.search]
+speed           = { unit = "km/h", original = 34, lower = 34, upper = 45, meaning = "speed" }
+impact_location = { unit = "%",    original = 50, lower = 25, upper = 75, meaning = "location" }
+[[matrix.tests]]
+name = "CPNCO"
+parameters = { test = "CPNCO" }
+[unmeasured]
+payloadCentre = 1.4
+sensorRange = { value = 80, source = "assumption" }
+"""
+FLEET = """car;note;treadDepth [mm];brakeTorque;payload;brakeResponse;sensorLatency
+new;bought "today";8;1;75;0,1;0,05
+007;;3;1;75;0,1;0,05
+slow;;1,6;0,5;525;0,4;0,4
+"""
+
+
+@pytest.fixture
+def short(in_tmp: Path) -> Study:
+    Path("short.toml").write_text(SHORT)
+    Path("fleet.csv").write_text(FLEET)
+    return load_study("short.toml")
+
+
+def are_unsafe(
+    study: Study, fit: int, cars: FloatArray, values: FloatArray, keep: float
+) -> BoolArray:
+    """Second computation: which cars are unsafe at each speed, shape (cars, speeds), at 21 impact
+    locations in any test alone, whether or not the original is safe there.
+    """
+    found = np.zeros((len(cars), len(values)), dtype=bool)
+    own = studies_of_sets(study)[fit]
+    assert own.matrix is not None
+    places = np.linspace(25, 75, 21)
+    for test in own.matrix.tests:
+        alone = msgspec.structs.replace(own.matrix, tests=[test])
+        system = assemble(msgspec.structs.replace(own, matrix=alone))
+        grid = np.stack(np.meshgrid(values, places, indexing="ij"), axis=-1).reshape(-1, 2)
+        rows = np.hstack([np.repeat(cars, len(grid), axis=0), np.tile(grid, (len(cars), 1))])
+        runs = drive_and_score(system, rows, with_originals=False)
+        fails = runs.collided | (runs.f_safe < (keep if fit == 0 else 0.0))
+        found |= fails.reshape(len(cars), len(values), -1).any(axis=2)
+    return found
+
+
+@pytest.mark.slow
+def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
+    study = load_study("wear_joint")
+    members = assemble(study).characteristics.vehicle
+    rng = np.random.default_rng(5)
+    settings = np.vstack(
+        [members.original, members.lower + rng.random((3, 7)) * (members.upper - members.lower)]
+    )
+    frame = pd.DataFrame(settings, columns=[*members.names])
+    frame.insert(0, "car", ["new", "a", "b", "c"])
+    answer = permit("wear_joint", cars=frame, fits=6)
+    up_to = answer.tables["sets"].pivot_table("up_to", "car", "fit", dropna=False)
+    assert up_to.loc["new", 0] <= 50
+    assert up_to.loc["new", 5] <= 44, "new cars hit somebody at 45 km/h with this set"
+    values = np.arange(10.0, 60.5, 0.5)
+    for fit in range(6):
+        fails = are_unsafe(study, fit, settings, values, keep=0.1)
+        for name, of_car in zip(frame["car"], fails, strict=True):
+            reached = up_to.loc[name, fit]
+            safe = 10.0 if np.isnan(reached) else reached
+            assert np.isnan(reached) or not of_car[values <= reached].any(), (name, fit)
+            assert of_car[values <= safe + 1].any(), (name, fit)
+    rows = answer.table().set_index("car")
+    for name in frame["car"]:
+        least = up_to.loc[name].min(skipna=False)
+        assert rows.loc[name, "up_to"] == least or np.isnan(least)
+    assert (rows["new_car_up_to"] == up_to.loc["new"].min()).all()
+    assert answer.numbers["fits"] == 6
+    assert not answer.numbers["rough"]
+
+
+def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(short: Study) -> None:
+    row = json_of("permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0")
+    cars = row["tables"]["cars"]["rows"]
+    numbers = row["numbers"]
+    assert [car["car"] for car in cars][0] == "slow"
+    assert (numbers["cars"], numbers["stop"], numbers["not_driven_above"]) == (3, 1, 45)
+    assert numbers["drive"] + numbers["limited"] + numbers["stop"] == 3
+    by_name = {car["car"]: car for car in cars}
+    assert by_name["slow"]["up_to"] is None
+    assert by_name["slow"]["because"].startswith("Not even at 34 km/h: ")
+    assert by_name["new"]["verdict"] == "drive", "as fast as the new car"
+    assert by_name["new"]["up_to"] == by_name["new"]["new_car_up_to"] > by_name["007"]["up_to"]
+    assert by_name["007"]["repair_first"] == "treadDepth"
+    assert by_name["007"]["up_to_after_repair"] == by_name["new"]["up_to"]
+    assert by_name["slow"]["repair_first"] in {None, *short.vehicle.characteristics}
+
+    typed = ["permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0"]
+    printed = printed_by(*typed, "--format", "csv", "--out", "out.csv")
+    listing = pd.read_csv("out.csv", dtype=str)
+    assert printed == Path("out.csv").read_text()
+    assert [*listing["car"]] == ["new", "007", "slow"]
+    assert [*listing.columns][:7] == [*pd.read_csv("fleet.csv", sep=";").columns]
+    assert listing["note"][0] == 'bought "today"'
+    assert listing["up_to"].isna().tolist() == [False, False, True]
+    assert listing["study_digest"].nunique() == 1
+    assert Path("fleet.csv").read_text() == FLEET
+    refused(*typed, "--out", "fleet.csv", message="fleet.csv is the list itself")
+
+
+def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
+    short: Study, worker_processes: None
+) -> None:
+    options: dict[str, Any] = {"fits": 3, "others": "new"}
+    cars = {"a": {"treadDepth": 3}, "b": {"brakeTorque": 0.7}, "c": {"payload": 400}}
+    all_three = permit(short, cars=cars, jobs=1, fresh=True, **options)
+    again = permit(short, cars=cars, jobs=2, fresh=True, **options)
+    assert all_three.render("json") == again.render("json")
+    alone = permit(short, cars={"b": cars["b"]}, **options)
+    for name in ("cars", "sets"):
+        together = all_three.tables[name]
+        own = together[together["car"] == "b"].reset_index(drop=True)
+        pd.testing.assert_frame_equal(own, alone.tables[name], check_dtype=False)
+
+
+def test_a_speed_that_is_needed(short: Study) -> None:
+    typed = ["permit", "short.toml", "--set", "treadDepth=1.6", "--others", "new", "--fits", "0"]
+    slow = json_of(*typed)["tables"]["cars"]["rows"][0]["up_to"]
+    assert json_of(*typed, "--need", f"{slow:g} km/h")["numbers"]["drive"] == 1
+    found = json_of(*typed, "--need", f"{slow + 1:g} km/h", exit_code=3)
+    assert "1 car may not drive" in found["verdict"]
+    assert found["numbers"]["need"] == slow + 1
+
+
+def test_all_cars_within_limits(short: Study) -> None:
+    limits = ("treadDepth >= 5", "payload <= 200")
+    answer = permit(short, limits=limits, others="new", fits=2)
+    (row,) = answer.table().to_dict("records")
+    assert row["repair_first"] is None
+    assert "treadDepth" in row["because"] or "payload" in row["because"]
+    members = assemble(short).characteristics.vehicle
+    rng = np.random.default_rng(3)
+    cars = np.tile(members.original, (40, 1))
+    cars[:, members.names.index("treadDepth")] = rng.choice([5, 6, 8], 40)
+    cars[:, members.names.index("payload")] = rng.choice([75, 150, 200], 40)
+    values = np.arange(34.0, row["up_to"] + 0.1, 0.5)
+    for fit in range(2):
+        assert not are_unsafe(short, fit, np.unique(cars, axis=0), values, keep=0.1).any()
+
+
+def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
+    cars = {"new": {}, "worn": {"treadDepth": 3}}
+    answer = permit(short, cars=cars, others="new", fits=0, quick=True)
+    assert answer.numbers["rough"]
+    assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
+    assert set(answer.table()["verdict"]) == {"up to"}
+
+
+MATRIX = """
+extends = "wear"
+name = "three"
+title = "Three tests on a wet road"
+wider = ""
+[[matrix.tests]]
+name = "CPFA"
+parameters = { test = "CPFA" }
+over = { speed = [20, 30] }
+[[matrix.tests]]
+name = "CPNA"
+parameters = { test = "CPNA" }
+over = { impact_location = [25, 75], speed = [10, 20, 50] }
+[[matrix.tests]]
+name = "CPNCO"
+parameters = { test = "CPNCO", speed = 30 }
+[[matrix.tests]]
+name = "CPLA"
+model = "along"
+parameters = { vut_length = 4.7, vut_width = 1.85 }
+over = { speed = [40, 60] }
+"""
+
+
+def own_search(study: Study) -> PermitSearch:
+    span = span_of(study, None)
+    own = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    values = np.arange(span.low, span.high + 1)
+    return PermitSearch(Models((own,), ()), span, values, LEAST_SIMULATIONS)
+
+
+def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
+    Path("three.toml").write_text(MATRIX)
+    study = load_study("three.toml")
+    span = span_of(study, None)
+    assert (span.low, span.high, span.unit) == (10, 30, "km/h")
+    assert (span.ending, span.left_out) == (("CPFA",), ("CPLA",))
+    model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    ends = [(each.test, each.low, each.high) for each in ranges_of(model, span)]
+    assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, 30)]
+    answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
+    assert "CPLA" in answer.verdict
+    assert "Above 30 km/h nothing was driven" in answer.verdict
+    assert permit(study, cars={"a": {}}, others="new", fits=0, quick=True, by="impact_location")
+
+
+@given(
+    begin=st.floats(10.1, 58), width=st.floats(1.1, 20), place=st.floats(30, 70), share=st.floats(8, 20)
+)
+def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
+    begin: float, width: float, place: float, share: float
+) -> None:
+    study = load_study("wear_joint")
+
+    def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
+        speed, location = self.as_printed(settings)[:, -2:].T
+        fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
+        return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EncounterRange, "robustness", robustness)
+        search = own_search(study)
+        (found,) = search.reach([Cars.one(assemble(study).characteristics.vehicle.original)], [None])
+    (reached,) = found.reached
+    assert reached.failure is not None
+    assert reached.failure.encounters.test == "CPLA"
+    assert begin - 0.005 <= reached.failure.value <= begin + 1.005
+    assert reached.up_to == np.ceil(reached.failure.value) - 1
