@@ -26,7 +26,7 @@ from safevar_sumo.questions.tolerance.limits import (
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
-from safevar_sumo.questions.tolerance.up_to import study_up_to, tests_left_out
+from safevar_sumo.questions.tolerance.up_to import names_left_out, study_up_to
 from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
 from safevar_sumo.study import Study
@@ -114,12 +114,18 @@ def tolerance(
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
+    # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
+    of_whole = original
+    if up_to is not None:
+        of_whole = whole.evaluate(whole.characteristics.original_settings, "original vehicle")
     asked = Asked(
         subject=subject,
         evaluator=evaluator,
         columns=columns,
         limits=specified,
-        unsafe=limit_criterion(whole, subject, unsafe, margin, original),
+        unsafe=limit_criterion(
+            whole, subject, unsafe, margin, of_whole if of_whole.valid[0] else original
+        ),
         original=original,
         criterion=unsafe,
         margin=margin,
@@ -128,6 +134,6 @@ def tolerance(
         is_quick=quick,
         at_tests=at_tests,
         up_to=up_to,
-        left_out=tests_left_out(whole.study, study),
+        left_out=names_left_out(whole.study, study),
     )
     return answer_limits(asked)

@@ -1,6 +1,4 @@
-"""A study up to a value of a parameter: the range of a searched one, or of an axis of the matrix, is
-cut there.
-"""
+"""A study up to a value: the range of a searched parameter, or of an axis of the matrix, is cut."""
 
 from __future__ import annotations
 
@@ -56,7 +54,7 @@ def study_up_to(study: Study, text: str) -> Study:
     return (_search_up_to if name in study.scenario.search else _matrix_up_to)(study, name, high)
 
 
-def tests_left_out(study: Study, cut: Study) -> list[str]:
+def names_left_out(study: Study, cut: Study) -> list[str]:
     """The names of the tests of a study that are left out where it is cut."""
     if study.matrix is None or cut.matrix is None:
         return []
@@ -84,8 +82,7 @@ def _matrix_up_to(study: Study, name: str, high: float) -> Study:
         units = [searchable_in(points[0].scenario) for _, points in by_test]
         unit = next((unit_text(each[name].unit) for each in units if name in each), "")
         problem = f"{name}={high:g} is not among the values that study {study.name!r} drives"
-        wider = f", or the study {study.wider}, whose scope is wider" if study.wider else ""
-        legal = f"a value from {min(driven):g} to {max(driven):g}{unit}{wider}"
+        legal = f"a value from {min(driven):g} to {max(driven):g}{unit}"
         raise InputError(OPTION, problem, legal)
     tests = list[MatrixTest]()
     for test, points in by_test:

@@ -4,6 +4,7 @@ key `wider`.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.declared import read_study
@@ -72,6 +74,9 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     if not evaluator.study.wider or together is None or not asked.budget:
         return []
     study = wider_study(evaluator.study)
+    if asked.up_to is not None:
+        with suppress(InputError):  # it ends below this value
+            study = study_up_to(study, asked.up_to)
     other = evaluator.for_study(study)
     original = other.evaluate_original()
     unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)

@@ -9,7 +9,7 @@ from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
-from safevar_sumo.questions.counterexamples import describe, limit_text
+from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
