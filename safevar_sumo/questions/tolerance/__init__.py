@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @question
 @contents(
-    *("unsafe", "margin", "kept", "rough", "scope", "up_to", *OF_BOX),
+    *("unsafe", "margin", "kept", "rough", "scope", "up_to", "boxes", *OF_BOX),
     limits=LIMITS,
     intervals=INTERVALS,
     uncertainty=UNCERTAINTY,
