@@ -121,7 +121,7 @@ def _check_names(
 ) -> None:
     """Refuse keys of conditions, and a table, that no answer of the command has."""
     names_study = keys and ... in declared.numbers  # as `simulate`
-    named = declared.with_options(values, names_in_study(values) if names_study else {})
+    named = declared.in_study(names_in_study(values) if names_study else {})
     for key in keys:
         named.check_key(key)
     if table is not None:

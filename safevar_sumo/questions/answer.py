@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import re
 import zlib
-from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -54,39 +53,26 @@ WIDTH = 80
 """Width of text that is not printed to a terminal [characters]."""
 
 
-NOTHING: Mapping[str, list[str]] = {}
-
-
 class Contents(NamedTuple):
     """The names of an answer's numbers, and of the columns of its tables; `...` among them stands
-    for names that a study gives, such as its metrics, and `{by}` for the name in a value NAME=...
-    of the option `by`.
+    for names that a study gives, such as its metrics.
     """
 
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
 
-    def with_options(
-        self, values: Mapping[str, Any], given: Mapping[str, list[str]] = NOTHING
-    ) -> Contents:
-        """The names that an answer has with these values of options, `NAME` for an option that has
-        none, and those that a study has `given`, by table; of numbers under "".
+    def in_study(self, given: Mapping[str, list[str]]) -> Contents:
+        """The names that an answer has with those that a study has `given`, by table; of numbers
+        under "".
         """
-        # Names that values of options give.
-        named = defaultdict(lambda: "NAME")
-        for option, text in values.items():
-            if isinstance(text, str):
-                named[option] = text.partition("=")[0].strip()
-
-        # Names that a study gives, in each table.
-        tables = {"": self.numbers, **self.tables}
-        for table, names in tables.items():
-            of_study = given.get(table, [...])
-            tables[table] = [
-                filled_name
+        tables = {
+            table: [
+                each
                 for name in names
-                for filled_name in (of_study if name is ... else [name.format_map(named)])
+                for each in (given.get(table, [...]) if name is ... else [name])
             ]
+            for table, names in {"": self.numbers, **self.tables}.items()
+        }
         return Contents(tables.pop(""), tables)
 
     def check_table(self, name: str) -> None:

@@ -261,7 +261,7 @@ class Question:
 
     def _is_long(self, values: JsonObject) -> bool:
         """Whether a rough answer, which comes much earlier, may be shown before the answer."""
-        return self.has_rough_answer and not any(values.get(name) for name in (QUICK, "by", "out"))
+        return self.has_rough_answer and not any(values.get(name) for name in (QUICK, "out"))
 
     def answer(
         self,
@@ -286,7 +286,7 @@ class Question:
             criterion = values.get(option)
             cites = ""
             # A study's own criterion stands where nothing else is asked for.
-            if option and all(values.get(name) is None for name in (option, "margin", "by")):
+            if option and all(values.get(name) is None for name in (option, "margin")):
                 criterion = study.unsafe.criterion or None
                 values = {**values, option: criterion}
                 if study.unsafe.source:
@@ -441,14 +441,12 @@ def with_criterion(text: str, unsafe: str | None) -> str:
 
 
 def quick_questions(texts: Sequence[str]) -> list[str]:
-    """The questions, rough where they can be; those by a parameter, which cannot, are left out."""
+    """The questions, rough where they can be."""
     found = []
     for text in texts:
         asked, values = parse_question(text)
-        if "by" not in values:
-            found.append(
-                f"{text} --{QUICK}" if asked.has_rough_answer and QUICK not in values else text
-            )
+        is_made_rough = asked.has_rough_answer and QUICK not in values
+        found.append(f"{text} --{QUICK}" if is_made_rough else text)
     return found
 
 

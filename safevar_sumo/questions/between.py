@@ -16,7 +16,6 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Scenario, searchable_in

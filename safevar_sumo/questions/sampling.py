@@ -32,10 +32,7 @@ class Stream(IntEnum):
     NEAREST_LIMIT = 8  # falsification of a limit in place of a specified one that does not hold
     WIDER_SCOPE = 9  # falsification of limits in the scope of a wider study, and up to a value
     EXTENSION = 10  # falsification of joint limits of which one is extended
-    SPECIFIED_BETWEEN = 11  # falsification of specified limits between two values of a parameter
-    SPECIFIED_UP_TO = 12  # the same, up to the largest value at which they hold
-    ORIGINAL_UP_TO = 13  # falsification of how far the original vehicle itself is safe
-    LEFT_OUT = 14  # search for contacts in encounters that do not count
+    SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
     VALIDATION = 15  # further falsifications of joint limits that passed one
     ORDERS_OF_CUTS = 16  # orders in which counterexamples are cut off a box
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
-from itertools import chain, count, takewhile
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -32,13 +32,11 @@ from safevar_sumo.questions.ask import (
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import Results, case_at, changes_since
-from safevar_sumo.questions.tolerance.by_parameter import usual_values
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, replays, tested, trust
 from safevar_sumo.report.sheet import sheet_of
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
-from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
 if TYPE_CHECKING:
@@ -102,7 +100,7 @@ def report(
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
-        Rough answers, without limits by speed and without a line to sign.
+        Rough answers, without a line to sign.
 
     Returns
     -------
@@ -135,7 +133,7 @@ def report(
     command = f"report {paths} {point} {ask} {unsafe} {quick}"
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
-        asked = [alone if ask else usual_questions(case, point, unsafe) for case in by_criterion]
+        asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
         numbers, total = count(1), sum(map(len, asked)) + len(joint)
 
@@ -188,10 +186,9 @@ def _later_changes(
     return later_changes
 
 
-def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = None) -> list[str]:
+def usual_questions(case: Case, point: str | None = None) -> list[str]:
     """The questions of a page about results; that of a rated study is about its points, with the
-    variant that loses some by the fewest changes. Where the study has speeds, the second asks the
-    limits up to some of them.
+    variant that loses some by the fewest changes.
     """
     # A rating of the worst solution.
     if is_rated(case.study) and point is None:
@@ -199,18 +196,8 @@ def usual_questions(case: Case, point: str | None = None, unsafe: Criterion = No
         handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]
 
-    # Limits, also by speed, and what else a study can answer.
-    first, *later = USUAL_QUESTIONS
-    questions = [first]
-    speeds = usual_values(case.study, SPEED_DIMENSION) if point is None and unsafe is None else []
-    if speeds:
-        questions.append(
-            f"{first} --by {SPEED_DIMENSION}={','.join(f'{value:g}' for value in speeds)}"
-        )
-    questions += later
-    if case.study.repair.promise or case.study.limits:
-        questions.append("repair")
-    return questions
+    can_repair = case.study.repair.promise or case.study.limits
+    return [*USUAL_QUESTIONS, *(["repair"] if can_repair else [])]
 
 
 def answer_to(
@@ -275,16 +262,13 @@ def make_page(
 
 def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonObject:
     """One study for the template: first the sheet of a workshop. On the front stand all verdicts,
-    the first of them with its first table; answers to the same question follow it with theirs.
+    the first of them with its first table.
     """
-    # All answers to the first question lead.
     anchor = f"study-{number}"
     answers = study.answers
     trusted = trust(study)
     sections = list(_sections(anchor, [*answers, tested(study), trusted]))
-    leading = [*takewhile(lambda answer: answer.question == answers[0].question, answers)] or [
-        trusted
-    ]
+    leading = answers[0] if answers else trusted
     return {
         "name": study.case.name,
         "title": study.case.study.title,
@@ -296,8 +280,8 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "tables": study.case.study,
         "versions": study.versions,
         "facts": facts(study),
-        "front": [_on_front(answer) for answer in leading],
-        "verdicts": [*sections[len(leading) : len(answers)], sections[-1]],
+        "front": _on_front(leading),
+        "verdicts": [*sections[1 : len(answers)], sections[-1]],
         "replays": list(replays(study, progress)),
         "sections": sections,
     }
@@ -310,14 +294,10 @@ def _on_front(answer: Answer) -> Markup:
 
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
     """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it
-    has one. The second answer to a question has the title of its first table as heading.
+    has one.
     """
-    names = set[str]()
     for number, answer in enumerate(answers, 1):
         name = answer.question
-        if name in names and answer.tables:
-            name = answer.table().attrs["title"].partition(",")[0]
-        names.add(name)
         try:
             picture = _picture(answer.figure())
         except InputError:  # it has nothing to draw

@@ -15,12 +15,11 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import SENTENCE_END, Answer, Columns, tabulate
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.tables import columns_of, html_table
+from safevar_sumo.questions.tables import html_table
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
 from safevar_sumo.scenarios.euro_ncap import TESTS
-from safevar_sumo.study import unit_text
 from safevar_sumo.vehicles import VEHICLES, Characteristic
 
 PARTS: Columns = {
@@ -43,10 +42,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     A sheet without joint limits that hold has no table; one whose limits are only rough or for
     screening, or that other files and versions gave, has no line to sign.
     """
-    # The answer with joint limits, and the one with limits up to values of a parameter.
-    of_limits = [answer for answer in study.answers if answer.question == "tolerance"]
-    limits = next((one for one in of_limits if "up_to" not in one.numbers), None)
-    by_value = next((one for one in of_limits if "up_to" in one.numbers), None)
+    limits = next((answer for answer in study.answers if answer.question == "tolerance"), None)
     if limits is None:
         return None
 
@@ -71,7 +67,6 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "tests": [_tests_in_words(phrase) for phrase in tests],
         "road": road,
         "wider": [] if wider is None else wider.to_dict("records"),
-        "own_limit": None if by_value is None else _own_limit(by_value),
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
@@ -155,19 +150,3 @@ def _tests_in_words(phrase: str) -> str:
         return phrase
     words = join_phrases(TESTS[name].words for name in names)
     return words + speeds.replace(" at ", "; this vehicle drives at ")
-
-
-def _own_limit(by_value: Answer) -> JsonObject:
-    """Up to which value of a parameter the original vehicle keeps its margin, and touches
-    nobody.
-    """
-    frame = by_value.table("limits")
-    column = next(name for name in map(str, frame) if name.startswith("by_"))
-    return {
-        "parameter": column.removeprefix("by_").replace("_", " "),
-        "unit": unit_text(columns_of(frame)[column].unit),
-        "margin": by_value.numbers["margin"],
-        "keeps": by_value.numbers["original_keeps_up_to"],
-        "safe": by_value.numbers["original_safe_up_to"],
-        "greatest": frame[column].max(),
-    }

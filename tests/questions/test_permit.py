@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -232,7 +231,10 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
 
 
 @given(
-    begin=st.floats(10.1, 58), width=st.floats(1.1, 20), place=st.floats(30, 70), share=st.floats(8, 20)
+    begin=st.floats(10.1, 58),
+    width=st.floats(1.1, 20),
+    place=st.floats(30, 70),
+    share=st.floats(8, 20),
 )
 def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     begin: float, width: float, place: float, share: float
@@ -247,7 +249,9 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EncounterRange, "robustness", robustness)
         search = own_search(study)
-        (found,) = search.reach([Cars.one(assemble(study).characteristics.vehicle.original)], [None])
+        (found,) = search.reach(
+            [Cars.one(assemble(study).characteristics.vehicle.original)], [None]
+        )
     (reached,) = found.reached
     assert reached.failure is not None
     assert reached.failure.encounters.test == "CPLA"

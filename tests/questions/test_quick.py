@@ -48,7 +48,7 @@ def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
 
 
 def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:
-    asked = ["tolerance", "tolerance --by speed=20,30", "explain --limit 30000", "risk"]
+    asked = ["tolerance", "explain --limit 30000", "risk"]
     assert quick_questions(asked) == ["tolerance --quick", "explain --limit 30000 --quick", "risk"]
 
 

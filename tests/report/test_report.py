@@ -27,7 +27,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.ask import find_question, parse_question
+from safevar_sumo.questions.ask import parse_question
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.figures import new_figure
 from safevar_sumo.report import sections
@@ -248,23 +248,6 @@ def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> No
     assert usual_questions(rated, "a point")[0] == "tolerance"
 
 
-def test_a_study_that_has_speeds_is_asked_for_the_limits_up_to_some_of_them(case: Case) -> None:
-    """Those of all tests of a matrix; of a domain from 10 to 60 whose original is 40 the middle,
-    that and the end.
-    """
-    wear, joint = (replace(case, study=load_study(name)) for name in ("wear", "wear_joint"))
-    assert usual_questions(wear)[1] == "tolerance --by speed=10,20,30,40"
-    assert usual_questions(joint)[1] == "tolerance --by speed=25,40,60"
-    stops = replace(case, study=load_study("stop"))
-    assert usual_questions(stops)[1] == "tolerance --by speed=30,80,120", (
-        "every second point: at most four"
-    )
-    for options in ({"point": "CPFA, speed 10"}, {"unsafe": "drac > 6"}):
-        assert [text.split()[0] for text in usual_questions(wear, **options)].count(
-            "tolerance"
-        ) == 1
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"])
 def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) -> None:
@@ -366,38 +349,6 @@ def commands_of(page: str) -> Iterator[list[str]]:
     """The words of the commands that a page prints, without those that start the program."""
     for line in re.findall("<code>(python -m .*?)</code>", page):
         yield shlex.split(line)[3:]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("coarse")
-def test_limits_up_to_each_speed_are_the_second_thing_of_a_page(tmp_path: Path) -> None:
-    test = {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [20, 40]}}
-    search = {"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]}
-    matrix = {"aggregate": "worst", "tests": [test]}
-    place = searched(load_study("wear", matrix=matrix, search=search), tmp_path / "results")
-    options = "--fits 0 --characteristics brakeTorque,sensorLatency"
-    asked = [f"tolerance {options} --attack 100", f"tolerance --by speed=20,40 {options}"]
-    page = page_of(place, ask=[*asked, "risk --samples 20"], jobs=1)
-    front = page[page.index('<div class="second">') : page.index('<dl class="verdicts">')]
-    answer = find_question("tolerance")(
-        str(place), by="speed=20,40", fits=0, characteristics=options.split()[-1:]
-    )
-    limits = answer.tables["limits"]
-    cells = dict(re.findall(r"<tr><td[^>]*>(\w+)</td>(.*?)</tr>", front))
-    assert list(cells) == ["brakeTorque", "sensorLatency"]
-    for name, rows in limits.groupby("characteristic"):
-        texts = [
-            f"{low:.10g} to {high:.10g}"
-            for low, high in rows[["alone_low", "alone_high"]].to_numpy()
-        ]
-        assert re.findall(">([^<]*)</td>", cells[name])[-2:] == texts
-    after_sheet = page[page.index('<div class="second">') :]
-    assert [*dict.fromkeys(re.findall("<h3>(.*?)</h3>", after_sheet))][:3] == [
-        "Tolerance",
-        "Limits up to each speed",
-        "Risk",
-    ]
-    assert Outline(page).open == []
 
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer, Column, tabulate
+from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
@@ -36,7 +36,6 @@ LIMITS = [
 """Joint limits and their words; nobody asked for those of the last."""
 COMMAND = "python -m safevar_sumo tolerance results/wear"
 COLUMNS = dict.fromkeys(("characteristic", "together_low", "together_high", "sentence"), "")
-BY_SPEED = {"by_speed": Column("km/h", "value up to which they hold")}
 VERDICT = "The worst of 21,234 is safe. At most 0.30 % are unsafe, with 95 % confidence."
 
 
@@ -52,7 +51,6 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
             " (full) at 80 km/h; weather wet (friction 0.71, water 1 mm), by day"
         ),
         "box": True,
-        "contacts_left_out": None,
         "fits": 1,
     }
     return Answer(
@@ -170,27 +168,9 @@ def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked()
     assert sheet_with() == ""
 
 
-@pytest.mark.parametrize(
-    ("keeps", "words", "found"),
-    [
-        (40.0, "up to speed 40 km/h, the greatest that was tested.", "no failure of these"),
-        (
-            39.2,
-            "only up to speed 39.2 km/h, and touches nobody up to 39.6 km/h.",
-            "A child is hit.",
-        ),
-        (None, "at no speed that was tested.", "A child is hit."),
-    ],
-)
-def test_the_limit_of_the_original_vehicle_and_wider_tests_stand_on_the_sheet(
-    keeps: float | None, words: str, found: str
-) -> None:
-    numbers = {"up_to": None, "original_keeps_up_to": keeps, "original_safe_up_to": 39.6}
-    by_speed = answer_of(BY_SPEED, [(20.0,), (40.0,)], **numbers)
+@pytest.mark.parametrize(("kept", "found"), [(True, "no failure of these"), (False, "A child")])
+def test_wider_tests_stand_on_the_sheet(kept: bool, found: str) -> None:
     answer = answer_of()
-    row = ("wear_joint", "up to 60 km/h", keeps == 40, "A child is hit.", None)
+    row = ("wear_joint", "up to 60 km/h", kept, "A child is hit.", None)
     answer.tables["wider"] = tabulate("Wider", WIDER, [row])
-    sheet = sheet_with(answer, by_speed)
-    assert f"It keeps 0.3 m {words}" in sheet
-    assert f"In the study wear_joint (up to 60 km/h), {found}" in sheet
-    assert f"It keeps 0.3 m {words}" in sheet_with(answer_of(box=False), by_speed)
+    assert f"In the study wear_joint (up to 60 km/h), {found}" in sheet_with(answer)

@@ -29,7 +29,7 @@ from safevar_sumo.questions.permit.rows import (
 from safevar_sumo.questions.permit.search import Permit, PermitSearch
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.up_to import study_up_to
+from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text
@@ -69,7 +69,9 @@ class PermitAnswer:
         ordered = cars.sort_values("up_to", kind="stable", na_position="first", ignore_index=True)
         ordered.attrs = cars.attrs
         unit = unit_text(span.unit)
-        scope = scope_of(study_up_to(self.study, f"{span.name}={span.high!r}"))
+        is_cut = bool(span.ending)
+        driven = study_up_to(self.study, f"{span.name}={span.high!r}") if is_cut else self.study
+        scope = scope_of(driven)
         own = self.models.own.unsafe
         slower = f"{number_of(too_slow, 'car')} may not drive {self.need or 0:g}{unit}"
         return Answer(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
@@ -14,7 +15,6 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
-from safevar_sumo.questions.tolerance.by_parameter import Parameter
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
     INTERVALS,
@@ -23,10 +23,10 @@ from safevar_sumo.questions.tolerance.limits import (
     POINTS,
     answer_limits,
 )
-from safevar_sumo.questions.tolerance.limits_by import BETWEEN_STAGE, answer_by, check_by
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
+from safevar_sumo.questions.tolerance.up_to import names_left_out, study_up_to
 from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
 from safevar_sumo.study import Study
@@ -37,9 +37,8 @@ if TYPE_CHECKING:
 
 @question
 @contents(
-    *("unsafe", "margin", "kept", "rough", "scope", "boxes", "contacts_left_out", *OF_BOX),
-    *("up_to", "original_keeps_up_to", "original_safe_up_to"),
-    limits=(*LIMITS, "by_{by}", "scope"),
+    *("unsafe", "margin", "kept", "rough", "scope", "up_to", "boxes", *OF_BOX),
+    limits=LIMITS,
     intervals=INTERVALS,
     uncertainty=UNCERTAINTY,
     fits=FITS,
@@ -57,6 +56,7 @@ def tolerance(
     unsafe: Criterion = None,
     fits: Annotated[int | None, Range(0, 1000)] = None,
     attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
+    up_to: Annotated[str | None, "NAME=V"] = None,
     by: Annotated[str | None, "NAME=V1,V2,..."] = None,
     at_tests: bool = False,
     quick: bool = False,
@@ -89,30 +89,43 @@ def tolerance(
         Number of simulations that search for a counterexample to the joint limits, over all
         parameter sets, at least 1,000; 0 leaves this search out, and then no limit is called kept.
         With fewer than by default the answer is rough.
+    up_to
+        Limits that hold up to a value of a searched parameter or of an axis of the matrix, such as
+        speed=40: encounters with a larger value do not count.
     by
-        A searched parameter or an axis of the matrix, and values such as speed=20,30,40: the limits
-        of each characteristic alone that hold up to each of these values, and the value up to which
-        the specified limits hold.
+        Has ended: ask `permit STUDY`, or for limits up to one value by `up_to`.
     at_tests
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.
     quick
         A rough answer: the study's own parameter set, and the shortest search for counterexamples.
-        No limit is called kept, and with limits the exit code is 3. Not with `by`.
+        No limit is called kept, and with limits the exit code is 3.
     """
+    if by is not None:
+        legal = "permit STUDY: how fast a car may drive; or --up-to speed=V: joint limits up to V"
+        raise InputError("by", f"{by!r}: tolerance --by has ended", legal)
+    whole = evaluator
+    if up_to is not None:
+        evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
-    parameter = None if by is None else Parameter.parse(by, study)
-    check_by(by, unsafe, is_quick=quick)
-    evaluator.plan(*_phases(study, parameter))
+    phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
+    phases |= {WIDER_STAGE: 4.0} if study.wider else {}
+    evaluator.plan(phases, VALIDATION_STAGE)
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
+    # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
+    of_whole = original
+    if up_to is not None:
+        of_whole = whole.evaluate(whole.characteristics.original_settings, "original vehicle")
     asked = Asked(
         subject=subject,
         evaluator=evaluator,
         columns=columns,
         limits=specified,
-        unsafe=limit_criterion(evaluator, subject, unsafe, margin, original),
+        unsafe=limit_criterion(
+            whole, subject, unsafe, margin, of_whole if of_whole.valid[0] else original
+        ),
         original=original,
         criterion=unsafe,
         margin=margin,
@@ -120,14 +133,7 @@ def tolerance(
         budget=min(attack, LEAST_SIMULATIONS) if quick else attack,
         is_quick=quick,
         at_tests=at_tests,
+        up_to=up_to,
+        left_out=names_left_out(whole.study, study),
     )
-    return answer_limits(asked) if parameter is None else answer_by(asked, parameter)
-
-
-def _phases(study: Study, by: Parameter | None) -> tuple[dict[str, float], str]:
-    """The phases of progress, with their usual shares of the time, and the one that has rounds."""
-    if by is not None:
-        levels = dict.fromkeys((f"limits up to {by.text(value)}" for value in by.values), 1.0)
-        return {**levels, BETWEEN_STAGE: 1.0}, ""
-    phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
-    return {**phases, **({WIDER_STAGE: 4.0} if study.wider else {})}, VALIDATION_STAGE
+    return answer_limits(asked)

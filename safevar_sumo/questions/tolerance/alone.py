@@ -103,19 +103,12 @@ class _Ends:
 
 class AloneSearch:
     """The search for limits alone, from scans with the study's own parameter set: one model after
-    another moves them in, each at some `values` between them.
+    another moves them in.
     """
 
-    def __init__(
-        self,
-        scans: Sequence[OneAtATimeScan],
-        columns: Sequence[int],
-        own: Model,
-        values: int = VALUES,
-    ) -> None:
+    def __init__(self, scans: Sequence[OneAtATimeScan], columns: Sequence[int], own: Model) -> None:
         self.scans = scans
         self.models = list[Model]()
-        self.values = values
         evaluator = own.evaluator
         self._encounters = np.concatenate(
             [[evaluator.characteristics.original], evaluator.critical_encounters]
@@ -132,27 +125,22 @@ class AloneSearch:
         self.models.append(model)
         if not self.ends:
             return
-        has_moved = _move_before(self.ends, model, self._encounters, self.values)
+        has_moved = _move_before(self.ends, model, self._encounters, VALUES)
         has_moved |= any([_move_between(self.ends, test) for test in tests])
         # The ends as they are printed, until all are safe in all models: where one moves, it is new
         # to the others.
         while has_moved:
-            has_moved = self.recheck(self.models)
+            at_ends = [_move_before(self.ends, each, self._encounters, 2) for each in self.models]
+            has_moved = any(at_ends)
             has_moved |= any([_move_between(self.ends, test) for test in tests])
 
-    def recheck(self, models: Sequence[Model]) -> bool:
-        """Move ends in before what fails in some models at the ends themselves; whether one has
-        moved.
+    def attack(self, model: Model, budget: int) -> None:
+        """Move ends in before what a falsification in a model finds in other encounters, in a study
+        that searches its scenario.
         """
-        ends = self.ends
-        return any([_move_before(ends, each, self._encounters, 2) for each in models if ends])
-
-    def attack(self, models: Sequence[Model], budget: int) -> None:
-        """Move ends in before what a falsification in some models finds in other encounters, in a
-        study that searches its scenario.
-        """
-        if self.ends and budget and len(models[0].evaluator.characteristics.scenario):
-            _falsify_alone(self.ends, models, budget_alone(budget))
+        if self.ends and budget and len(model.evaluator.characteristics.scenario):
+            share = max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
+            _falsify_alone(self.ends, model, share)
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:
         """Move the limits before failures that another search met, each of one characteristic,
@@ -171,11 +159,6 @@ class AloneSearch:
         return [each.limit() for each in self.ends] or [
             AloneLimit(scan, None) for scan in self.scans
         ]
-
-
-def budget_alone(budget: int) -> int:
-    """Number of simulations of an attack on one limit."""
-    return max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
 
 
 def _find_beyond(ends: Sequence[_Ends], own: Model) -> None:
@@ -272,11 +255,11 @@ def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]
     return below, above
 
 
-def _falsify_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) -> None:
+def _falsify_alone(ends: Sequence[_Ends], model: Model, budget: int) -> None:
     """Falsify the limits in encounters that no scan met, until nothing is found."""
-    members = models[0].evaluator.characteristics
-    seed = models[0].evaluator.study.search.seed
-    judges = judges_of(models, "falsification of limits alone")
+    members = model.evaluator.characteristics
+    seed = model.evaluator.study.search.seed
+    judges = judges_of([model], "falsification of limits alone")
     waiting = [*ends]
     nothing = np.zeros((0, len(members)))
     size = max(budget // GENERATIONS, 1)
@@ -290,13 +273,12 @@ def _falsify_alone(ends: Sequence[_Ends], models: Sequence[Model], budget: int) 
             limit = each.limit().safe
             assert limit is not None
             lower[each.column], upper[each.column] = limit
-            boxes.append(Box(models[0].evaluator.region, lower, upper))
+            boxes.append(Box(model.evaluator.region, lower, upper))
             at_limit = boxes[-1].draw(size, rng)
             at_limit[:, each.column] = np.resize(limit, len(at_limit))  # both ends in turn
-            known.append(np.array_split(at_limit, len(models)))
+            known.append([at_limit])
         found = [each.failures for each in falsify_all(boxes, judges, known, budget, rngs, size)]
-        for judge, model in enumerate(models):
-            _move(waiting, model, [failures.get(judge, nothing) for failures in found])
+        _move(waiting, model, [failures.get(0, nothing) for failures in found])
         waiting = [each for each, failures in zip(waiting, found, strict=True) if failures]
         if not waiting:
             return

@@ -38,6 +38,10 @@ class Asked(NamedTuple):
         Whether the answer is rough, so that no limit is called kept.
     at_tests
         Whether limits hold at the points of the study's tests alone, and not between them.
+    up_to
+        The parameter and the value at which the study was cut, as `NAME=V`; None if it was not.
+    left_out
+        The names of the tests that are above this value.
     """
 
     subject: Study | Case
@@ -52,6 +56,8 @@ class Asked(NamedTuple):
     budget: int
     is_quick: bool = False
     at_tests: bool = False
+    up_to: str | None = None
+    left_out: Sequence[str] = ()
 
     @property
     def drives_between(self) -> bool:
@@ -76,7 +82,14 @@ class Asked(NamedTuple):
         varies = ~members.of_vehicle
         varies[self.columns] = True
         is_original = (settings == members.original)[:, ~varies].all(axis=1)
-        return np.unique(settings[is_original], axis=0)
+        settings = np.unique(settings[is_original], axis=0)
+        if self.up_to is None or not len(settings):
+            return settings
+        # They are unsafe in the whole study; those in encounters above the value do not count.
+        is_inside = (settings >= members.lower) & (settings <= members.upper)
+        settings = settings[is_inside.all(axis=1)]
+        evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
+        return np.asarray(settings[evaluations.valid & self.unsafe.of(evaluations)])
 
 
 def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:

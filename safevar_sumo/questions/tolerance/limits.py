@@ -23,7 +23,6 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.left_out import contacts_left_out
 from safevar_sumo.questions.tolerance.rows import (
     CHARACTERISTIC,
     LIMITS,
@@ -167,7 +166,7 @@ def _find_together(
     for model in models.members:
         with asked.evaluator.stage(ALONE_STAGE, VALUES * len(asked.columns) * encounters):
             search_alone.add(model, tests[model.fit])
-            search_alone.attack([model], asked.budget)
+            search_alone.attack(model, asked.budget)
         for _ in range(MAX_REFUTED):
             if model.fit == 0:
                 joint.find(scans, np.concatenate([known, search_alone.failures]))
@@ -189,9 +188,6 @@ def answer_limits(asked: Asked) -> Answer:
     found = find_limits(asked)
     models = found.models
     together = found.together
-    contacts = None
-    if together is not None and asked.budget and len(evaluator.characteristics.scenario):
-        contacts = contacts_left_out(models.members, [together.box or together.specified])
     scope = scope_of(study, between=asked.drives_between)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
     if not asked.may_keep:
@@ -208,9 +204,9 @@ def answer_limits(asked: Asked) -> Answer:
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
     is_kept = None if not failures and not asked.may_keep else not failures
     sentences = verdict_sentences(
-        *(models, found.alone, together, asked, rows.broken), *(nearest, wider, demand, contacts)
+        models, found.alone, together, asked, rows.broken, nearest, wider, demand
     )
-    tested = tested_sentences(models, together, asked.budget, contacts)
+    tested = tested_sentences(models, together, asked.budget)
     return Answer(
         question="tolerance",
         study=study,
@@ -222,7 +218,7 @@ def answer_limits(asked: Asked) -> Answer:
             "kept": is_kept,
             "rough": asked.budget < USUAL_BUDGET,
             "scope": scope,
-            "contacts_left_out": None if contacts is None else contacts.number,
+            "up_to": None if asked.up_to is None else float(asked.up_to.partition("=")[2]),
             **_numbers(found),
         },
         tables=_tables(found, rows.rows, nearest, wider),

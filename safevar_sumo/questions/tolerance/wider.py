@@ -4,6 +4,7 @@ key `wider`.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,10 @@ from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.left_out import leading_parameter
 from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study
 
@@ -72,6 +74,9 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     if not evaluator.study.wider or together is None or not asked.budget:
         return []
     study = wider_study(evaluator.study)
+    if asked.up_to is not None:
+        with suppress(InputError):  # it ends below this value
+            study = study_up_to(study, asked.up_to)
     other = evaluator.for_study(study)
     original = other.evaluate_original()
     unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)
@@ -86,7 +91,9 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
         found = falsify_limits(box, judges, budget, stream)
     lowest = None
     if found.failures and study.scenario.search:
-        column = other.characteristics.names.index(leading_parameter(study))
+        searched = study.scenario.search
+        leading = SPEED_DIMENSION if SPEED_DIMENSION in searched else next(iter(searched))
+        column = other.characteristics.names.index(leading)
         start = float(box.lower[column])
         with other.stage(WIDER_STAGE):
             below = reach(box, (1, column), start, judges, budget, stream, found.failures)

@@ -9,15 +9,13 @@ from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
-from safevar_sumo.questions.counterexamples import describe, limit_text
-from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.left_out import Contacts
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, share_in_words
 from safevar_sumo.study import unit_text
@@ -30,35 +28,6 @@ def why_not_kept(asked: Asked) -> str:
     return "with --attack 0, no simulation searched for a counterexample"
 
 
-def rough_in_words(budget: int) -> str:
-    """The beginning of a verdict for which fewer simulations than usual searched for a
-    counterexample.
-    """
-    if budget >= USUAL_BUDGET:
-        return ""
-    return (
-        f"Rough answer, with {budget:,} instead of {USUAL_BUDGET:,} simulations that search for a"
-        " counterexample. "
-    )
-
-
-def contacts_in_words(evaluator: Evaluator, contacts: Contacts) -> Iterator[str]:
-    """What vehicles within the limits do in encounters that do not count; nothing where they touch
-    nobody.
-    """
-    if contacts.number:
-        members = evaluator.characteristics
-        item = members.members[members.names.index(contacts.name)]
-        margin = evaluator.study.scenario.margin
-        yield (
-            "Some encounters do not count, because the original touches nobody there but keeps less"
-            f" than {margin:g} m. In these, vehicles within the limits touch somebody:"
-            f" {number_of(contacts.number, 'such contact')} found, the lowest at"
-            f" {item.name.replace('_', ' ')}"
-            f" {limit_text(item, round(contacts.lowest, item.digits + 1))}."
-        )
-
-
 def verdict_sentences(
     models: Models,
     alone: Sequence[AloneLimit],
@@ -68,7 +37,6 @@ def verdict_sentences(
     nearest: Sequence[tuple[Any, ...]],
     wider: Sequence[tuple[Any, ...]],
     refusal: str,
-    contacts: Contacts | None,
 ) -> Iterator[str]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
     scope. A `refusal` says why no limit can be kept.
@@ -80,18 +48,19 @@ def verdict_sentences(
         return
 
     # The decision, and how sure it is.
-    decision = f"Do not release: {'; '.join(broken)}." if broken else ""
-    begin = "" if asked.is_quick else rough_in_words(asked.budget)
-    if rough := f"{begin}{decision}".strip():
-        yield rough
+    if asked.budget < USUAL_BUDGET and not asked.is_quick:
+        yield (
+            f"Rough answer, with {asked.budget:,} instead of {USUAL_BUDGET:,} simulations that"
+            " search for a counterexample."
+        )
+    if broken:
+        yield f"Do not release: {'; '.join(broken)}."
     if together is not None:
         yield from _fits_in_words(models, together)
         yield from _nearest_in_words(nearest)
         yield from _box_in_words(models, together, asked)
 
-    # What is unsafe within the limits but does not count, or elsewhere.
-    if contacts is not None:
-        yield from contacts_in_words(models.own.evaluator, contacts)
+    # What is unsafe elsewhere.
     for name, scope, _, verdict, _ in wider:
         yield f"In the wider scope of {name} ({scope}) {verdict}"
     names = [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]
@@ -103,17 +72,18 @@ def verdict_sentences(
         yield "No single characteristic makes the vehicle unsafe on its own."
     if unsafe.remark:
         yield unsafe.remark
+    if asked.left_out:
+        tests = join_phrases(asked.left_out)
+        yield f"Left out, as all their values are above {asked.up_to}: {tests}."
     if asked.at_tests:
         yield "Nothing was simulated between the values of the tests (--at-tests)."
     yield f"Scope: {scope_of(study, between=asked.drives_between)}."
 
 
-def tested_sentences(
-    models: Models, together: LimitsTogether | None, budget: int, contacts: Contacts | None
-) -> Iterator[str]:
+def tested_sentences(models: Models, together: LimitsTogether | None, budget: int) -> Iterator[str]:
     """How joint limits were tested; nothing without such limits."""
     study = models.own.evaluator.study
-    if contacts is not None:
+    if together is not None and budget and study.scenario.search:
         share = share_in_words(models.own.evaluator.share_left_out)
         yield (
             f"Of the encounters over the domain {share} do not count, because the original vehicle"

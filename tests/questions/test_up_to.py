@@ -1,0 +1,139 @@
+"""Limits up to one value of a parameter: what the study that is cut drives, and how its limits lie
+between those of others.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pytest
+
+from safevar_sumo import tolerance
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.tolerance.asked import Asked
+from safevar_sumo.questions.tolerance.up_to import names_left_out, study_up_to
+from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Study
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
+from tests.questions.conftest import Plant
+
+AHEAD = """
+extends = "wear"
+name = "ahead"
+title = "A pedestrian ahead on a wet road"
+wider = ""
+[[matrix.tests]]
+name = "slow"
+model = "along"
+parameters = { vut_length = 4.7, vut_width = 1.85 }
+over = { speed = [30, 60] }
+[[matrix.tests]]
+name = "fast"
+model = "along"
+parameters = { vut_length = 4.7, vut_width = 1.85 }
+over = { speed = [50, 60] }
+"""
+ROUGH: dict[str, Any] = {"fits": 0, "attack": 1000, "jobs": 1}
+
+
+@pytest.fixture
+def ahead(in_tmp: Path) -> Study:
+    (in_tmp / "ahead.toml").write_text(AHEAD)
+    return load_study("ahead.toml")
+
+
+def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: Study) -> None:
+    def over(study: Study) -> list[Any]:
+        assert study.matrix is not None
+        return [test.over["speed"] for test in study.matrix.tests]
+
+    wear, stop = load_study("wear"), load_study("stop")
+    assert over(study_up_to(wear, "speed=45")) == [[10, 20, 30, 40]] * 3 + [[10, 20, 30, 40, 45]]
+    assert over(study_up_to(stop, "speed=75")) == [[30, 50]], (
+        "a fixed way to stop has its own speeds"
+    )
+    assert study_up_to(wear, "speed=60") == wear
+    assert over(study_up_to(ahead, "speed=40")) == [[30, 40]]
+    assert names_left_out(ahead, study_up_to(ahead, "speed=40")) == ["fast"]
+    assert names_left_out(ahead, study_up_to(ahead, "speed=50")) == []
+    placed = study_up_to(wear, "impact_location=30")
+    assert over(placed) == over(wear), "tests without such an axis count unchanged"
+
+
+def test_a_searched_original_above_the_value_becomes_it() -> None:
+    joint = load_study("wear_joint")
+    low, high = (
+        study_up_to(joint, text).scenario.search["speed"] for text in ("speed=25", "speed=50")
+    )
+    assert (low.original, low.upper) == (25, 25)
+    assert (high.original, high.upper) == (40, 50)
+    assert study_up_to(joint, "speed=60") == joint
+
+
+def limits_up_to(study: Study, value: float, **options: Any) -> Answer:
+    return tolerance(study, up_to=f"speed={value:g}", characteristics=("brakeTorque",), **options)
+
+
+@pytest.mark.slow
+def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_theirs(
+    ahead: Study,
+) -> None:
+    """At a brake torque that is safe at 40 km/h and not at 50, the cut at 45 decides."""
+    answers = [limits_up_to(ahead, value, **ROUGH) for value in (40, 45, 50)]
+    least = [answer.values("limits.alone_low")[0] for answer in answers]
+    assert least[0] < least[1] < least[2]
+    between = answers[1]
+    assert "speed=45: fast" in between.verdict
+    assert "along (slow) at 30 to 45 km/h" in between.numbers["scope"]
+    assert between.numbers["up_to"] == 45
+    cut = assemble(study_up_to(ahead, "speed=45"))
+    settings = np.tile(cut.characteristics.original, (2, 1))
+    column = cut.characteristics.names.index("brakeTorque")
+    settings[:, column] = least[1], least[0]
+    is_kept = drive_and_score(cut, settings).f_safe >= between.numbers["margin"]
+    assert is_kept.tolist() == [True, False]
+
+
+def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> None:
+    """In the study that is cut, a brake torque below 0.7 collides; all three did in the results."""
+    study = study_up_to(load_study("wear_joint"), "speed=40")
+    plant = Plant(study, lambda rows: rows[:, 1] < 0.7)
+    members = CharacteristicSet.of(study)
+    evaluator: Any = SimpleNamespace(
+        characteristics=members, evaluate=lambda rows, _: plant.evaluate(rows)
+    )
+    settings = np.tile(members.original, (3, 1))
+    settings[:, members.names.index("brakeTorque")] = 0.6, 0.6, 0.8
+    settings[:, members.names.index("speed")] = 30, 50, 30
+    frame = pd.DataFrame(settings, columns=[*members.names])
+    frame = frame.assign(outcome="collision", safety_degree=-1.0)
+    subject: Any = SimpleNamespace(solutions=frame)
+    options: dict[str, Any] = {"limits": {}, "unsafe": Unsafe(), "criterion": None, "margin": None}
+    columns = [*range(len(members.vehicle))]
+    original = plant.evaluate(members.original_settings)
+    asked = Asked(subject, evaluator, columns, original=original, fits=0, budget=0, **options)
+    known: FloatArray = asked._replace(up_to="speed=40").unsafe_solutions
+    assert known.tolist() == [settings[0].tolist()]
+    assert len(asked.unsafe_solutions) == 3, "those of results about the whole study all count"
+
+
+@pytest.mark.slow
+def test_limits_up_to_a_larger_value_are_never_wider(ahead: Study) -> None:
+    study = msgspec.structs.replace(ahead, wider="")
+    options = {**ROUGH, "characteristics": ("brakeTorque,sensorLatency",)}
+    answers = [tolerance(study, up_to=f"speed={value}", **options) for value in (30, 40, 50, 60)]
+    for slower, faster in pairwise(answers):
+        for kind in ("alone", "together"):
+            for end, sign in (("low", 1), ("high", -1)):
+                ends = [one.values(f"limits.{kind}_{end}") for one in (slower, faster)]
+                assert (sign * np.array(ends[0]) <= sign * np.array(ends[1])).all(), (kind, end)
