@@ -155,22 +155,6 @@ def domains_of_axes(study: Study, test: MatrixTest, scenario: Scenario) -> dict[
     }
 
 
-def with_random_places(
-    model: Model, new_car: Unsafe, tests: Sequence[MatrixTest], count: int
-) -> Model:
-    """A model with random places between the values of some tests, at which the original is not
-    unsafe by `new_car`; for another `count` there are others.
-    """
-    rng = Stream.TESTS_BETWEEN.generator(model.evaluator.study.search.seed, count)
-    for test in moving_tests(with_tests(model, tests, alone=True), new_car) if tests else ():
-        settings = test.spread(test.original[np.newaxis], rng)
-        settings = test.at_printed_places(settings)
-        originals = test.model.evaluate(settings, "original vehicle between the tests")
-        is_kept = originals.valid & ~new_car.of(originals)
-        model = with_tests(model, test.encounters(settings[is_kept]))
-    return model
-
-
 def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
     """A model at further tests beside those of its matrix, or at these `alone`; a point that the
     matrix has counts once.
