@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""
 NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
-ALL_CARS = "all cars within these limits"
-"""How the only row is called that stands for limits."""
 
 
 @question
@@ -170,10 +168,11 @@ def read_cars(
         rows = study.vehicle.characteristics
         with about("limits"):
             names = limits_of(limits, rows)
-        cars = {ALL_CARS: {name: rows[name].original for name in names}}
-    columns = [column for column in CARS if column != "car"]
+        cars = {
+            f"all cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
+        }
     return read_fleet(
-        study, members, cars, values, others=others, ignore=ignore, answer_columns=columns
+        study, members, cars, values, others=others, ignore=ignore, answer_columns=CARS
     )
 
 

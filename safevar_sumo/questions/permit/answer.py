@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from safevar_sumo.campaign.identity import manifest_now
@@ -77,7 +78,7 @@ class PermitAnswer:
         return Answer(
             question="permit",
             study=self.study,
-            verdict=" ".join(self._sentences(len(rows), counts, too_slow, scope)),
+            verdict=" ".join(self._sentences(cars, counts, too_slow, scope)),
             tested=self._tested(),
             numbers={
                 "unsafe": str(own),
@@ -132,21 +133,30 @@ class PermitAnswer:
         return rows
 
     def _sentences(
-        self, number: int, counts: Mapping[str, int], too_slow: int, scope: str
+        self, cars: pd.DataFrame, counts: Mapping[str, int], too_slow: int, scope: str
     ) -> list[str]:
         """The verdict: how many cars may drive, what is safe, and what was not driven."""
         span = self.span
         unit = unit_text(span.unit)
         top = f"{span.high:g}{unit}"
-        as_new = f"the new car may drive up to {self.new_car.up_to:g}{unit}"
+        number = len(cars)
+        new_car = f"the new car may drive up to {self.new_car.up_to:g}{unit}"
         goal = top if self.need is None else f"{self.need:g}{unit}"
-        drive = f"{counts[DRIVE]} may drive {goal}, or as fast as the new car"
-        parts = [
-            *([drive] if not self.is_quick else []),
-            f"{counts[LIMITED]} up to a lower {span.name.replace('_', ' ')}",
-            f"{counts[STOP]} not even {span.low:g}{unit}",
-        ]
-        sentences = [f"Of {number_of(number, 'car')}, {join_phrases(parts)} ({as_new})."]
+        phrases = {
+            DRIVE: f"may drive {goal} or as fast as the new car",
+            LIMITED: f"may drive up to a lower {span.name.replace('_', ' ')}",
+            STOP: f"may not drive, not even at {span.low:g}{unit}",
+        }
+        of_all = f" of {number_of(number, 'car')}"
+        parts = list[str]()
+        for verdict, phrase in phrases.items():
+            if counts[verdict]:
+                parts.append(f"{counts[verdict]}{of_all if not parts else ''} {phrase}")
+        sentences = [f"{join_phrases(parts)}; {new_car}."]
+        if self.is_box:
+            name, up_to = cars.iloc[0][["car", "up_to"]]
+            may = "may not drive" if np.isnan(up_to) else f"may drive up to {up_to:g}{unit}"
+            sentences = [f"{name[:1].upper()}{name[1:]} {may}; {new_car}."]
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
         sentences.append(f"Safe means: {self._safe_in_words()}.")
