@@ -30,12 +30,14 @@ STAGE = "what fails first"
 
 class Failure(NamedTuple):
     """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with
-    the encounter, and the parameters of the point of the matrix where it does.
+    the encounter, the parameters of the point of the matrix where it does, and its breach of the
+    criterion alone.
     """
 
     setting: FloatArray
     words: str
     point: JsonObject
+    breach: str
 
 
 def describe(
@@ -106,10 +108,11 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
         )
+        breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
         if model.unsafe.is_of_impacts and runs.collided[row]:
-            how = f"the car {model.unsafe.breach_in_words(runs.take(np.array([row])))}"
+            how = f"the car {breach}"
         where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
-        failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters))
+        failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters), breach)
     return failures
 
 

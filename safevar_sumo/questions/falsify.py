@@ -101,15 +101,17 @@ def falsify_all(
     budget: int,
     rngs: Sequence[np.random.Generator],
     generation: int = GENERATION,
+    begun: Sequence[Falsification] = (),
 ) -> list[Falsification]:
     """Falsify the claim about several boxes side by side, each with `budget` simulations,
     `generation` of them at once: a judge meets a generation of all boxes together, as few large
-    batches cost less than many small ones.
+    batches cost less than many small ones. What was `begun` goes on with its children.
     """
     found = dict[int, Falsification]()
+    before: Sequence[Falsification | None] = begun or [None] * len(boxes)
     steps = [
-        _steps(box, len(judges), of_box, budget, generation, rng)
-        for box, of_box, rng in zip(boxes, known, rngs, strict=True)
+        _steps(box, len(judges), of_box, budget, generation, rng, of_before)
+        for box, of_box, rng, of_before in zip(boxes, known, rngs, before, strict=True)
     ]
     waiting = dict[int, _Generation]()
 
@@ -152,15 +154,22 @@ def _steps(
     budget: int,
     size: int,
     rng: np.random.Generator,
+    found: Falsification | None,
 ) -> Generator[_Generation, FloatArray, Falsification]:
     """The generations of a falsification, which takes what each leaves."""
-    found = Falsification(np.zeros((0, len(box.lower))), np.zeros(0, dtype=np.intp), np.zeros(0), 0)
+    empty = np.zeros((0, len(box.lower)))
+    found = found or Falsification(empty, np.zeros(0, dtype=np.intp), np.zeros(0), 0)
     seen = set[tuple[int, bytes]]()
     generations_left = 1 + MORE_GENERATIONS
-    settings = np.concatenate([found.settings, *known])
+    settings = np.concatenate([empty, *known])
     numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(np.intp)
     least = np.full(n_judges, np.inf)
     generation = 0
+    if len(found.settings):
+        np.minimum.at(least, found.judges, found.robustness)
+        generation = 1
+        settings = _children(box, found, max(size, GENERATION), rng)
+        numbers = _pair(least, generation)[np.arange(len(settings)) // 2 % 2]
     while found.simulated < budget:
         # The first generation holds all known settings, and random ones; more known settings than
         # a generation get as many random ones beside them.

@@ -174,10 +174,13 @@ def models_of(
     left_out = list[Model]()
     for number, fitted in enumerate(studies, 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
+        if with_unsafe_originals:
+            members.append(model)
+            continue
         original = model.evaluator.evaluate(
             evaluator.characteristics.original_settings, "original with each parameter set"
         )
-        if not with_unsafe_originals and (unsafe.of(original)[0] or not original.valid[0]):
+        if unsafe.of(original)[0] or not original.valid[0]:
             left_out.append(model._replace(unsafe=unsafe))
         else:
             members.append(model)

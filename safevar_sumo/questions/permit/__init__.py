@@ -18,7 +18,7 @@ from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
 from safevar_sumo.questions.permit.answer import PermitAnswer
 from safevar_sumo.questions.permit.encounters import Span, span_of
@@ -121,7 +121,9 @@ def permit(
     models = models_of(
         evaluator, _criterion(evaluator, unsafe, margin), fits, with_unsafe_originals=True
     )
-    search = PermitSearch(models, span, values, 0 if quick else attack)
+    # A claim about all cars within limits gets the search of one about joint limits.
+    budget = max(attack, USUAL_BUDGET) if limits else attack
+    search = PermitSearch(models, span, values, 0 if quick else budget)
     repairs = [] if quick or limits else [REPAIR_STAGE]
     evaluator.plan({**dict.fromkeys(search.stages(), 1.0), **dict.fromkeys(repairs, 6.0)})
     new_car, *permits = search.reach(
@@ -189,7 +191,7 @@ def _check_forms(
     ]
     if len(given) != 1:
         raise InputError(
-            "permit", f"{join_phrases(given) or 'no car'} given", "--cars, --set or --limits"
+            "permit", f"{join_phrases(given or ['no car'])} given", "--cars, --set or --limits"
         )
     if out is None:
         return

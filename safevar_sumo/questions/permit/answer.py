@@ -153,10 +153,10 @@ class PermitAnswer:
             if counts[verdict]:
                 parts.append(f"{counts[verdict]}{of_all if not parts else ''} {phrase}")
         sentences = [f"{join_phrases(parts)}; {new_car}."]
-        if self.is_box:
-            name, up_to = cars.iloc[0][["car", "up_to"]]
+        if number == 1:
+            name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
             may = "may not drive" if np.isnan(up_to) else f"may drive up to {up_to:g}{unit}"
-            sentences = [f"{name[:1].upper()}{name[1:]} {may}; {new_car}."]
+            sentences = [f"{name[:1].upper()}{name[1:]} {may}; {new_car}. {because_of}"]
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
         sentences.append(f"Safe means: {self._safe_in_words()}.")

@@ -24,7 +24,7 @@ from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 
-SPREAD_PLACES = 6
+SPREAD_PLACES = 4
 """Number of Sobol points over the other parameters that a vehicle meets at each speed."""
 MOST_ENDS = 4
 """Number of them of whose ends all combinations are met, too, each with ends of the others."""
@@ -100,14 +100,14 @@ class EncounterRange(NamedTuple):
             return np.full(len(settings), self.low)
         return settings[:, self.column]
 
-    def places(self, value: float, attempt: int) -> FloatArray:
+    def places(self, value: float) -> FloatArray:
         """Encounters at a value of the parameter, as they are printed, shape (P, searched
-        parameters): Sobol points and ends of all others; in another `attempt` there are others.
+        parameters): Sobol points and ends of all others.
         """
         members = self.model.evaluator.characteristics
         count = self.number_of_characteristics
         others = [at for at in range(count, len(members)) if at != self.column]
-        points = unit_places(len(others), value, attempt)
+        points = unit_places(len(others), value)
         settings = np.zeros((len(points), len(members)))
         lower, upper = members.lower[others], members.upper[others]
         settings[:, others] = lower + points * (upper - lower)
@@ -144,13 +144,13 @@ class EncounterRange(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def unit_places(dimensions: int, value: float, attempt: int) -> FloatArray:
-    """Sobol points and corners in the unit cube, shape (P, dimensions), for a value of a parameter
-    and an attempt.
+def unit_places(dimensions: int, value: float) -> FloatArray:
+    """Sobol points and corners in the unit cube, shape (P, dimensions), for a value of a
+    parameter.
     """
     if not dimensions:
         return np.zeros((1, 0))
-    seed = zlib.crc32(np.array([value, attempt]).tobytes())
+    seed = zlib.crc32(np.array([value]).tobytes())
     corners = np.array([*product((0.0, 1.0), repeat=min(dimensions, MOST_ENDS))])
     others = dimensions - corners.shape[1]
     further = np.random.default_rng(seed).integers(0, 2, size=(len(corners), others))

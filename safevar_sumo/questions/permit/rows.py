@@ -67,7 +67,6 @@ def failures_in_words(
         point = model.evaluator.system.points[0]
         rows = np.array([failure.setting for failure in known])
         described = failures_at(model, rows)
-        runs = model.evaluate(rows, "what fails first")
         for row, number in enumerate(numbers):
             setting = rows[row]
             words = described[row].words.partition(" (parameter set")[0]
@@ -91,7 +90,7 @@ def failures_in_words(
             found[number] = FailureInWords(
                 test=known[row].encounters.test or None,
                 encounter=", ".join(texts) or None,
-                outcome=model.unsafe.breach_in_words(runs.take(np.array([row]))),
+                outcome=described[row].breach,
                 sentence=words,
             )
     return found

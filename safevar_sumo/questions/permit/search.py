@@ -14,6 +14,8 @@ from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSea
 from safevar_sumo.records import BoolArray, FloatArray
 
 REPAIR_STAGE = "cars with one part as new"
+MOST_LIMITING = 3
+"""Number of failures of a car that each repair of it meets first."""
 
 
 class Reached(NamedTuple):
@@ -39,6 +41,12 @@ class Permit(NamedTuple):
     @property
     def up_to(self) -> float | None:
         return self.least.up_to
+
+    @property
+    def limiting(self) -> list[LimitingFailure]:
+        """The failures at the least values, of several parameter sets."""
+        failures = [each.failure for each in self.reached if each.failure is not None]
+        return sorted(failures, key=lambda failure: failure.value)[:MOST_LIMITING]
 
     @property
     def order(self) -> float:
@@ -142,7 +150,7 @@ class PermitSearch:
             worn = np.flatnonzero(measured[row] & (settings[row] != original))
             is_limited = permit.up_to is None or permit.up_to < top
             bounds.append(dict.fromkeys(worn.tolist() if is_limited else [], np.inf))
-            failures.append([each.failure for each in permit.reached if each.failure is not None])
+            failures.append(permit.limiting)
         while any(bounds):
             self._lower(bounds, failures, settings, original)
             # The most promising repair of each car, unless a better one is known.

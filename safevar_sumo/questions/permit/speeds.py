@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.falsify import falsify_all
+from safevar_sumo.questions.falsify import PARENTS, Falsification, falsify_all
 from safevar_sumo.questions.permit.encounters import MOST_VEHICLES, EncounterRange
 from safevar_sumo.questions.sampling import Stream, sobol_points
 from safevar_sumo.records import FloatArray
@@ -27,10 +27,8 @@ cars.
 """
 EFFICIENT = 512
 """Number of cars times values that fill a batch: a smaller one costs hardly less."""
-KEPT = 32
-"""Number of the worst encounters of the grid with which the falsification of a car begins."""
-GENERATIONS = 2
-"""Number of generations of a falsification."""
+GENERATION = 256
+"""Number of simulations of a generation of the falsification."""
 LEAST_BUDGET = 64
 """Fewest simulations of a falsification of one car in one test."""
 SPREAD = 128
@@ -152,7 +150,7 @@ class SpeedSearch:
         values = [begin] if next_value in block else []
         if encounters.column is not None:
             values += [v for v in block.tolist() if encounters.low < v <= encounters.high]
-        return [encounters.places(value, 0) for value in values]
+        return [encounters.places(value) for value in values]
 
     def _drive(self, number: int, cars: Sequence[int], places: FloatArray) -> None:
         """Have cars meet encounters of a test, and keep what they met and what fails."""
@@ -164,21 +162,15 @@ class SpeedSearch:
             self._note(car, encounters, own, left)
             self._met[car][number].append((own, left))
 
-    def _worst(self, car: int, number: int, box: Box) -> FloatArray:
-        """The worst encounters of a test that a car has met within a box."""
+    def _met_within(self, car: int, number: int, box: Box) -> Falsification:
+        """What a car has met of a test within a box, the worst first."""
         met = self._met[car][number]
         settings = np.concatenate([np.zeros((0, len(box.lower))), *(own for own, _ in met)])
         robustness = np.concatenate([np.zeros(0), *(left for _, left in met)])
         is_inside = box.holds(settings) & np.isfinite(robustness)
-        order = np.argsort(robustness[is_inside], kind="stable")
-        return np.asarray(settings[is_inside][order][:KEPT])
-
-    def _at_value(self, car: int, number: int, attempt: int) -> FloatArray:
-        """A car in other encounters of a test at its value."""
-        encounters = self._ranges[number]
-        up_to = self.up_to(car)
-        assert up_to is not None
-        return self._settings(car, encounters.places(min(up_to, encounters.high), attempt))
+        order = np.flatnonzero(is_inside)[np.argsort(robustness[is_inside], kind="stable")]
+        worst = order[:PARENTS]
+        return Falsification(settings[worst], np.zeros(len(worst), int), robustness[worst], 0)
 
     def _settings(self, car: int, places: FloatArray) -> FloatArray:
         """The settings in which the vehicles of a car meet encounters, some of them in each."""
@@ -236,22 +228,17 @@ class SpeedSearch:
         if not boxes:
             return []
 
-        # All cars side by side, each first in its worst encounters, and at its value elsewhere.
-        known = [
-            [np.concatenate([self._worst(car, number, box), self._at_value(car, number, attempt)])]
-            for car, box in boxes.items()
-        ]
+        # All cars side by side, each from what it met on the grid.
+        met = [self._met_within(car, number, box) for car, box in boxes.items()]
         stream = encounters.model.fit, number, attempt
         rngs = [Stream.PERMIT.generator(self._cars[car].number, *stream) for car in boxes]
         share = max(budget // len(self._ranges), LEAST_BUDGET)
         judge = partial(encounters.robustness, stage=self._stage)
-        generation = max(share // GENERATIONS, LEAST_BUDGET)
+        results = falsify_all(
+            *([*boxes.values()], [judge], [()] * len(boxes), share, rngs, GENERATION), begun=met
+        )
         failing = list[int]()
-        for car, found in zip(
-            boxes,
-            falsify_all([*boxes.values()], [judge], known, share, rngs, generation),
-            strict=True,
-        ):
+        for car, found in zip(boxes, results, strict=True):
             self.attacked += found.simulated
             settings = encounters.as_printed(found.settings)
             failing += [car] if self._note(car, encounters, settings, found.robustness) else []
