@@ -45,6 +45,7 @@ COMMANDS = (
     'tolerance wear --limits "treadDepth >= 3"',
     "tolerance sun_joint",
     "tolerance wear_joint",
+    "permit wear_joint --set treadDepth=3 --set payload=300 --set brakeTorque=0.9",
     "repair wear --promise all",
     "report results/rain",
 )

@@ -115,27 +115,15 @@ def permit(
     members = evaluator.characteristics.vehicle
     _check_forms(cars, set, limits, out)
     fleet = read_cars(study, cars, set, limits, others, ignore)
-    asked = [Cars.one(setting) for setting in fleet.settings]
-    if limits:
-        asked = [_within(members, limits, study, fleet.settings[0])]
-    models = models_of(
-        evaluator, _criterion(evaluator, unsafe, margin), fits, with_unsafe_originals=True
-    )
+    criterion = _criterion(evaluator, unsafe, margin)
+    models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
     budget = max(attack, USUAL_BUDGET) if limits else attack
     search = PermitSearch(models, span, values, 0 if quick else budget)
-    repairs = [] if quick or limits else [REPAIR_STAGE]
-    evaluator.plan({**dict.fromkeys(search.stages(), 1.0), **dict.fromkeys(repairs, 6.0)})
-    new_car, *permits = search.reach(
-        [Cars.one(members.original), *asked], [-np.inf, *[None] * len(asked)]
-    )
-    if new_car.up_to is None:
-        words = failures_in_words([new_car.least.failure])[0].sentence
-        problem = f"the new car is not safe at {span.low:g}{unit_text(span.unit)}: {words}"
-        raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
-    repaired: list[tuple[int, Permit] | None] = [None] * len(permits)
-    if repairs:
-        repaired = search.repair_first(fleet.settings, fleet.measured, members.original, permits)
+    asked = [Cars.one(setting) for setting in fleet.settings]
+    if limits:
+        asked = [_within(members, limits, study, fleet.settings[0])]
+    new_car, permits, repaired = _drive(evaluator, search, fleet, asked, is_rough=quick)
     result = PermitAnswer(
         study=study,
         span=span,
@@ -152,6 +140,40 @@ def permit(
         with whole_file(Path(out), "out") as file:
             file.write_text(answer.render("csv"), encoding="utf-8")
     return answer
+
+
+def _drive(
+    evaluator: Evaluator,
+    search: PermitSearch,
+    fleet: Fleet,
+    asked: Sequence[Cars],
+    *,
+    is_rough: bool,
+) -> tuple[Permit, list[Permit], list[tuple[int, Permit] | None]]:
+    """How far the new car and each of the others are safe, and the best repair of each.
+
+    Raises
+    ------
+    InputError
+        If the new car is not safe at the least value.
+    """
+    members = evaluator.characteristics.vehicle
+    # Repairs of cars, not of limits.
+    repairs = [REPAIR_STAGE] if not is_rough and len(asked[0].vehicles) == 1 else []
+    evaluator.plan({**dict.fromkeys(search.stages(), 1.0), **dict.fromkeys(repairs, 6.0)})
+    above = [-np.inf, *[None] * len(asked)]
+    new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
+    if new_car.up_to is None:
+        study = evaluator.study
+        words = failures_in_words([new_car.least.failure])[0].sentence
+        problem = (
+            f"the new car is not safe at {search.values[0]:g}{unit_text(search.unit)}: {words}"
+        )
+        raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
+    if not repairs:
+        return new_car, permits, [None] * len(permits)
+    settings, measured = fleet.settings, fleet.measured
+    return new_car, permits, search.repair_first(settings, measured, members.original, permits)
 
 
 def read_cars(

@@ -120,7 +120,8 @@ def because(
     if up_to is None:
         return f"Not even at {span.low:g}{unit}: {words.sentence}."
     if not words.sentence:
-        return f"Safe up to {up_to:g}{unit}, the greatest value that was driven."
+        name = span.name.replace("_", " ")
+        return f"Safe up to {up_to:g}{unit}, the greatest {name} that was driven."
     sentence = words.sentence[:1].upper() + words.sentence[1:]
     if verdict != DRIVE:
         return f"{sentence}."

@@ -79,6 +79,11 @@ class PermitSearch:
         self._ranges = dict[int, list[EncounterRange]]()
         self._models_in_order = [*models.members]
 
+    @property
+    def unit(self) -> str:
+        """The unit of the values."""
+        return self._span.unit
+
     def stages(self) -> list[str]:
         """The phases of progress."""
         return [self._stage(model.fit) for model in self._models.members]
