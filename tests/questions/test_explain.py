@@ -13,7 +13,6 @@ import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.api.study import _verdict
 from safevar_sumo.campaign.questions import COMPILING
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -35,14 +34,13 @@ from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, printed_limits
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.progress import Phases
-from safevar_sumo.questions.subject import load
 from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.results import choose_handle, handles_of, row_of_handle, solutions_frame
+from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, json_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
@@ -121,12 +119,8 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
         explain.compute(case, evaluator, solution=("nsga2:7:0",))
 
 
-def test_every_boundary_is_unsafe_as_it_is_printed(
-    slippery: Path, case: Case, explained: Answer
-) -> None:
-    """Also each change alone at its boundary; and the solution in the verdict of `study` ends as in
-    the table of solutions.
-    """
+def test_every_boundary_is_unsafe_as_it_is_printed(case: Case, explained: Answer) -> None:
+    """Also each change alone at its boundary."""
     table = explained.tables["causes"]
     columns = columns_of(table)
     typed = []
@@ -143,13 +137,29 @@ def test_every_boundary_is_unsafe_as_it_is_printed(
     system = assemble(case.study)
     assert case.unsafe.of(drive_and_score(system, np.array(settings))).all()
 
-    handle = choose_handle(case.solutions, case.unsafe, "fewest")
-    solution = case.solutions.iloc[row_of_handle(case.solutions, handle)]
-    verdict, rows = _verdict(load(slippery), case, system)
-    assert f"collides at {-solution['f_safe']:.2f} m/s" in verdict
-    again = case.characteristics.setting({name: value for name, _, _, value in rows})
-    degree = drive_and_score(system, again[np.newaxis]).f_safe[0]
-    assert f"{degree:.2f}" == f"{solution['f_safe']:.2f}"
+
+@pytest.mark.slow
+def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
+    slippery: Path, case: Case
+) -> None:
+    """In the verdict of `study`, as `simulate` chooses them, and typed as the verdict says."""
+    verdict = json_of("study", str(slippery.parent / "slippery.toml"), "--out", str(slippery))[
+        "verdict"
+    ]
+    command = verdict.partition("It is simulated by python -m safevar_sumo ")[2].partition(". ")[0]
+    typed, chosen = (
+        json_of(*one)["numbers"]
+        for one in (command.split(), ("simulate", str(slippery), "--solution", "fewest"))
+    )
+    assert f"the vehicle collides at {-typed['safety_degree']:.2f} m/s" in verdict
+    assert chosen["safety_degree"] == typed["safety_degree"]
+    values = dict(re.findall(r"--set (\w+)=(\S+)", command))
+    assert f"With {len(values)} change" in verdict
+    crashes = case.solutions[case.solutions["outcome"] == "collision"]
+    assert len(values) <= crashes["f_num_diff"].min()
+    for left_out in values:
+        rest = [f"--set={name}={value}" for name, value in values.items() if name != left_out]
+        assert json_of("simulate", str(slippery), *rest)["numbers"]["outcome"] == "stopped"
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(

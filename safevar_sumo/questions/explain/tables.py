@@ -19,7 +19,7 @@ from safevar_sumo.questions.causes import (
     find_cause_limits,
     settings_of,
 )
-from safevar_sumo.questions.counterexamples import describe
+from safevar_sumo.questions.counterexamples import values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
     Population,
@@ -223,7 +223,7 @@ def printed_limits(
     """
     pairs = list(zip(causes, limits, strict=True))
     exact = [limit.boundary | cause.encounter for cause, limit in pairs]
-    printed = _as_printed(model, exact)
+    printed = values_as_printed(model, exact)
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
     whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
@@ -241,7 +241,7 @@ def printed_limits(
         for values, (cause, limit) in zip(printed, pairs, strict=True)
         for name, value in limit.single_boundary.items()
     ]
-    found = iter(_as_printed(model, alone))
+    found = iter(values_as_printed(model, alone))
     return [
         {
             "encounter": {name: values[name] for name in cause.encounter},
@@ -250,16 +250,6 @@ def printed_limits(
         }
         for values, cause in zip(printed, causes, strict=True)
     ]
-
-
-def _as_printed(model: Model, vehicles: Sequence[dict[str, float]]) -> list[dict[str, float]]:
-    """Values of vehicles, all else as in the original, as `describe` prints them, or as they are
-    where it prints none.
-    """
-    members = model.evaluator.characteristics
-    settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
-    settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
-    return [members.named(one) for one in settings.values()]
 
 
 def _holding(
