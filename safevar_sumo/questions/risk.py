@@ -58,6 +58,9 @@ UNSURE = 0.5
 """Width of an interval of a share of the variance from which on the verdict says that it is unsure
 [-].
 """
+MAX_RIVALS = 3
+"""Largest number of characteristics that the verdict names beside the one with the largest share.
+"""
 NO_PROBABILITY = (
     " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
 )
@@ -183,8 +186,8 @@ def _bound_in_words(high: float, total: int, confidence: float) -> str:
 
 
 def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
-    """Which characteristic has the largest share of the variance of the table's measure, and which
-    shares are unsure.
+    """Which characteristic decides the table's measure, as the interval of its share of the
+    variance is above those of all others, or which may; and which shares are unsure.
     """
     if table.empty:
         return ""
@@ -197,10 +200,17 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
         name = first["characteristic"]
-        words = (
-            f" {name} decides most: it causes {100 * share:.0f} % of the variance of"
-            f" {in_words['degree']} ({100 * low:.0f} to {100 * high:.0f} %)."
+        causes = (
+            f"causes {100 * share:.0f} % of the variance of {in_words['degree']}"
+            f" ({100 * low:.0f} to {100 * high:.0f} %)"
         )
+        _, *rivals = table[table[f"degree_{index}{HIGH}"] >= low]["characteristic"]
+        words = f" {name} decides most: it {causes}."
+        if rivals:
+            words = (
+                f" What decides most is uncertain: {name} {causes}, and the interval of"
+                f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
+            )
 
     # Shares that are too unsure.
     of_output = {

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import html
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,7 +100,8 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
         None
     ] * 3
     results = SimpleNamespace(case=case, study=case.study, directory="results")
-    verdict, _ = _verdict(results, case, None)
+    stated = replace(case, stated=Unsafe(points=points - 1e-3))
+    verdict, _ = _verdict(results, stated, None)
     assert "With 1 change, the fewest that were found, the vehicle earns " in verdict
     assert "brakeTorque 1 -> 0." in verdict
 

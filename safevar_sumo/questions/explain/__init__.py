@@ -14,7 +14,13 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
-from safevar_sumo.questions.causes import BOUNDARIES, OTHER_SETS, SUBSETS, count_needed
+from safevar_sumo.questions.causes import (
+    BOUNDARIES,
+    OTHER_SETS,
+    SUBSETS,
+    count_distinct_causes,
+    count_needed,
+)
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
@@ -144,11 +150,12 @@ def explain(
 
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
+    distinct = count_distinct_causes(evaluator.characteristics, of_sample)
     tables = {
-        "causes": causes_table(population, evaluator, fits, solutions, of_chosen),
+        "causes": causes_table(population, evaluator, fits, solutions, of_chosen, distinct),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions),
-        "distinct_causes": distinct_table(evaluator, of_sample),
+        "distinct_causes": distinct_table(distinct),
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
