@@ -62,14 +62,6 @@ class Falsification(NamedTuple):
             for judge in np.unique(self.judges[is_unsafe]).tolist()
         }
 
-    def merged(self, other: Falsification) -> Falsification:
-        """Both falsifications as one."""
-        robustness = np.concatenate([self.robustness, other.robustness])
-        worst = np.argsort(robustness, kind="stable")
-        settings = np.concatenate([self.settings, other.settings])[worst]
-        judges = np.concatenate([self.judges, other.judges])[worst]
-        return Falsification(settings, judges, robustness[worst], self.simulated + other.simulated)
-
 
 def enough(budget: int) -> int:
     """The number of simulations with which a value that is printed is tested; 0 leaves the

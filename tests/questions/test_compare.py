@@ -169,20 +169,6 @@ def test_none_of_four_worse_versions_is_released(
 
 
 @pytest.mark.slow
-def test_a_slower_sensor_meets_the_same_changes() -> None:
-    wear = load_study("wear", **ONE_TEST)
-    slower = load_study(
-        "wear", **ONE_TEST, vehicle={"characteristics": {"sensorLatency": {"original": 0.15}}}
-    )
-    answer = sv.compare(wear, slower, samples=16, pool=POOL)
-    frame = answer.tables["settings"]
-    np.testing.assert_allclose(frame["b_sensorLatency"] - frame["sensorLatency"], 0.1)
-    assert frame["b_sensorLatency"].max() <= 0.4
-    assert answer.numbers["b_degree"] < answer.numbers["a_degree"]
-    assert "sensorLatency 0.05 and 0.15 s" in answer.verdict
-
-
-@pytest.mark.slow
 def test_without_benign_scenes_nothing_is_called_better() -> None:
     wear, early = (
         load_study("wear", **ONE_TEST),
@@ -191,7 +177,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
     answer = sv.compare(wear, early, samples=16, pool=POOL)
     assert answer.numbers["better_in"] > 0 == answer.numbers["worse_in"]
     assert answer.verdict.startswith("DECIDE: B is safer than A, but may brake more often")
-    assert "Needless braking was not measured" in answer.verdict
+    assert "need, which was not measured." in answer.verdict
     assert answer.numbers["b_needless_braking"] is None
     assert answer.numbers["metres_earlier"] > 0
 
@@ -232,6 +218,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
         2500,
     ]
     assert answer.numbers["a_degree"] > answer.numbers["b_degree"]
+    assert "mass 2404 and 2500 kg" in answer.verdict
     assert answer.figure().axes
 
 

@@ -34,7 +34,6 @@ from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, MAX_DISTINCT, printed_limits
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
@@ -398,38 +397,6 @@ def test_progress_of_a_stage_counts_all_calls_and_numbers_it() -> None:
     assert shown[-1][1:] == (6, 0)
     counts = [*dict.fromkeys((done, total) for _, done, total in shown)]
     assert counts == [(0, 4), (3, 4), (3, 5), (5, 5), (5, 0), (6, 0)]
-
-
-def test_a_stage_that_begins_again_counts_in_the_one_under_way() -> None:
-    """A test of 3 settings, a search, another test of 2, which counts in the search, as there is no
-    way back: alone, and within a whole.
-    """
-    shown = list[tuple[str, int, int]]()
-    evaluator = made_up_evaluator(1, nowhere)
-    evaluator.phases = Phases(
-        lambda *values: shown.append(values) if values[0] in ("test", "search", "whole") else None
-    )
-
-    def test_twice() -> None:
-        for number, name in ((3, "test"), (4, "search"), (2, "test")):
-            with evaluator.stage(name, number if name == "test" else None):
-                evaluator.evaluate(np.arange(number)[:, np.newaxis] + 1.0, "a call")
-
-    test_twice()
-    assert [*dict.fromkeys(shown)] == [
-        *[
-            ("test", 0, 3),
-            ("test", 3, 3),
-            ("search", 0, 0),
-            ("search", 4, 0),
-            ("search", 4, 6),
-            ("search", 6, 6),
-        ]
-    ]
-    shown.clear()
-    with evaluator.stage("whole"):
-        test_twice()
-    assert [*dict.fromkeys(shown)] == [("whole", done, 0) for done in (0, 3, 7, 9)]
 
 
 def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -210,15 +210,11 @@ def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> No
             f"degree_total{LOW}": [0.5, 0.3],
             f"degree_total{HIGH}": [0.7, of_b],
             "unsafe_total": [1.37, 0.0],
-            f"unsafe_total{LOW}": [-0.26, 0.0],
-            f"unsafe_total{HIGH}": [3.01, 0.0],
         }
     )
     frame.attrs = {"of_what": OUTPUTS}
-    words = deciding_in_words(frame, 120)
-    assert said in words
-    assert words.endswith("their intervals are up to 327 percentage points wide.")
-    frame.loc[:, "unsafe_total":] = np.nan
+    assert said in deciding_in_words(frame, 120)
+    frame["unsafe_total"] = np.nan
     assert "that needs 100 unsafe and as many safe vehicles" in deciding_in_words(frame, 1)
     assert "unknown" not in deciding_in_words(frame, 0)
     assert deciding_in_words(frame.iloc[:0], 0) == ""

@@ -23,11 +23,12 @@ from safevar_sumo.questions.ask import Count, Criterion, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
     BOTH,
+    COLLISION,
+    COMFORT,
     GROWN,
     LIMIT_COLUMNS,
     SHRUNK,
     Difference,
-    compare_collisions,
     compare_counts,
     compare_limits,
     compare_originals,
@@ -140,15 +141,15 @@ def compare(
     study = evaluator.study
     evaluator.plan({BOTH_STAGE: 1, SCAN_STAGE: 2})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
-    evaluators, subjects = (evaluator, second), (subject, other)
+    evaluators = (evaluator, second)
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
     originals = [side.evaluate_original() for side in evaluators]
-    criteria = _criteria(subjects, evaluators, originals, unsafe, margin)
+    criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
-    pairs, outside = pairs_of(subjects, common, criteria, samples)
+    pairs, outside = pairs_of((subject, other), common, criteria, samples)
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
@@ -158,26 +159,17 @@ def compare(
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria, titles[0])
-    collisions = compare_collisions(evaluators, titles[0])
     differences = [
-        *collisions,
-        *compare_counts(counts, titles[0]),
-        *compare_limits(alone, evaluator.characteristics.vehicle.members),
         *of_new_cars,
+        *compare_counts(counts, titles[0]),
+        *compare_limits(alone),
         *compare_values(tested.quantity, tested.p, tested.a12),
     ]
-    is_measured = bool(of_originals["benign_scenes"])
-    has_new_onsets = any(of_originals[name] for name in ("metres_earlier", "metres_later"))
-    decision, why = _decide(
-        differences,
-        titles,
-        collides=bool(collisions),
-        measured=is_measured or not (differences or has_new_onsets),
-    )
+    decided, why = _decide(differences, titles, of_originals)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
-        "decision": decision.lower(),
-        **_numbers(criteria[0], counts, tested, differences, alone["change"]),
+        **decided,
+        **_numbers(criteria[0], counts, tested, alone["change"]),
         "outside": outside,
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
         **of_originals,
@@ -185,8 +177,7 @@ def compare(
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         why,
-        *_criterion_in_words(criteria[0], is_measured=is_measured),
-        *_basis_in_words(common, limits),
+        *_basis_in_words(criteria[0], common, limits),
         *counted_in_words(study, pairs.number_infeasible),
     ]
     return Answer(
@@ -197,7 +188,7 @@ def compare(
         numbers=numbers,
         tables={"limits": alone, "pairs": tested.pairs, "settings": _table(common, settings)},
         folded=("settings",),
-        failures=(why,) if decision == DO_NOT_RELEASE else (),
+        failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
     )
 
@@ -206,10 +197,9 @@ def _numbers(
     criterion: Unsafe,
     counts: Mapping[str, int],
     tested: _PairedTest,
-    differences: Sequence[Difference],
     changes_of_limits: pd.Series[str],
 ) -> JsonObject:
-    """What was compared, and in how much B is better and worse."""
+    """What was compared."""
     return {
         "unsafe": str(criterion),
         "margin": criterion.keep,
@@ -217,8 +207,6 @@ def _numbers(
         **counts,
         "p": tested.p,
         "a12": tested.a12,
-        "better_in": sum(one.is_better for one in differences),
-        "worse_in": sum(not one.is_better for one in differences),
         "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
         "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
     }
@@ -347,27 +335,28 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
 
 
 def _decide(
-    differences: Sequence[Difference], titles: Sequence[str], *, collides: bool, measured: bool
-) -> tuple[str, str]:
+    differences: Sequence[Difference], titles: Sequence[str], of_originals: JsonObject
+) -> tuple[JsonObject, str]:
     """Whether to release B, and why: with a new collision never, and not if it is worse in safety
     and better in needless braking at most. What is better in some and worse in other things is for
-    a person to decide; so is every change whose needless braking was not `measured`.
+    a person to decide; so is every change whose needless braking was not measured.
     """
     a, b = titles
-    worse, better = (
-        [one for one in differences if one.is_better is sign] for sign in (False, True)
-    )
-    is_less_safe = any(one.is_of_safety for one in worse)
-    is_safer = any(one.is_of_safety for one in better)
+    in_order = sorted(differences, key=lambda one: -one.weight)
+    worse, better = ([one for one in in_order if one.is_better is sign] for sign in (False, True))
+    worst, best = (max([one.weight for one in some], default=COMFORT) for some in (worse, better))
+    brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
+    is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
     decision = DECIDE
-    if collides or (is_less_safe and not is_safer):
+    if worst == COLLISION or worst > best:
         decision = DO_NOT_RELEASE
-        what = f"is less safe than {a}{', but brakes less often without need' if better else ''}"
+        but = ", but brakes less often without need" if better and best == COMFORT else ""
+        what = f"is less safe than {a}{but}"
     elif worse and better:
         what = f"is better than {a} in some things and worse in others"
     elif worse:
         what = f"is as safe as {a}, but brakes more often without need"
-    elif not measured:
+    elif is_unknown:
         safe = "safer than" if better else "as safe as"
         what = f"is {safe} {a}, but may brake more often without need, which was not measured"
     else:
@@ -377,17 +366,8 @@ def _decide(
             what = f"does not differ from {a} in anything that was measured"
     shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
     reasons = "".join(f" It {one.phrase}." for one in shown)
-    return decision, f"{decision}: {b} {what}.{reasons}"
-
-
-def _criterion_in_words(unsafe: Unsafe, *, is_measured: bool) -> Iterator[str]:
-    """What was not measured, and what counts as unsafe."""
-    if not is_measured:
-        yield "Needless braking was not measured: no benign scenes are known for this scenario."
-    if not unsafe.is_collision or unsafe.keep:
-        yield f"Unsafe means: {unsafe.description}."
-    if unsafe.remark:
-        yield unsafe.remark
+    numbers = {"decision": decision.lower(), "better_in": len(better), "worse_in": len(worse)}
+    return numbers, f"{decision}: {b} {what}.{reasons}"
 
 
 def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
@@ -400,8 +380,12 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     )
 
 
-def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
-    """Within which limits, and around which originals."""
+def _basis_in_words(unsafe: Unsafe, common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
+    """What counts as unsafe, within which limits, and around which originals."""
+    if not unsafe.is_collision or unsafe.keep:
+        yield f"Unsafe means: {unsafe.description}."
+    if unsafe.remark:
+        yield unsafe.remark
     if limits:
         yield f"All vehicles that were compared are within {join_phrases(limits)}."
 

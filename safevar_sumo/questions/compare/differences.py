@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,7 +29,6 @@ from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.vehicles import Characteristic
 
 LIMIT_COLUMNS = {
     "characteristic": Column("", "characteristic of the vehicle"),
@@ -54,14 +53,18 @@ OF_OWN_FIT = "with the study's own parameter set"
 """In which parameter set of the vehicle model the limits hold."""
 
 
+COMFORT, SAFETY, COLLISION = range(3)
+"""Weights of differences: needless braking, what concerns safety, and new collisions of the
+original vehicle.
+"""
+
+
 class Difference(NamedTuple):
-    """What B does in comparison with A: a phrase, and whether it is better; needless braking alone
-    is not of safety.
-    """
+    """What B does in comparison with A: a phrase, whether it is better, and how much it weighs."""
 
     phrase: str
     is_better: bool
-    is_of_safety: bool = True
+    weight: int = SAFETY
 
 
 def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:
@@ -141,46 +144,21 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     )
 
 
-def compare_limits(limits: pd.DataFrame, members: Sequence[Characteristic]) -> list[Difference]:
-    """The limits that grow or shrink, in words; `limits` has a row for each of `members`."""
-    return [
-        Difference(phrase, is_better)
-        for change, verb, signs in (
-            (GROWN, "grow", (True,)),
-            (SHRUNK, "shrink", (False,)),
-            (BOTH, "move", (True, False)),
-        )
-        for phrase in _moved_limits(limits, members, change, verb)
-        for is_better in signs
-    ]
-
-
-def _moved_limits(
-    limits: pd.DataFrame, members: Sequence[Characteristic], change: str, verb: str
-) -> list[str]:
-    """The phrase about limits with this change that exist in both systems; empty if there are
-    none.
-    """
-    is_named = (limits["change"] == change) & limits[["a_low", "b_low"]].notna().all(axis=1)
-    numbers = np.flatnonzero(is_named).tolist()
-    texts = [
-        _limit_in_words(limits.iloc[number], members[number])
-        for number in numbers[:MAX_LIMITS_NAMED]
-    ]
-    if len(numbers) > MAX_LIMITS_NAMED:
-        texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
-    return (
-        [f"has limits of single characteristics that {verb} ({join_phrases(texts)})"]
-        if texts
-        else []
-    )
-
-
-def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
-    """A limit in B, and in A, such as `sensorRange at least 19.1 instead of 15 m`."""
-    ends = (("at least", row["a_low"], row["b_low"]), ("at most", row["a_high"], row["b_high"]))
-    moved = (f"{word} {b:g} instead of {a:g}{item.suffix}" for word, a, b in ends if a != b)
-    return f"{item.name} {join_phrases(moved)}"
+def compare_limits(limits: pd.DataFrame) -> list[Difference]:
+    """The limits that grow, shrink or move and exist in both systems, in words."""
+    found = list[Difference]()
+    exist = limits[limits[["a_low", "b_low"]].notna().all(axis=1)]
+    for change, verb, signs in (
+        (GROWN, "grow", (True,)),
+        (SHRUNK, "shrink", (False,)),
+        (BOTH, "move", (True, False)),
+    ):
+        names = exist["characteristic"][exist["change"] == change].tolist()
+        if len(names) > MAX_LIMITS_NAMED:
+            names[MAX_LIMITS_NAMED:] = [f"{len(names) - MAX_LIMITS_NAMED} more"]
+        phrase = f"has limits of single characteristics that {verb} ({join_phrases(names or [''])})"
+        found += [Difference(phrase, is_better) for is_better in signs if names]
+    return found
 
 
 def compare_originals(
@@ -202,7 +180,7 @@ def compare_originals(
     numbers = {**ends, **braking, **points, **_metres_earlier(*evaluators)}
 
     # What differs, and in whose favour.
-    found = list[Difference]()
+    found = _new_collisions(evaluators, a)
     if in_a != in_b:
         of_b, of_a = ("unsafe", "safe") if in_b else ("safe", "unsafe")
         phrase = f"is {of_b} even with the original vehicle, which is {of_a} in {a}"
@@ -213,11 +191,11 @@ def compare_originals(
     before, after, scenes = braking.values()
     if before != after:
         phrase = f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
-        found.append(Difference(phrase, is_better=after < before, is_of_safety=False))
+        found.append(Difference(phrase, after < before, COMFORT))
     return numbers, found
 
 
-def compare_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]:
+def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]:
     """The fastest collision of B's original vehicle at a point where A's does not collide, if there
     is one. A point that A does not have counts unless A's original vehicle collides anywhere.
     """
@@ -247,7 +225,7 @@ def compare_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Differen
         f" ({len(new)} test cases are like this; this one is the fastest)" if len(new) > 1 else ""
     )
     collision = f"collides at {speed:.2f} m/s with its original vehicle{where}"
-    return [Difference(f"{collision}, where that of {a} does not collide{more}", is_better=False)]
+    return [Difference(f"{collision}, where that of {a} does not collide{more}", False, COLLISION)]
 
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:

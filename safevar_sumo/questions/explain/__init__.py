@@ -111,9 +111,8 @@ def explain(
     Parameters
     ----------
     solution
-        Handle of a solution, such as nsga2:3:0; may be repeated. By default the robust failure with
-        the fewest changes, those with the fewest and the smallest changes, the most severe one, and
-        one of each distinct cause.
+        Handle of a solution, such as nsga2:3:0; may be repeated. By default those with
+        the fewest and the smallest changes, the most severe one, and one of each distinct cause.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     top
