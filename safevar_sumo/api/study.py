@@ -12,7 +12,6 @@ from shlex import quote
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
@@ -26,11 +25,11 @@ from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict
 from safevar_sumo.errors import MAX_BATCH, InputError, warn
-from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, RATING_POINTS, Unsafe, impact_in_words
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Jobs, Range
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
-from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, as_printed
+from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.measure import cases_by, study_by
 from safevar_sumo.questions.research_questions.answer import (
     REMARKS,
@@ -41,14 +40,13 @@ from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.words import (
+    EXACT,
     change_texts,
     demanded_in_words,
-    ending_in_words,
     number_of,
     question_command,
 )
-from safevar_sumo.records import FloatArray, JsonObject, Outcome
-from safevar_sumo.results import CHOICES
+from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
@@ -218,10 +216,10 @@ def _found(results: Results, system: System, unsafe: str | None, jobs: int | Non
             "a smaller scenario.margin, or original values of scenario.search with which the"
             " original vehicle is safe, as questions demand"
         )
-    sentence, changes = _verdict(results, case, system)
+    sentence, changes = _verdict(results, case, jobs)
     tables = answer.tables
     if changes:
-        frame = tabulate("The unsafe solution with the fewest changes", CHANGES, changes)
+        frame = tabulate("The fewest unsafe changes that were found", CHANGES, changes)
         tables = {"algorithms": tables["algorithms"], "fewest": frame, **tables}
     return replace(
         answer,
@@ -297,78 +295,47 @@ def _measured(
     )
 
 
-def _verdict(results: Results, case: Case, system: System) -> tuple[str, list[tuple[Any, ...]]]:
-    """How many solutions of a case of the results are unsafe, and how little is enough; and the
-    rows of `CHANGES` of the solution with the fewest.
+def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[tuple[Any, ...]]]:
+    """How many solutions of a case of the results are unsafe, and how few changes are enough; and
+    the rows of `CHANGES` of a vehicle with these.
     """
-    names = list(system.characteristics.names)
+    members = case.characteristics
 
     # An original vehicle that is unsafe itself needs no change.
-    if not system.rater and not system.characteristics.scenario:
-        original = drive_and_score(assemble(case.study), system.characteristics.original_settings)
+    system = assemble(case.study)
+    if not system.rater and not members.scenario:
+        original = drive_and_score(system, members.original_settings)
         if case.unsafe.of(original)[0]:
             breach = case.unsafe.breach_in_words(original)
             return f"The original vehicle itself {breach}: no change is needed.", []
 
-    # The solution with the fewest changes; as it is printed, it ends in the same way.
-    solutions = case.solutions.drop_duplicates(names)
+    # The solution with the fewest changes, of which as many as possible are undone.
+    solutions = case.solutions.drop_duplicates([*members.names])
     if solutions.empty:
         return f"The search found no solution: {case.why_no_solution}.", []
-    failures = solutions[case.unsafe.rows(solutions)].sort_values(CHOICES["fewest"], kind="stable")
+    number = int(case.unsafe.rows(solutions).sum())
     counts = (
         f"The search found {number_of(len(solutions), 'different solution')};"
-        f" of them {case.unsafe.number_in_words(len(failures))}."
+        f" of them {case.unsafe.number_in_words(number)}."
     )
     remarks = filter(None, [case.unsafe.remark])
     counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
-    if failures.empty:
+    found = fewest_changes(case, jobs) if number else None
+    if found is None:
         return counts, []
-    fewest = failures.iloc[0]
-    values = fewest[names].to_numpy(dtype=float)
-    ending = _ending(system, case, fewest)
-    printed = None if system.rater else _ending_as_printed(system, case, values, ending)
 
-    # What it changes.
-    are_printed = printed is not None
-    by_name = case.characteristics.named(values if printed is None else printed)
-    texts = change_texts(case.characteristics, by_name, are_printed=are_printed)
-    rows = [
-        (item.name, item.unit, item.original, by_name[item.name])
-        for item in case.characteristics
-        if by_name[item.name] != item.original
-    ]
-    listed = f"; its {number_of(len(texts), 'change')} are listed in the second table"
-    if len(texts) <= MAX_LISTED:
-        listed = f" with {number_of(len(texts), 'change')}: {', '.join(texts)}" if texts else ""
-    fewest_in_words = "The unsafe solution with the fewest changes"
-    return f"{counts} {fewest_in_words} {ending}{listed}.", rows
-
-
-def _ending(system: System, case: Case, row: Any) -> str:
-    """How a solution ends, in words, from its row of results."""
-    if system.rater:
-        return f"earns {row[RATING_POINTS.name]:.2f} points"
-    if case.unsafe.is_of_impacts:
-        return f"has an {impact_in_words(row[IMPACT_SPEED.name], row[IMPACT_EXCESS.name])}"
-    ending = ending_in_words(str(row["outcome"]), float(row[SAFETY_DEGREE]), system.contact)
-    bound = case.unsafe.bound
-    return f"{ending}, {bound.measure} {row[bound.measure]:.3g}" if bound else ending
-
-
-def _ending_as_printed(
-    system: System, case: Case, setting: FloatArray, ending: str
-) -> FloatArray | None:
-    """An unsafe solution with its values as they are printed, shape (n,), with as many digits as it
-    needs to be unsafe with the same ending; None if it is not with any of them.
-    """
-    for further in FURTHER_DIGITS:
-        printed = as_printed(system.characteristics, setting, further)
-        found = drive_and_score(system, printed[np.newaxis])
-        row = {name: column[0] for name, column in found.results.items()}
-        is_unsafe = case.unsafe.of(found)[0] and not system.measuring.scoring.violation(found)[0]
-        if is_unsafe and _ending(system, case, row) == ending:
-            return printed
-    return None
+    # What is left, and the command that simulates it.
+    values = members.named(found.settings[0])
+    changed = [item for item in members if values[item.name] != item.original]
+    texts = change_texts(members, values, are_printed=True)
+    options = "".join(f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed)
+    listed = "" if len(texts) > MAX_LISTED else f": {', '.join(texts)}"
+    return (
+        f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
+        f" {case.unsafe.breach_in_words(found)}{listed}. It is simulated by"
+        f" {question_command('simulate', str(results.directory))}{options}.",
+        [(item.name, item.unit, item.original, values[item.name]) for item in changed],
+    )
 
 
 def summarise(results: Results) -> Answer:

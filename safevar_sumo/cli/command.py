@@ -10,6 +10,7 @@ import operator
 import os
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
@@ -42,6 +43,18 @@ METAVARS = {
 """How the help names positional parameters, unless by their names."""
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
+
+
+class _Command(click.Command):
+    """A command that refuses an option with one value that is given twice."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        given = Counter(word.partition("=")[0] for word in args)
+        for option in self.params:
+            takes_one = isinstance(option, click.Option) and not (option.multiple or option.is_flag)
+            if takes_one and given[option.opts[0]] > 1:
+                raise InputError(option.opts[0], "is given twice", "it once")
+        return super().parse_args(ctx, args)
 
 
 def command_of(name: str, function: Callable[..., Any]) -> click.Command:
@@ -104,7 +117,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     # The command, with the options of every answer.
     declared = contents_of(function)
     gives_answer = "Answer" in str(signature.return_annotation)
-    return click.Command(
+    return _Command(
         name,
         params=[
             *map(_argument, positional),

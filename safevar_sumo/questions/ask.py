@@ -423,6 +423,8 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]
+        if option.name in values and not option.is_repeated:
+            raise InputError(f"ask: {name} {flag}", "is given twice", "it once")
         value = option.kind is bool or next(waiting, None)
         try:
             value = value if option.kind is bool else option.kind(value)

@@ -5,19 +5,25 @@ with these values.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.causes import find_minimal_causes
+from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.words import EXACT, join_phrases
-from safevar_sumo.records import KMH_PER_MS, FloatArray, JsonObject
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject
+from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
 """Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is
@@ -62,6 +68,36 @@ def describe(
         failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
         waiting = {name: setting for name, setting in waiting.items() if name not in failures}
     return failures
+
+
+def values_as_printed(
+    model: Model, vehicles: Sequence[Mapping[str, float]]
+) -> list[dict[str, float]]:
+    """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
+    are where it prints none.
+    """
+    members = model.evaluator.characteristics
+    settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
+    settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
+    return [members.named(one) for one in settings.values()]
+
+
+def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
+    """The evaluation of the unsafe solution with the fewest changes, of which as many as possible
+    are undone; its values are those that are printed. None if the solution is safe here.
+    """
+    handle = choose_handle(case.solutions, case.unsafe, "fewest")
+    row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
+    setting = row[[*case.characteristics.names]].to_numpy(dtype=float)
+    with open_evaluator(case.study, jobs=jobs) as evaluator:
+        (causes,) = find_minimal_causes(evaluator, setting[np.newaxis], case.unsafe)
+        if not causes:
+            return None
+        worst = min(causes, key=lambda cause: cause.safety_degree)
+        model = Model(0, evaluator, case.unsafe)
+        (printed,) = values_as_printed(model, [worst.changes | worst.encounter])
+        settings = case.characteristics.setting(printed, beyond=True)[np.newaxis]
+        return evaluator.evaluate(settings, STAGE)
 
 
 def limit_text(item: Characteristic, value: float) -> str:

@@ -50,6 +50,9 @@ TESTS: Columns = TEST | {
     "possible": POINTS(meaning="points of the test"),
     "points": POINTS(meaning="points that the vehicle earns"),
     "lost": POINTS(meaning="points of the original vehicle minus those of this one"),
+    "first_speed": Column(
+        "km/h", "slowest test speed at which a cell is not green; of a variant, is worse", "g"
+    ),
     "standard": POINTS(meaning="points of the standard range"),
     "extended": POINTS(meaning="points of the extended range"),
     "robustness": POINTS(meaning="points of robustness layers"),
@@ -228,6 +231,13 @@ def _rows_of_tests(
         for matrix in rater.protocol.matrices:
             points = scores.tests[matrix.name].round(DECIMALS)
             totals = points.sum(axis=1)
+            colours = scores.colours[[number, 0]]
+            is_worse = colours[0] > (colours[1] if number else 0)
+            speeds = [
+                cell.vut_speed
+                for cell, loses in zip(rater.protocol.cells, is_worse, strict=True)
+                if loses and cell.matrix is matrix
+            ]
             failing = [
                 layer
                 for (of_test, layer), holds in scores.layers.items()
@@ -238,6 +248,7 @@ def _rows_of_tests(
                 *(
                     totals[number],
                     round(totals[0] - totals[number], DECIMALS),
+                    min(speeds, default=None),
                     *points[number],
                     *matrix.points[:2],
                 ),
@@ -337,13 +348,25 @@ def _verdict(
             f" weather is {weather.name!r}, and {darken(weather).name!r} in the tests by night."
         )
 
-    # Without a variant, what the original earns.
+    # Where most points are lost, and from which speed on.
     *others, variant = settings
+    own = tests[tests["variant"] == variant]
+    missing = own["lost"] if others else own["possible"] - own["points"]
+    largest = own[missing == missing.max()]
+    where = ""
+    if missing.max() > 0:
+        prefix = "each of " if len(largest) > 1 else ""
+        speed = largest["first_speed"].min()
+        since = "" if np.isnan(speed) else f", from {speed:g} km/h on"
+        names = join_phrases(largest["test"])
+        where = f" It loses most in {prefix}{names}: {missing.max():.2f} points{since}."
+
+    # Without a variant, what the original earns.
     earned = f"{scores.total[0]:.2f}"
     if not others:
         return (
             f"The original vehicle earns {earned} of the {possible:g} points that the simulated"
-            f" tests give.{road}"
+            f" tests give.{where}{road}"
         )
 
     # What changes, what it costs, and where.
@@ -353,19 +376,10 @@ def _verdict(
         for name, value in _changes(study, settings[variant]).items()
     ]
     lost = round(scores.total[0] - scores.total[-1], DECIMALS)
-    where = ""
     result = f"loses {lost:.2f} of the {earned} points that the original vehicle earns"
     if lost <= 0:
         more = f"{-lost:.2f} more than" if lost < 0 else "as many as"
         result = f"earns {scores.total[-1]:.2f} points, {more} the original vehicle"
-    losses = tests[tests["variant"] == variant]
-    largest = losses[losses["lost"] == losses["lost"].max()]
-    if lost > 0:
-        prefix = "each of " if len(largest) > 1 else ""
-        where = (
-            f" It loses most in {prefix}{join_phrases([*largest['test']])}:"
-            f" {largest['lost'].iloc[0]:.2f} points."
-        )
     return (
         f"With {join_phrases(changes or ['no change at all'])}, the vehicle {result}; the simulated"
         f" tests give {possible:g}.{where}{road}"

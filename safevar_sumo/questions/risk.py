@@ -54,9 +54,8 @@ MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
 RARE = 1e-4
 """If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
-UNSURE = 0.5
-"""Width of an interval of a share of the variance from which on the verdict says that it is unsure
-[-].
+MAX_RIVALS = 3
+"""Largest number of characteristics that the verdict names beside the one with the largest share.
 """
 NO_PROBABILITY = (
     " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
@@ -183,8 +182,8 @@ def _bound_in_words(high: float, total: int, confidence: float) -> str:
 
 
 def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
-    """Which characteristic has the largest share of the variance of the table's measure, and which
-    shares are unsure.
+    """Which characteristic decides the table's measure, as the interval of its share of the
+    variance is above those of all others, or which may.
     """
     if table.empty:
         return ""
@@ -197,22 +196,20 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
         name = first["characteristic"]
-        words = (
-            f" {name} decides most: it causes {100 * share:.0f} % of the variance of"
-            f" {in_words['degree']} ({100 * low:.0f} to {100 * high:.0f} %)."
+        causes = (
+            f"causes {100 * share:.0f} % of the variance of {in_words['degree']}"
+            f" ({100 * low:.0f} to {100 * high:.0f} %)"
         )
-
-    # Shares that are too unsure.
-    of_output = {
-        name: table[f"{name}_{index}{HIGH}"] - table[f"{name}_{index}{LOW}"] for name in OUTPUTS
-    }
-    for name, widths in of_output.items():
-        if widths.max() > UNSURE:
-            words += (
-                f" The shares for {in_words[name]} are uncertain: their intervals are up to"
-                f" {100 * widths.max():.0f} percentage points wide."
+        _, *rivals = table[table[f"degree_{index}{HIGH}"] >= low]["characteristic"]
+        words = f" {name} decides most: it {causes}."
+        if rivals:
+            words = (
+                f" What decides most is uncertain: {name} {causes}, and the interval of"
+                f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
             )
-    if failures and of_output["unsafe"].isna().all():
+
+    # Without the outcome's own shares, what decides it is unknown.
+    if failures and table[f"unsafe_{index}"].isna().all():
         words += (
             " What decides whether a vehicle is unsafe is unknown: that needs"
             f" {MIN_OUTCOMES} unsafe and as many safe vehicles."

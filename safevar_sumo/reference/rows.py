@@ -8,9 +8,8 @@ A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegre
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -206,7 +205,6 @@ def import_published(
     nsga2: str | Path | None = None,
     rs: str | Path | None = None,
     safe_fuzzer: str | Path | None = None,
-    original: Annotated[Mapping[str, float] | tuple[str, ...], "METRIC=NUMBER"] = (),
 ) -> Results:
     """Import published CSV solutions of a study as a results directory, in place of an earlier
     import.
@@ -221,9 +219,6 @@ def import_published(
         File with the solutions of random search.
     safe_fuzzer
         File with the solutions of SafeFuzzer.
-    original
-        A metric of the original vehicle, such as sd=2.7, tet, tit or ave_dece; may be repeated. By
-        default those published for the study.
 
     Raises
     ------
@@ -239,13 +234,11 @@ def import_published(
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
 
-    # The original vehicle's metrics, from the study or as given.
-    metrics = {
-        name: {**loaded_study.published, **_read_metrics(original)}.get(name) for name in METRICS
-    }
+    # The original vehicle's metrics.
+    metrics = {name: loaded_study.published.get(name) for name in METRICS}
     if metrics[SAFETY_DEGREE] is None:
-        problem = "the study has no published values of the original vehicle"
-        raise InputError(study, problem, "them as `original`, at least the safety degree")
+        problem = "published: the study has no values of the original vehicle"
+        raise InputError(loaded_study.source, problem, "at least its safety_degree")
 
     # The solutions, as a directory of results.
     characteristics = CharacteristicSet.of(loaded_study)
@@ -256,33 +249,3 @@ def import_published(
     names = {algorithm: path.name for algorithm, path in files.items()}
     write_imported(directory, loaded_study, solutions, metrics, names)
     return load(directory)
-
-
-def _read_metrics(original: Mapping[str, float] | Sequence[str]) -> dict[str, float]:
-    """Metrics by name, of which the form METRIC=NUMBER also knows the titles; raises InputError if
-    a number is none, or outside its range.
-    """
-    # Words and numbers of the form METRIC=NUMBER.
-    texts = (
-        [f"{name}={value}" for name, value in original.items()]
-        if isinstance(original, Mapping)
-        else original
-    )
-    names = {
-        word: metric.name
-        for metric in METRICS.values()
-        for word in (metric.name, metric.title.lower())
-    }
-    metrics = {}
-    for text in texts:
-        word, _, number = text.partition("=")
-        try:
-            name = names[word.strip()]
-            lowest, highest = RANGES[name]
-            if not lowest <= float(number) <= highest:
-                raise ValueError
-        except (KeyError, ValueError):
-            legal = "sd=NUMBER, tet=NUMBER, tit=NUMBER or ave_dece=NUMBER, in its range"
-            raise InputError("original", repr(text), legal) from None
-        metrics[name] = float(number)
-    return metrics

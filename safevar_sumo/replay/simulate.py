@@ -21,6 +21,7 @@ from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import PointName
 from safevar_sumo.questions.changes import read_changes
+from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
@@ -101,7 +102,7 @@ NOT_SAFE = "the original vehicle keeps less than a search demands of it in the s
 
 class Target(NamedTuple):
     """What is simulated: a study, and its name in errors; of a solution also its handle and its row
-    of the results.
+    of the results; where changes of it are undone, the row has the values alone.
     """
 
     study: Study
@@ -130,7 +131,6 @@ def show_simulation(
     *,
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
     set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
-    no_filter: bool = False,
     beyond: bool = False,
     trace: Path | None = None,
     animate: Path | None = None,
@@ -146,13 +146,11 @@ def show_simulation(
     ----------
     solution
         Replay solution N of a run in a results directory; N counts from 0. Or the unsafe solution
-        with the smallest or the fewest changes, or the most severe one: smallest, fewest,
-        most-severe.
+        with the smallest changes, or the most severe one: smallest, most-severe; fewest: that with
+        the fewest changes, of which as many are undone as it stays unsafe without.
     set
         A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it
         for others.
-    no_filter
-        Accepted for earlier versions and without effect: changes of any size are simulated.
     beyond
         Also accept values beyond the domains, and settings that violate a constraint.
     trace
@@ -198,7 +196,8 @@ def show_simulation(
 
     # One setting beside the original vehicle.
     simulation = simulate_with_original(target.study, system, requested[0], filtered=False)
-    if target.row and not changes and point is None:  # results belong to the whole matrix
+    # Results belong to the whole matrix.
+    if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
         with whole_file(trace, "trace") as file:
@@ -337,7 +336,10 @@ def load_target(source: str, solution: str | None, as_it_is_now: bool, point: st
             else SolutionId.parse(solution)
         )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
-    return Target(study, source, handle, {str(name): value for name, value in row.items()})
+    values = {str(name): value for name, value in row.items()}
+    if choice == "fewest" and (found := fewest_changes(subject)):
+        values = subject.characteristics.named(found.settings[0])
+    return Target(study, source, handle, values)
 
 
 def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:

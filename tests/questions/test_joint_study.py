@@ -101,7 +101,7 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
     limit = case.scoring.safe_original
     row = drawn[drawn["original_safety_degree"] < limit].iloc[0]
     values = [f"--set={name}={float(row[name])!r}" for name in case.characteristics.names]
-    answer = json_of("simulate", "results", *values, "--no-filter")
+    answer = json_of("simulate", "results", *values)
     degrees = next(
         one for one in answer["tables"]["results"]["rows"] if one["result"] == "safety_degree"
     )
@@ -110,7 +110,7 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
         row["safety_degree"],
     )
     assert "Here the original vehicle keeps less than a search demands" in answer["verdict"]
-    sweep = json_of("simulate", "results", *values[:-1], "--set=distance=8..18:5", "--no-filter")
+    sweep = json_of("simulate", "results", *values[:-1], "--set=distance=8..18:5")
     counted = [
         one["remark"] for one in sweep["tables"]["remarks"]["rows"] if "demands" in one["remark"]
     ]

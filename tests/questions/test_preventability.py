@@ -18,7 +18,7 @@ from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import _avoided_in_words
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
-from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure, robust_shares
+from safevar_sumo.questions.explain.robustness import robust_shares
 from safevar_sumo.questions.preventability import (
     DRIVERS,
     assess_collisions,
@@ -45,31 +45,6 @@ def test_robust_is_what_its_neighbours_are_too() -> None:
     assert edge.mean() == pytest.approx(0.5, abs=0.2)
     (beyond,) = robust_shares(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), 0.1, COLLISION)
     assert beyond.mean() == 1.0
-
-
-@pytest.mark.parametrize(
-    ("shares", "row"),
-    [
-        ([(0.5, 1.0, 1.0), (0.9, 0.9, 0.9)], 0),
-        ([(0.39, 1.0, 1.0), (0.9, 0.9, 0.9)], 1),
-        ([(0.79, 0.79, 0.79), (1.0, 1.0, 0.3)], None),
-    ],
-)
-def test_a_failure_is_robust_by_the_mean_of_all_time_steps(
-    shares: list[tuple[float, ...]], row: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whatever the study's own time step says, if the other steps can make up for it."""
-    evaluator = made_up_evaluator(2, box)
-
-    def estimates(_: Evaluator, settings: FloatArray, step: float, unsafe: Unsafe) -> FloatArray:
-        return np.array([shares[int(setting[0]) - 8] for setting in settings])
-
-    monkeypatch.setattr("safevar_sumo.questions.explain.robustness.robust_shares", estimates)
-    failures = evaluator.evaluate(np.array([[8.0, 1.0], [9.0, 1.0]]), "failures")
-    assert (
-        find_smallest_robust_failure(evaluator, failures, 0.1, COLLISION, max_evaluations=100)
-        == row
-    )
 
 
 STUDY = load_study("euro_ncap_pedestrian")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import html
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +25,6 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.explain.failures import compare_at_cells
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.questions.tolerance.scans import scan
-from safevar_sumo.results import record
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
 from tests.made_up import case_of, original_of
@@ -99,13 +99,11 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
     assert [answer.numbers[name] for name in ("collisions", "avoidable", "unavoidable")] == [
         None
     ] * 3
-    results = SimpleNamespace(case=case, study=case.study, original=record(original, row=0))
-    verdict, _ = _verdict(results, case, assemble(case.study))
-    kept = evaluations.column("rating_points")[
-        case.solutions.sort_values(["f_num_diff", "f_safe"]).index[0]
-    ]
-    assert f"earns {kept:.2f} points with " in verdict
-    assert "brakeTorque 1 -> " in verdict
+    results = SimpleNamespace(case=case, study=case.study, directory="results")
+    stated = replace(case, stated=Unsafe(points=points - 1e-3))
+    verdict, _ = _verdict(results, stated, None)
+    assert "With 1 change, the fewest that were found, the vehicle earns " in verdict
+    assert "brakeTorque 1 -> 0." in verdict
 
 
 def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

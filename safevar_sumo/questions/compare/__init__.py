@@ -23,6 +23,8 @@ from safevar_sumo.questions.ask import Count, Criterion, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
     BOTH,
+    COLLISION,
+    COMFORT,
     GROWN,
     LIMIT_COLUMNS,
     SHRUNK,
@@ -32,7 +34,6 @@ from safevar_sumo.questions.compare.differences import (
     compare_originals,
     compare_values,
     limits_of_both,
-    reasons_against,
 )
 from safevar_sumo.questions.compare.settings import (
     BOTH_STAGE,
@@ -63,6 +64,9 @@ from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
 
+RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
+MAX_REASONS = 3
+"""Largest number of differences that the verdict names."""
 PAIR_COLUMNS = {
     "pair": Column("", "run, with its solutions in both systems, or line of sampled settings"),
     "a": Column("", "mean in A", ".2f"),
@@ -72,7 +76,17 @@ PAIR_COLUMNS = {
 
 @question
 @contents(
-    *("unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12", "better_in", "worse_in"),
+    *(
+        "decision",
+        "unsafe",
+        "margin",
+        "settings",
+        *UNSAFE_IN.values(),
+        "p",
+        "a12",
+        "better_in",
+        "worse_in",
+    ),
     *(
         "limits_grown",
         "limits_shrunk",
@@ -101,9 +115,11 @@ def compare(
 ) -> Answer:
     """Compare two studies or results, A and B: what is better in B, and what is worse.
 
-    A version B whose original vehicle collides where that of A does not must not be released: the
-    command ends with exit code 3. The same criterion counts for both. Where the original vehicles
-    differ, the same changes of each original are compared. Small changes are not filtered out.
+    A version B that is less safe must not be released, and the command ends with exit code 3: its
+    original vehicle collides where that of A does not, or something that concerns safety is worse,
+    and at most needless braking is better. The same criterion counts for both. Where the original
+    vehicles differ, the same changes of each original are compared. Small changes are not filtered
+    out.
 
     Parameters
     ----------
@@ -125,15 +141,15 @@ def compare(
     study = evaluator.study
     evaluator.plan({BOTH_STAGE: 1, SCAN_STAGE: 2})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
-    evaluators, subjects = (evaluator, second), (subject, other)
+    evaluators = (evaluator, second)
     with about("limits"):
         within = limits_of(limits, study.domains)
     common = CommonDomain.of(evaluators, within)
     originals = [side.evaluate_original() for side in evaluators]
-    criteria = _criteria(subjects, evaluators, originals, unsafe, margin)
+    criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
-    pairs, outside = pairs_of(subjects, common, criteria, samples)
+    pairs, outside = pairs_of((subject, other), common, criteria, samples)
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
@@ -143,23 +159,25 @@ def compare(
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria, titles[0])
-    of_counts = compare_counts(counts, titles[0])
-    of_limits = compare_limits(alone, evaluator.characteristics.vehicle.members)
-    of_values = compare_values(tested.quantity, tested.p, tested.a12)
-    difference = Difference.joined([of_counts, of_limits, of_new_cars, of_values])
+    differences = [
+        *of_new_cars,
+        *compare_counts(counts, titles[0]),
+        *compare_limits(alone),
+        *compare_values(tested.quantity, tested.p, tested.a12),
+    ]
+    decided, why = _decide(differences, titles, of_originals)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
-        **_numbers(criteria[0], counts, tested, difference, alone["change"]),
+        **decided,
+        **_numbers(criteria[0], counts, tested, alone["change"]),
         "outside": outside,
         "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
         **of_originals,
     }
-    refusals = reasons_against(evaluators, titles)
     sentences = [
-        *(f"{refusal}." for refusal in refusals),
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
-        *_verdict(difference, titles, criteria[0], is_measured=bool(numbers["benign_scenes"])),
-        *_basis_in_words(common, limits),
+        why,
+        *_basis_in_words(criteria[0], common, limits),
         *counted_in_words(study, pairs.number_infeasible),
     ]
     return Answer(
@@ -170,7 +188,7 @@ def compare(
         numbers=numbers,
         tables={"limits": alone, "pairs": tested.pairs, "settings": _table(common, settings)},
         folded=("settings",),
-        failures=refusals,
+        failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
     )
 
@@ -179,10 +197,9 @@ def _numbers(
     criterion: Unsafe,
     counts: Mapping[str, int],
     tested: _PairedTest,
-    difference: Difference,
     changes_of_limits: pd.Series[str],
 ) -> JsonObject:
-    """What was compared, and in how much B is better and worse."""
+    """What was compared."""
     return {
         "unsafe": str(criterion),
         "margin": criterion.keep,
@@ -190,8 +207,6 @@ def _numbers(
         **counts,
         "p": tested.p,
         "a12": tested.a12,
-        "better_in": len(difference.better),
-        "worse_in": len(difference.worse),
         "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
         "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
     }
@@ -319,35 +334,40 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     return _PairedTest(p, a12, table, unit, quantity)
 
 
-def _verdict(
-    difference: Difference, titles: Sequence[str], unsafe: Unsafe, *, is_measured: bool
-) -> Iterator[str]:
-    """Whether B is better: in something and worse in nothing, needless braking included."""
-    # Only what is better without anything worse is better.
+def _decide(
+    differences: Sequence[Difference], titles: Sequence[str], of_originals: JsonObject
+) -> tuple[JsonObject, str]:
+    """Whether to release B, and why: with a new collision never, and not if it is worse in safety
+    and better in needless braking at most. What is better in some and worse in other things is for
+    a person to decide; so is every change whose needless braking was not measured.
+    """
     a, b = titles
-    better, worse, facts = (". It ".join(phrases) for phrases in difference)
-    if worse and better:
-        yield f"Neither {a} nor {b} is better in everything."
-        yield f"What is worse in {b}: it {worse}."
-        yield f"What is better in {b}: it {better}."
+    in_order = sorted(differences, key=lambda one: -one.weight)
+    worse, better = ([one for one in in_order if one.is_better is sign] for sign in (False, True))
+    worst, best = (max([one.weight for one in some], default=COMFORT) for some in (worse, better))
+    brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
+    is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
+    decision = DECIDE
+    if worst == COLLISION or worst > best:
+        decision = DO_NOT_RELEASE
+        but = ", but brakes less often without need" if better and best == COMFORT else ""
+        what = f"is less safe than {a}{but}"
+    elif worse and better:
+        what = f"is better than {a} in some things and worse in others"
     elif worse:
-        yield f"{b} is worse than {a}. It {worse}."
-    elif better and is_measured:
-        yield f"{b} is better than {a}. It {better}. Nothing that was measured is worse."
-    elif better:
-        yield f"There is not enough evidence that {b} is better than {a}, although it {better}."
+        what = f"is as safe as {a}, but brakes more often without need"
+    elif is_unknown:
+        safe = "safer than" if better else "as safe as"
+        what = f"is {safe} {a}, but may brake more often without need, which was not measured"
     else:
-        yield f"No difference between {a} and {b} was found."
-
-    # What else differs, what was not measured, and what counts as unsafe.
-    if facts:
-        yield f"In the original vehicle, the driving system of {b} {facts}."
-    if not is_measured:
-        yield "Needless braking was not measured: no benign scenes are known for this scenario."
-    if not unsafe.is_collision or unsafe.keep:
-        yield f"Unsafe means: {unsafe.description}."
-    if unsafe.remark:
-        yield unsafe.remark
+        decision = RELEASE
+        what = f"is better than {a}, and worse in nothing that was measured"
+        if not better:
+            what = f"does not differ from {a} in anything that was measured"
+    shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
+    reasons = "".join(f" It {one.phrase}." for one in shown)
+    numbers = {"decision": decision.lower(), "better_in": len(better), "worse_in": len(worse)}
+    return numbers, f"{decision}: {b} {what}.{reasons}"
 
 
 def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
@@ -360,8 +380,12 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     )
 
 
-def _basis_in_words(common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
-    """Within which limits, and around which originals."""
+def _basis_in_words(unsafe: Unsafe, common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
+    """What counts as unsafe, within which limits, and around which originals."""
+    if not unsafe.is_collision or unsafe.keep:
+        yield f"Unsafe means: {unsafe.description}."
+    if unsafe.remark:
+        yield unsafe.remark
     if limits:
         yield f"All vehicles that were compared are within {join_phrases(limits)}."
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,7 +29,6 @@ from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.vehicles import Characteristic
 
 LIMIT_COLUMNS = {
     "characteristic": Column("", "characteristic of the vehicle"),
@@ -53,51 +51,43 @@ MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
 OF_OWN_FIT = "with the study's own parameter set"
 """In which parameter set of the vehicle model the limits hold."""
-LEAST_METRES = 0.05
-"""A smaller distance by which a vehicle brakes earlier or later is not mentioned [m]."""
+
+
+COMFORT, SAFETY, COLLISION = range(3)
+"""Weights of differences: needless braking, what concerns safety, and new collisions of the
+original vehicle.
+"""
 
 
 class Difference(NamedTuple):
-    """What B does in comparison with A, each a phrase: `better`, `worse`, and `facts` that are
-    neither.
-    """
+    """What B does in comparison with A: a phrase, whether it is better, and how much it weighs."""
 
-    better: Sequence[str] = ()
-    worse: Sequence[str] = ()
-    facts: Sequence[str] = ()
-
-    @classmethod
-    def joined(cls, parts: Sequence[Difference]) -> Difference:
-        """All phrases of some differences, in their order."""
-        return cls(*([*chain(*phrases)] for phrases in zip(cls(), *parts, strict=True)))
-
-    @classmethod
-    def of(cls, phrase: str, *, is_better: bool) -> Difference:
-        """A single phrase."""
-        return cls(better=[phrase]) if is_better else cls(worse=[phrase])
+    phrase: str
+    is_better: bool
+    weight: int = SAFETY
 
 
-def compare_counts(counts: Mapping[str, int], a: str) -> Difference:
+def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:
     """The settings that are unsafe in one system only."""
     only_a = counts["only_a_unsafe"]
     only_b = counts["only_b_unsafe"]
     unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that are"
     safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that are"
-    better = [f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}"] if only_a else []
-    worse = [f"is unsafe in {only_b} of {safe_in_a} safe in {a}"] if only_b else []
-    return Difference(better, worse)
+    found = [
+        Difference(f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}", is_better=True),
+        Difference(f"is unsafe in {only_b} of {safe_in_a} safe in {a}", is_better=False),
+    ]
+    return [one for one, count in zip(found, (only_a, only_b), strict=True) if count]
 
 
-def compare_values(quantity: str, p: float, a12: float) -> Difference:
+def compare_values(quantity: str, p: float, a12: float) -> list[Difference]:
     """A significant difference of the safety degree, or of the rating, over all pairs; p is NaN
     without pairs.
     """
     if not p < ALPHA:
-        return Difference()
+        return []
     is_better = a12 < 0.5
-    return Difference.of(
-        f"has a {'higher' if is_better else 'lower'} {quantity} (p = {p:.2g})", is_better=is_better
-    )
+    return [Difference(f"has a {'higher' if is_better else 'lower'} {quantity}", is_better)]
 
 
 def limits_of_both(
@@ -154,40 +144,21 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     )
 
 
-def compare_limits(limits: pd.DataFrame, members: Sequence[Characteristic]) -> Difference:
-    """The limits that grow or shrink, in words; `limits` has a row for each of `members`."""
-    grown = _moved_limits(limits, members, GROWN, "grow")
-    shrunk = _moved_limits(limits, members, SHRUNK, "shrink")
-    moved = _moved_limits(limits, members, BOTH, "move")
-    return Difference(grown + moved, shrunk + moved)
-
-
-def _moved_limits(
-    limits: pd.DataFrame, members: Sequence[Characteristic], change: str, verb: str
-) -> list[str]:
-    """The phrase about limits with this change that exist in both systems; empty if there are
-    none.
-    """
-    is_named = (limits["change"] == change) & limits[["a_low", "b_low"]].notna().all(axis=1)
-    numbers = np.flatnonzero(is_named).tolist()
-    texts = [
-        _limit_in_words(limits.iloc[number], members[number])
-        for number in numbers[:MAX_LIMITS_NAMED]
-    ]
-    if len(numbers) > MAX_LIMITS_NAMED:
-        texts.append(f"{len(numbers) - MAX_LIMITS_NAMED} more")
-    return (
-        [f"has limits of single characteristics that {verb} ({join_phrases(texts)})"]
-        if texts
-        else []
-    )
-
-
-def _limit_in_words(row: pd.Series[Any], item: Characteristic) -> str:
-    """A limit in B, and in A, such as `sensorRange at least 19.1 instead of 15 m`."""
-    ends = (("at least", row["a_low"], row["b_low"]), ("at most", row["a_high"], row["b_high"]))
-    moved = (f"{word} {b:g} instead of {a:g}{item.suffix}" for word, a, b in ends if a != b)
-    return f"{item.name} {join_phrases(moved)}"
+def compare_limits(limits: pd.DataFrame) -> list[Difference]:
+    """The limits that grow, shrink or move and exist in both systems, in words."""
+    found = list[Difference]()
+    exist = limits[limits[["a_low", "b_low"]].notna().all(axis=1)]
+    for change, verb, signs in (
+        (GROWN, "grow", (True,)),
+        (SHRUNK, "shrink", (False,)),
+        (BOTH, "move", (True, False)),
+    ):
+        names = exist["characteristic"][exist["change"] == change].tolist()
+        if len(names) > MAX_LIMITS_NAMED:
+            names[MAX_LIMITS_NAMED:] = [f"{len(names) - MAX_LIMITS_NAMED} more"]
+        phrase = f"has limits of single characteristics that {verb} ({join_phrases(names or [''])})"
+        found += [Difference(phrase, is_better) for is_better in signs if names]
+    return found
 
 
 def compare_originals(
@@ -195,7 +166,7 @@ def compare_originals(
     originals: Sequence[Evaluations],
     criteria: Sequence[Unsafe],
     a: str,
-) -> tuple[JsonObject, Difference]:
+) -> tuple[JsonObject, list[Difference]]:
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's
     brakes: the numbers, and what they say.
     """
@@ -205,41 +176,28 @@ def compare_originals(
     )
     braking = _needless_braking(*evaluators)
     points = _points(evaluators, originals)
-    metres = _metres_earlier(*evaluators)
-    numbers = {**_ends_of_originals(evaluators, originals), **braking, **points, **metres}
+    ends = _ends_of_originals(evaluators, originals)
+    numbers = {**ends, **braking, **points, **_metres_earlier(*evaluators)}
 
     # What differs, and in whose favour.
-    parts = list[Difference]()
+    found = _new_collisions(evaluators, a)
     if in_a != in_b:
-        phrase = (
-            f"is {'unsafe' if in_b else 'safe'} even with the original vehicle, which is"
-            f" {'safe' if in_b else 'unsafe'} in {a}"
-        )
-        parts.append(Difference.of(phrase, is_better=in_a))
-    if braking["a_needless_braking"] != braking["b_needless_braking"]:
-        before = braking["a_needless_braking"]
-        after = braking["b_needless_braking"]
-        phrase = (
-            f"brakes needlessly in {after} of {braking['benign_scenes']} benign scenes, where {a}"
-            f" does so in {before}"
-        )
-        parts.append(Difference.of(phrase, is_better=after < before))
+        of_b, of_a = ("unsafe", "safe") if in_b else ("safe", "unsafe")
+        phrase = f"is {of_b} even with the original vehicle, which is {of_a} in {a}"
+        found.append(Difference(phrase, is_better=in_a))
     if points and points["a_points"] != points["b_points"]:
         phrase = f"earns {points['b_points']:.4g} points, where {a} earns {points['a_points']:.4g}"
-        parts.append(Difference.of(phrase, is_better=points["b_points"] > points["a_points"]))
-    onsets = ((metres["metres_earlier"], "earlier"), (metres["metres_later"], "later"))
-    phrases = [
-        f"up to {value:.2g} m {word}" for value, word in onsets if (value or 0) > LEAST_METRES
-    ]
-    if phrases:
-        parts.append(Difference(facts=[f"begins to brake {join_phrases(phrases)}"]))
-    return numbers, Difference.joined(parts)
+        found.append(Difference(phrase, is_better=points["b_points"] > points["a_points"]))
+    before, after, scenes = braking.values()
+    if before != after:
+        phrase = f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
+        found.append(Difference(phrase, after < before, COMFORT))
+    return numbers, found
 
 
-def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> tuple[str, ...]:
-    """Why B is not to be released: the fastest collision of its original vehicle at a point where
-    A's does not collide, if there is one. A point that A does not have counts unless A's original
-    vehicle collides anywhere.
+def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]:
+    """The fastest collision of B's original vehicle at a point where A's does not collide, if there
+    is one. A point that A does not have counts unless A's original vehicle collides anywhere.
     """
     # Collisions of both original vehicles, by point.
     systems = [side.system for side in evaluators]
@@ -260,15 +218,14 @@ def reasons_against(evaluators: Sequence[Evaluator], titles: Sequence[str]) -> t
         and not collides_in_a.get(name, any(collides_in_a.values()))
     ]
     if not new:
-        return ()
+        return []
     speed, point = max(new, key=lambda pair: pair[0])
     where = where_in_words(systems[1].points, point, point.scenario, {})
     more = (
         f" ({len(new)} test cases are like this; this one is the fastest)" if len(new) > 1 else ""
     )
-    a, b = titles
-    collision = f"its original vehicle collides at {speed:.2f} m/s{where}"
-    return (f"Do not release {b}: {collision}, where that of {a} does not collide{more}",)
+    collision = f"collides at {speed:.2f} m/s with its original vehicle{where}"
+    return [Difference(f"{collision}, where that of {a} does not collide{more}", False, COLLISION)]
 
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:

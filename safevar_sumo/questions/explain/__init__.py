@@ -14,7 +14,13 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
-from safevar_sumo.questions.causes import BOUNDARIES, OTHER_SETS, SUBSETS, count_needed
+from safevar_sumo.questions.causes import (
+    BOUNDARIES,
+    OTHER_SETS,
+    SUBSETS,
+    count_distinct_causes,
+    count_needed,
+)
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
@@ -105,9 +111,8 @@ def explain(
     Parameters
     ----------
     solution
-        Handle of a solution, such as nsga2:3:0; may be repeated. By default the robust failure with
-        the fewest changes, those with the fewest and the smallest changes, the most severe one, and
-        one of each distinct cause.
+        Handle of a solution, such as nsga2:3:0; may be repeated. By default those with
+        the fewest and the smallest changes, the most severe one, and one of each distinct cause.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     top
@@ -144,11 +149,12 @@ def explain(
 
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
+    distinct = count_distinct_causes(evaluator.characteristics, of_sample)
     tables = {
-        "causes": causes_table(population, evaluator, fits, solutions, of_chosen),
+        "causes": causes_table(population, evaluator, fits, solutions, of_chosen, distinct),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions),
-        "distinct_causes": distinct_table(evaluator, of_sample),
+        "distinct_causes": distinct_table(distinct),
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),

@@ -22,7 +22,6 @@ from safevar_sumo.questions.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.robustness import find_smallest_robust_failure
 from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
@@ -34,10 +33,8 @@ Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
 TO_EXPLAIN = "settings to explain"
 """A stage of progress."""
-ROBUST = "smallest robust"
-"""The reason for choosing the robust failure with the fewest changes."""
 REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest": "smallest changes"}
-"""The other reasons for choosing a failure, by the name of the choice in `CHOICES`."""
+"""Reasons for choosing a failure, by the name of the choice in `CHOICES`."""
 REQUESTED = "requested"
 """The reason for explaining a solution that the user names."""
 DISTINCT_CAUSE = "a cause of its own"
@@ -179,9 +176,9 @@ class Chosen(NamedTuple):
 def choose_failures(population: Population, evaluator: Evaluator, limit: int, top: int) -> Chosen:
     """At most `top` failures that matter, and a sample of all failures; of named rows these alone.
 
-    The sample are all failures, if that takes at most about `limit` simulations. What matters: the
-    smallest robust failure, a failure for each of `REASONS`, and the simplest failure with each
-    minimal cause that these do not have.
+    The sample are all failures, if that takes at most about `limit` simulations. What matters: a
+    failure for each of `REASONS`, and the simplest failure with each minimal cause that these do
+    not have.
     """
     rows = population.rows
 
@@ -194,7 +191,7 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     # Causes of a sample, and of failures that matter.
     limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
-    reasons = _failures_that_matter(population, evaluator, limit)
+    reasons = _failures_that_matter(population)
     analysed = sorted({*sample, *reasons})
     found = find_minimal_causes(evaluator, settings[analysed], population.unsafe)
     causes = dict(zip(analysed, found, strict=True))
@@ -218,22 +215,11 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     return Chosen(reasons, sample, causes)
 
 
-def _failures_that_matter(population: Population, evaluator: Evaluator, limit: int) -> Reasons:
-    """The smallest robust failure, and a failure for each of `REASONS`."""
+def _failures_that_matter(population: Population) -> Reasons:
+    """A failure for each of `REASONS`."""
     reasons = Reasons()
-
-    # A robust failure.
     failures = population.evaluations.take(population.rows)
-    if not population.rows:
-        return reasons
-    if not is_rated(evaluator.study) and not population.unsafe.of(population.original)[0]:
-        step = evaluator.system.step
-        index = find_smallest_robust_failure(evaluator, failures, step, population.unsafe, limit)
-        if index is not None:
-            reasons[population.rows[index]] = ROBUST
-
-    # The first of each choice.
-    for choice, reason in REASONS.items():
+    for choice, reason in REASONS.items() if population.rows else ():
         order = np.lexsort([failures.column(name) for name in reversed(CHOICES[choice])])
         row = population.rows[order[0]]
         reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason

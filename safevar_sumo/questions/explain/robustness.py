@@ -8,7 +8,7 @@ import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 NEIGHBOURS = "neighbours"
@@ -19,8 +19,6 @@ STEP_FACTORS: Sequence[float] = (1.0, 0.5, 2.0)
 """Factors by which the study's time step is multiplied; the step itself comes first."""
 MIN_ROBUST_SHARE = 0.8
 """Share of unsafe neighbours from which on a failure is called robust; below, it is borderline."""
-FAILURES_PER_BATCH = 8
-"""Number of failures whose robustness is estimated at a time, the smallest failures first."""
 
 
 def draw_neighbours(
@@ -65,30 +63,6 @@ def robust_shares(
             )
             shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)
-
-
-def find_smallest_robust_failure(
-    evaluator: Evaluator, failures: Evaluations, step: float, unsafe: Unsafe, max_evaluations: int
-) -> int | None:
-    """The row of the robust failure with the fewest changes; of several, the one whose largest
-    change is smallest.
-
-    A failure is robust by the mean over the time steps. Failures are tried in this order until one
-    is robust, or about `max_evaluations` settings are evaluated with each time step; None if no
-    tried failure is robust.
-    """
-    order = np.lexsort([failures.f_safe, failures.f_diff, failures.f_num_diff])[
-        : max_evaluations // NEIGHBOUR_COUNT + 1
-    ]
-    for start in range(0, len(order), FAILURES_PER_BATCH):
-        rows = order[start : start + FAILURES_PER_BATCH]
-        is_robust = (
-            robust_shares(evaluator, failures.settings[rows], step, unsafe).mean(axis=1)
-            >= MIN_ROBUST_SHARE
-        )
-        if is_robust.any():
-            return int(rows[np.argmax(is_robust)])
-    return None
 
 
 def robustness_in_words(share: float) -> str:

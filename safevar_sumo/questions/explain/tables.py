@@ -15,11 +15,11 @@ from safevar_sumo.questions.causes import (
     Cause,
     Limits,
     are_causes,
-    count_distinct_causes,
+    directions,
     find_cause_limits,
     settings_of,
 )
-from safevar_sumo.questions.counterexamples import describe
+from safevar_sumo.questions.counterexamples import values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
     Population,
@@ -27,7 +27,7 @@ from safevar_sumo.questions.explain.failures import (
     compare_at_cells,
     compare_at_points,
 )
-from safevar_sumo.questions.explain.robustness import STEP_FACTORS, robust_shares
+from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, STEP_FACTORS, robust_shares
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
@@ -73,8 +73,9 @@ CAUSE_COLUMNS: Columns = {
     "safety_degree": Column(
         "m", "safety degree with these changes only; -m/s on a collision", is_shown=False
     ),
+    "share": Column("-", "share of the failures that have such a cause", ".2f"),
     "robust_share": Column(
-        "-", "share of vehicles with slightly different values that are unsafe, too", ".2f"
+        "-", "share of vehicles with nearly the values of the cause alone that are unsafe", ".2f"
     ),
     "holds": "number of parameter sets of the vehicle model with which these changes are a cause",
     "fits": "number of parameter sets that were tried",
@@ -93,8 +94,8 @@ SOLUTION_COLUMNS: Columns = {
     "largest_change": Column(
         "-", "its largest change, as a share of the original value", is_shown=False
     ),
-    "robust_share": Column(
-        "-", "share of vehicles with slightly different values that are unsafe, too", ".2f"
+    "unsafe_neighbours": Column(
+        "-", "share of vehicles with nearly the values of the whole failure that are unsafe", ".2f"
     ),
     "ends": Column(
         "", "how the original vehicle and this one end, where this one is worst", is_shown=False
@@ -151,7 +152,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "robust_share": (
+        "unsafe_neighbours": (
             robust_shares(evaluator, settings, evaluator.system.step, unsafe, factors).mean(axis=1)
         ),
         "ends": [sentence for sentence, _ in comparisons],
@@ -167,9 +168,10 @@ def causes_table(
     fits: int,
     solutions: pd.DataFrame,
     causes_of: Sequence[Sequence[Cause]],
+    distinct: pd.DataFrame,
 ) -> pd.DataFrame:
-    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure; of a failure the most robust
-    one first.
+    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure: first the most frequent of
+    the robust ones, whose shares are in `distinct`, then the others, the most robust one first.
     """
     study = evaluator.study
     unsafe = population.unsafe
@@ -193,7 +195,12 @@ def causes_table(
         settings = settings_of(evaluator.characteristics, at_original)
         elsewhere = unsafe.of(evaluator.evaluate(settings, "causes in the original encounter"))
 
-    # Rows by failure, the most robust cause first.
+    # How many failures have a cause with the same directions; robust causes come first.
+    share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
+    kinds = [directions(evaluator.characteristics, cause.changes) for cause in causes]
+    shares = [share_of.get(kind, 0.0) for kind in kinds]
+    is_robust = robust >= MIN_ROBUST_SHARE
+    order = np.lexsort([-robust, -np.where(is_robust, shares, 0.0), ~is_robust])
     solution_of = np.repeat(range(len(solutions)), [len(group) for group in causes_of])
     rows = [
         {
@@ -203,11 +210,12 @@ def causes_table(
             **printed[index],
             "size": len(causes[index].changes),
             "elsewhere": bool(elsewhere[index]),
+            "share": shares[index],
             "robust_share": robust[index],
             "holds": sum(int(is_cause[index]) for is_cause in holding) if holding else None,
             "fits": len(holding) or None,
         }
-        for index in np.lexsort([-robust, solution_of]).tolist()
+        for index in order.tolist()
     ]
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"holds": "Int64", "fits": "Int64"})
     omitted = () if study.scenario.search else OF_ENCOUNTER
@@ -223,7 +231,7 @@ def printed_limits(
     """
     pairs = list(zip(causes, limits, strict=True))
     exact = [limit.boundary | cause.encounter for cause, limit in pairs]
-    printed = _as_printed(model, exact)
+    printed = values_as_printed(model, exact)
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
     whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
@@ -241,7 +249,7 @@ def printed_limits(
         for values, (cause, limit) in zip(printed, pairs, strict=True)
         for name, value in limit.single_boundary.items()
     ]
-    found = iter(_as_printed(model, alone))
+    found = iter(values_as_printed(model, alone))
     return [
         {
             "encounter": {name: values[name] for name in cause.encounter},
@@ -250,16 +258,6 @@ def printed_limits(
         }
         for values, cause in zip(printed, causes, strict=True)
     ]
-
-
-def _as_printed(model: Model, vehicles: Sequence[dict[str, float]]) -> list[dict[str, float]]:
-    """Values of vehicles, all else as in the original, as `describe` prints them, or as they are
-    where it prints none.
-    """
-    members = model.evaluator.characteristics
-    settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
-    settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
-    return [members.named(one) for one in settings.values()]
 
 
 def _holding(
@@ -295,8 +293,7 @@ def statistics_tables(
     }
 
 
-def distinct_table(evaluator: Evaluator, causes: Sequence[Sequence[Cause]]) -> pd.DataFrame:
-    distinct = count_distinct_causes(evaluator.characteristics, causes)
+def distinct_table(distinct: pd.DataFrame) -> pd.DataFrame:
     rows = distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT)
     return tabulate(
         f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows

@@ -10,7 +10,7 @@ driving system is the change of no parameter.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -276,6 +276,7 @@ def _answer_of(
         repairs = [
             _row(problem, change, proof, survivors.fits) for change, proof in survivors.changes
         ]
+        repairs.sort(key=_cost_of)
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "unsafe": str(unsafe),
@@ -320,10 +321,10 @@ def _verdict(
         verdict = (
             "No repair is necessary: with the driving system of today all tested vehicles"
             f"{where} {safe} within the required range ({wear}). The worst of them {ending}."
-            f" {_proof_in_words(survivors)}"
+            f" {_proof_in_words(**_columns_of(survivors.changes[0][1]))}"
         )
     elif repairs:
-        verdict = f"{_repair_in_words(repairs[0], wear, safe)} {_proof_in_words(survivors)}"
+        verdict = f"{_repair_in_words(repairs, wear, safe)} {_proof_in_words(**repairs[0])}"
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = (
@@ -378,18 +379,34 @@ def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) ->
         "changed": len(values),
         "largest_change": float(np.max(np.abs(change - problem.today))),
         "fits": fits,
-        "proof_samples": proof.samples,
-        "proof_failures": proof.failures,
-        "at_most": proof.at_most,
+        **_columns_of(proof),
         **price_of(problem.study, values, problem.encounters),
     }
 
 
-def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
-    """A repair and its price on a new vehicle."""
-    found = "change of the driving system that was"
+def _cost_of(repair: JsonObject) -> tuple[float, ...]:
+    """What makes a repair the cheaper one, and of equal ones the smaller one."""
+    names = ("needless_braking", "metres_earlier", "largest_change")
+    return tuple(repair[name] or 0.0 for name in names)
+
+
+def _columns_of(proof: Proof) -> JsonObject:
+    """A proof by the names of columns."""
+    return {
+        "proof_samples": proof.samples,
+        "proof_failures": proof.failures,
+        "at_most": proof.at_most,
+    }
+
+
+def _repair_in_words(repairs: Sequence[JsonObject], wear: str, safe: str) -> str:
+    """The first repair, which is the cheapest one, and its price on a new vehicle."""
+    repair = repairs[0]
+    smallest = min(one["largest_change"] for one in repairs)
+    kind = "smallest" if repair["largest_change"] == smallest else "cheapest"
+    found = f"{kind} change of the driving system that was"
     if repair["changed"] > 1:
-        found = "changes of the driving system that were"
+        found = f"{kind} changes of the driving system that were"
     metres = repair["metres_earlier"]
     earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
     needless = "Needless braking was not measured: the study has no benign scenes."
@@ -399,19 +416,18 @@ def _repair_in_words(repair: JsonObject, wear: str, safe: str) -> str:
             f" benign scenes ({repair['needless_braking_today']} today)."
         )
     return (
-        f"The smallest {found} found: {repair['change']}. Then all tested vehicles within the"
+        f"The {found} found: {repair['change']}. Then all tested vehicles within the"
         f" required range ({wear}) {safe}. The price: a new vehicle"
         f" {earlier}. {needless}"
     )
 
 
-def _proof_in_words(survivors: Survivors) -> str:
-    """The validation of the first change, in a sentence."""
-    _, proof = survivors.changes[0]
+def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, **_: object) -> str:
+    """The validation of a change, in a sentence."""
     return (
-        f"Of {proof.samples:,} worn vehicles that were sampled afterwards"
-        f" {proof.failures or 'none'} {'is' if proof.failures < 2 else 'are'} unsafe: with"
-        f" {100 * CONFIDENCE:g} % confidence at most {100 * proof.at_most:.2g} % are."
+        f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
+        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe: with"
+        f" {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.2g} % are."
     )
 
 
