@@ -43,6 +43,7 @@ from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
     demanded_in_words,
+    encounter_in_words,
     number_of,
     question_command,
 )
@@ -327,12 +328,13 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[
     # What is left, and the command that simulates it.
     values = members.named(found.settings[0])
     changed = [item for item in members if values[item.name] != item.original]
-    texts = change_texts(members, values, are_printed=True)
+    texts = change_texts(members.vehicle, values, are_printed=True)
+    where = encounter_in_words(members, values, are_printed=True)
     options = "".join(f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed)
-    listed = "" if len(texts) > MAX_LISTED else f": {', '.join(texts)}"
+    listed = "" if not 0 < len(texts) <= MAX_LISTED else f": {', '.join(texts)}"
     return (
         f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
-        f" {case.unsafe.breach_in_words(found)}{listed}. It is simulated by"
+        f" {case.unsafe.breach_in_words(found)}{where}{listed}. It is simulated by"
         f" {question_command('simulate', str(results.directory))}{options}.",
         [(item.name, item.unit, item.original, values[item.name]) for item in changed],
     )

@@ -125,7 +125,8 @@ VERSIONS = {
     "later": (
         {"ads": {"model": "late:Late"}},
         "do not release",
-        "is less safe than wear, but brakes less often without need. It collides at",
+        r"but brakes less often without need\. It collides at ([\d.]+) m/s with its original"
+        r" vehicle in the test CPFA at 40 km/h, where that of wear does not",
     ),
     "needless": (
         {"ads": {"parameters": {"braking_share": 0.1}}},
@@ -164,8 +165,10 @@ def test_none_of_four_worse_versions_is_released(
     assert answer.numbers["decision"] == decision
     assert answer.verdict.startswith(f"{decision.upper()}: {version} ")
     assert bool(answer.failures) == (decision == "do not release")
-    assert (answer.numbers["b_outcome"] == "collision") == (version == "later")
-    assert re.search(words, answer.verdict)
+    said = re.search(words, answer.verdict)
+    assert said is not None, answer.verdict
+    for speed in said.groups():
+        assert float(speed) == pytest.approx(-answer.numbers["b_degree"], abs=0.005)
 
 
 @pytest.mark.slow

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
 
-from safevar_sumo import compare, tolerance
+from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
@@ -24,7 +23,6 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool
-from tests.made_up import original_of
 from tests.questions.conftest import made_up_evaluator, made_up_study
 
 
@@ -114,33 +112,3 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
         "The original vehicle itself keeps 0.88 m of clearance, less than 30"
     )
     assert answer.numbers["kept"] is False
-
-
-@pytest.mark.slow
-def test_a_version_whose_original_collides_is_not_released(tmp_path: Path) -> None:
-    """The new version reacts later: its original hits somebody where that of `wear` does not."""
-    file = tmp_path / "late.toml"
-    table = 'extends = "wear"\nname = "late"\n[ads]\nmodel = "aeb"\n'
-    file.write_text(f"{table}parameters = {{ braking_share = 0.75, response_time = 0.05 }}\n")
-    study = load_study("wear")
-    other = load_study(str(file))
-    answer = compare.compute(study, Evaluator(study, InlinePool(), verified=0), other, samples=20)
-    said = re.search(
-        r"It collides at ([\d.]+) m/s with its original vehicle in the test (\w+) at"
-        r" ([\d.]+) km/h"
-        r" with impact location ([\d.]+) %, where that of wear does not",
-        answer.verdict,
-    )
-    assert said is not None, answer.verdict
-    assert answer.failures[0].startswith("DO NOT RELEASE: late is less safe than ")
-    system = assemble(other)
-    named = [
-        point
-        for point in system.points
-        if dict(point.parameters).get("test") == said[2]
-        and dict(point.parameters).get("speed") == float(said[3])
-        and dict(point.parameters).get("impact_location") == float(said[4])
-    ]
-    runs = drive_and_score(system.at(named[0]), original_of(system))
-    assert -runs.f_safe[0] == pytest.approx(float(said[1]), abs=0.005)
-    assert "with the study's own parameter set" in answer.tables["limits"].attrs["title"]
