@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from types import SimpleNamespace
 from typing import cast
 
@@ -19,8 +18,6 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, judges_of
 from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool
 from tests.questions.conftest import made_up_evaluator, made_up_study
