@@ -169,7 +169,7 @@ def test_the_verdict_names_what_is_lost_and_where() -> None:
     answer = answer_about(np.nan, hits(numbers("CPNCO", "standard", "night"), 40.0))
     assert answer.verdict.startswith("With tread depth at 3 mm, the vehicle loses 1.")
     assert re.search(
-        r"It loses most in CPNCO night: [\d.]+ points\. Not comparable with an official",
+        r"It loses most in CPNCO night: [\d.]+ points, from 10 km/h on\. Not comparable with an",
         answer.verdict,
     )
     equal = answer_about(np.nan, hits(numbers("CBNA") + numbers("CBFA"), 60.0))
