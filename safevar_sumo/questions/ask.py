@@ -324,10 +324,10 @@ class Question:
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
         for option in self.options:
             value = values.get(option.name, option.default)
+            if option.metavar == CARS_FILE and not isinstance(value, str | Path | None):
+                value = CARS_FILE  # a table's contents are none of the command's
             if value == option.default:
                 continue
-            if option.metavar == CARS_FILE and not isinstance(value, str | Path):
-                value = CARS_FILE  # a table's contents are none of the command's
             texts = [""] if option.kind is bool else value if option.is_repeated else [value]
             words += [
                 f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag

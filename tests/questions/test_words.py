@@ -33,7 +33,7 @@ TYPED = (
     ("rules", "tiny.toml", "--samples", "512"),
     ("explain", "tiny.toml", "--fits", "2", "--top", "2", "--limit", "500"),
     ("explain", "results", "--fits", "2", "--top", "2", "--limit", "500"),
-    ("compare", "tiny.toml", "rain", "--samples", "64"),
+    ("compare", "rain", "tiny.toml", "--samples", "64"),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW, "--limits", "tireFric >= 3"),
     ("repair", "tiny.toml", "--fits", "0", "--margin", "1"),
