@@ -151,8 +151,9 @@ def box_of(
     limits: dict[str, Limit],
     others: Sequence[Region] = (),
     budget: int = 2000,
+    outer: LimitsTogether | None = None,
 ) -> LimitsTogether:
-    """The box of a planted region, and of those of further fits."""
+    """The box of a planted region, and of those of further fits, within an outer one."""
     study = made_up_study(n)
     fits = [
         Model(number, Evaluator(study, Plant(study, each)), Unsafe())
@@ -170,7 +171,7 @@ def box_of(
     known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
     nothing = known[:0]
     search = JointSearch(
-        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, budget
+        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, budget, outer
     )
     search.find(scans, known)
     for model in fits[1:]:

@@ -47,6 +47,34 @@ def test_the_box_with_limits_is_nearly_the_largest(
     )
 
 
+def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
+    """Of two unsafe pairs the second alone leaves a box that one of the first pair does not hold,
+    so that a search of its own moves a limit out.
+    """
+
+    def pair(rows: FloatArray) -> BoolArray:
+        return np.asarray((rows[:, 0] > 7) & (rows[:, 1] > 6))
+
+    def both(rows: FloatArray) -> BoolArray:
+        return np.asarray(pair(rows) | (rows[:, 0] > 7) & (rows[:, 2] > 6))
+
+    outer = box_of(3, pair, {})
+    alone, inner = box_of(3, both, {}), box_of(3, both, {}, outer=outer)
+    assert outer.box is not None
+    assert alone.box is not None
+    assert inner.box is not None
+    ends = [outer.box.upper, alone.box.upper, inner.box.upper]
+    assert (ends[1] > ends[0]).any()
+    assert (ends[2] <= ends[0]).all()
+    assert (inner.box.lower >= outer.box.lower).all()
+    assert not both(inner.box.corners(0, 0)).any()
+    again = box_of(3, pair, {}, outer=outer)
+    assert again.box is not None
+    assert again.box.upper.tolist() == ends[0].tolist()
+    assert again.beyond.keys() == outer.beyond.keys()
+    assert box_of(3, pair, {}, outer=outer._replace(box=None)).box is None
+
+
 def test_no_limit_of_the_box_can_move_out_alone() -> None:
     """By a 50th of its range, or it meets the failure that is named."""
     found = box_of(3, linear, {})

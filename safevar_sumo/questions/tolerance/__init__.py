@@ -26,7 +26,7 @@ from safevar_sumo.questions.tolerance.limits import (
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
 from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
-from safevar_sumo.questions.tolerance.up_to import names_left_out, study_up_to
+from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
 from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
 from safevar_sumo.study import Study
@@ -111,6 +111,7 @@ def tolerance(
     phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
     phases |= {WIDER_STAGE: 4.0} if study.wider else {}
     evaluator.plan(phases, VALIDATION_STAGE)
+    smaller = [] if up_to is None else smaller_cuts(whole.study, up_to)
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -135,5 +136,6 @@ def tolerance(
         at_tests=at_tests,
         up_to=up_to,
         left_out=names_left_out(whole.study, study),
+        smaller=[whole.for_study(cut) for cut in smaller],
     )
     return answer_limits(asked)

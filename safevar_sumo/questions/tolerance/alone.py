@@ -68,6 +68,21 @@ class AloneLimit(NamedTuple):
         """What is beyond the end that is nearer to the original."""
         return min(filter(None, self.beyond), key=lambda pair: self._change(*pair), default=None)
 
+    def within(self, outer: AloneLimit) -> AloneLimit:
+        """The limit, each end of which is that of an outer limit where this is closer."""
+        if self.safe is None or outer.safe is None:
+            return self
+        (low, below), (high, above) = (
+            max(pairs, key=lambda pair: sign * pair[0])
+            for sign, *pairs in zip(
+                (1, -1),
+                zip(self.safe, self.beyond, strict=True),
+                zip(outer.safe, outer.beyond, strict=True),
+                strict=True,
+            )
+        )
+        return AloneLimit(self.scan, (low, high), (below, above))
+
     def _change(self, setting: FloatArray, model: Model) -> float:
         column = model.evaluator.characteristics.names.index(self.characteristic.name)
         return abs(float(setting[column]) - self.characteristic.original)

@@ -42,6 +42,9 @@ class Asked(NamedTuple):
         The parameter and the value at which the study was cut, as `NAME=V`; None if it was not.
     left_out
         The names of the tests that are above this value.
+    smaller
+        The evaluators of the study cut at smaller values, in ascending order: its limits lie within
+        those of each.
     """
 
     subject: Study | Case
@@ -58,6 +61,7 @@ class Asked(NamedTuple):
     at_tests: bool = False
     up_to: str | None = None
     left_out: Sequence[str] = ()
+    smaller: Sequence[Evaluator] = ()
 
     @property
     def drives_between(self) -> bool:

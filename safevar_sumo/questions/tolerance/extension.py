@@ -82,7 +82,7 @@ class Extension:
         search = self.search
         side, column = step
         sides = search.sides_of(wider)
-        if len(search.unsafe_inside(sides)):
+        if sides[side, column] > search.longest[side, column] or len(search.unsafe_inside(sides)):
             return True
         end = (wider.lower, wider.upper)[side][column]
         ends = [wider.lower.copy(), wider.upper.copy()]

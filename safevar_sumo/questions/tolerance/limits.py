@@ -117,8 +117,22 @@ class FoundLimits(NamedTuple):
         return all(one.safe is not None for one in self.scans)
 
 
-def find_limits(asked: Asked) -> FoundLimits:
-    """Search the limits that a question asks for."""
+def find_nested_limits(asked: Asked) -> FoundLimits:
+    """Search the limits that a question asks for: those up to a value within those up to each
+    smaller one at which the original vehicle is safe.
+    """
+    outer = None
+    for evaluator in asked.smaller:
+        original = evaluator.evaluate(
+            evaluator.characteristics.original_settings, "original vehicle"
+        )
+        if original.valid[0] and not asked.unsafe.of(original)[0]:
+            outer = find_limits(asked._replace(evaluator=evaluator, original=original), outer)
+    return find_limits(asked, outer)
+
+
+def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
+    """Search limits within outer ones."""
     evaluator = asked.evaluator
     members = evaluator.characteristics
     # A box of a rated study would take thousands of whole test matrices.
@@ -137,17 +151,25 @@ def find_limits(asked: Asked) -> FoundLimits:
     search_alone = AloneSearch(scans, asked.columns, models.own)
     together = None
     if is_sought and is_safe:
-        together = _find_together(asked, scans, models, search_alone)
+        outer_box = None if outer is None else outer.together
+        together = _find_together(asked, scans, models, search_alone, outer_box)
     else:
         search_alone.add(models.own)
-    return FoundLimits(scans, models, search_alone.limits(), together)
+    alone = search_alone.limits()
+    if outer is not None:
+        alone = [each.within(wide) for each, wide in zip(alone, outer.alone, strict=True)]
+    return FoundLimits(scans, models, alone, together)
 
 
 def _find_together(
-    asked: Asked, scans: Sequence[OneAtATimeScan], models: Models, search_alone: AloneSearch
+    asked: Asked,
+    scans: Sequence[OneAtATimeScan],
+    models: Models,
+    search_alone: AloneSearch,
+    outer: LimitsTogether | None,
 ) -> LimitsTogether:
-    """The joint limits, which hold nothing that the search of limits alone met, and the other way
-    round: limits alone end before failures that the search of joint limits met.
+    """The joint limits within outer ones. They hold nothing that the search of limits alone met,
+    and the other way round: limits alone end before failures that the search of joint limits met.
 
     One parameter set after another moves both in, so that they do not depend on those that follow.
     """
@@ -160,7 +182,7 @@ def _find_together(
         model.fit: moving_tests(model, asked.unsafe) if asked.drives_between else []
         for model in models.members
     }
-    joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget)
+    joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget, outer)
     known = np.concatenate([asked.unsafe_solutions, _unsafe_alone(asked, scans)])
     encounters = 1 + len(asked.evaluator.critical_encounters)
     for model in models.members:
@@ -185,7 +207,7 @@ def answer_limits(asked: Asked) -> Answer:
     """The answer with limits alone and joint limits."""
     evaluator = asked.evaluator
     study = evaluator.study
-    found = find_limits(asked)
+    found = find_nested_limits(asked)
     models = found.models
     together = found.together
     scope = scope_of(study, between=asked.drives_between)

@@ -72,8 +72,8 @@ class BoxGeometry:
     is_free
         Which sides may move; the others are at their limits.
     longest
-        The longest that each side may be: a free one to the end of its domain, a fixed one to its
-        limit.
+        The longest that each side may be: a free one to the end of its domain, or to that of an
+        outer box within which it stays, a fixed one to its limit.
     fixed
         The box whose free sides are 0.
     """
@@ -97,6 +97,11 @@ class BoxGeometry:
             np.isnan(self.limits), self.domain, np.abs(self.limits - self.original)
         )
         self.fixed = np.where(self.is_free, 0.0, self.longest)
+
+    def stay_within(self, outer: Box) -> None:
+        """Let no free side be longer than that of an outer box of vehicles."""
+        shorter = np.minimum(self.longest, self.sides_of(outer))
+        self.longest = np.where(self.is_free, shorter, self.longest)
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -137,11 +142,11 @@ class BoxGeometry:
         return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
 
     def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
-        """A box with some sides moved outwards by a share of the domain, at most to its end."""
+        """A box with some sides moved outwards by a share of the domain, up to their longest."""
         wider = sides.copy()
         for side, column in steps:
             wider[side, column] = min(
-                sides[side, column] + share * self.width[column], self.domain[side, column]
+                sides[side, column] + share * self.width[column], self.longest[side, column]
             )
         return wider
 

@@ -206,6 +206,9 @@ class JointSearch:
     A further parameter set meets the box with corners and searches of its own, and what fails is
     cut off. Nothing moves out any more, and nothing depends on sets that follow: with more sets,
     limits are never wider.
+
+    Up to a larger value of a parameter, the box stays within an `outer` one, found up to a smaller
+    value: limits are never wider then, either. What failed there stays known.
     """
 
     def __init__(
@@ -215,6 +218,7 @@ class JointSearch:
         columns: Sequence[int],
         limits: Mapping[str, Limit],
         budget: int,
+        outer: LimitsTogether | None = None,
     ) -> None:
         self.own = models.own._replace(
             evaluator=models.own.evaluator.for_study(models.own.evaluator.study, verified=0)
@@ -233,6 +237,11 @@ class JointSearch:
             (self.own,),
             self._search.failures_alone,
         )
+        self._outer = outer
+        if outer is not None:
+            broken = {**outer.broken, **self.found.broken}
+            searched = (*self.found.searched, *outer.searched)
+            self.found = self.found._replace(broken=broken, searched=searched)
         self.met: Sequence[Model] = ()
         self._validators = list[Validator]()
         """Of the study's own set, then of those in which something failed."""
@@ -251,6 +260,14 @@ class JointSearch:
             first = self.own.at_worst_points(unsafe_settings, "worst points")
         search = BoxSearch(first, self._columns, self._limits, unsafe_settings)
         self._search = search
+        if self._outer is not None:
+            # Without joint limits there are none here: no free side has any room.
+            search.stay_within(self._outer.box or self._outer.specified)
+            known = [
+                search.unsafe_settings,
+                *(row[np.newaxis] for row in self._outer.beyond.values()),
+            ]
+            search.unsafe_settings = np.concatenate(known)
         boxes = _Boxes(search, _start_of(search, self._columns, scans), self.own.evaluator)
         validator = self._validator(self.own, self._budget)
         self._validators = [validator]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name
@@ -15,6 +16,10 @@ from safevar_sumo.sumo.system import assemble
 
 OPTION = "up_to"
 FORM = "NAME=V: a searched parameter or an axis of the matrix, and a number"
+PARTS, DECIMALS = 5, 9
+"""Number of parts of a searched range, and decimals of their ends, within the limits up to which
+those up to larger values lie.
+"""
 
 
 def study_up_to(study: Study, text: str) -> Study:
@@ -52,6 +57,20 @@ def study_up_to(study: Study, text: str) -> Study:
         raise InputError(OPTION, repr(text), FORM)
     check_name(OPTION, problem, name, known)
     return (_search_up_to if name in study.scenario.search else _matrix_up_to)(study, name, high)
+
+
+def smaller_cuts(study: Study, text: str) -> list[Study]:
+    """The study cut at smaller values than the one that an option states, in ascending order: those
+    of the matrix, or ends of equal parts of the searched range.
+    """
+    name, _, high = (part.strip() for part in text.partition("="))
+    if name in study.scenario.search:
+        domain = study.scenario.search[name]
+        values = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:].round(DECIMALS).tolist()
+    else:
+        assert study.matrix is not None
+        values = sorted({value for test in study.matrix.tests for value in _values(test, name)})
+    return [study_up_to(study, f"{name}={each}") for each in values if each < float(high)]
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:
