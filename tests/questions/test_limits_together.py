@@ -48,15 +48,13 @@ def test_the_box_with_limits_is_nearly_the_largest(
 
 
 def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
-    """Of two unsafe pairs the second alone leaves a box that one of the first pair does not hold,
-    so that a search of its own moves a limit out.
-    """
+    """The largest box without the larger region has b up to 7, and needs no limit of a."""
 
     def pair(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7) & (rows[:, 1] > 6))
+        return np.asarray((rows[:, 0] > 9) & (rows[:, 1] > 7))
 
     def both(rows: FloatArray) -> BoolArray:
-        return np.asarray(pair(rows) | (rows[:, 0] > 7) & (rows[:, 2] > 6))
+        return np.asarray(pair(rows) | (rows[:, 1] > 7) & (rows[:, 2] > 5.5))
 
     outer = box_of(3, pair, {})
     alone, inner = box_of(3, both, {}), box_of(3, both, {}, outer=outer)

@@ -111,7 +111,6 @@ def tolerance(
     phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
     phases |= {WIDER_STAGE: 4.0} if study.wider else {}
     evaluator.plan(phases, VALIDATION_STAGE)
-    smaller = [] if up_to is None else smaller_cuts(whole.study, up_to)
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -136,6 +135,6 @@ def tolerance(
         at_tests=at_tests,
         up_to=up_to,
         left_out=names_left_out(whole.study, study),
-        smaller=[whole.for_study(cut) for cut in smaller],
+        smaller=[*map(whole.for_study, smaller_cuts(whole.study, up_to))],
     )
     return answer_limits(asked)

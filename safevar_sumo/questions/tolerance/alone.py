@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -72,16 +73,13 @@ class AloneLimit(NamedTuple):
         """The limit, each end of which is that of an outer limit where this is closer."""
         if self.safe is None or outer.safe is None:
             return self
-        (low, below), (high, above) = (
-            max(pairs, key=lambda pair: sign * pair[0])
-            for sign, *pairs in zip(
-                (1, -1),
-                zip(self.safe, self.beyond, strict=True),
-                zip(outer.safe, outer.beyond, strict=True),
-                strict=True,
-            )
-        )
-        return AloneLimit(self.scan, (low, high), (below, above))
+        ends = [
+            *zip(self.safe, self.beyond, strict=True),
+            *zip(outer.safe, outer.beyond, strict=True),
+        ]
+        low, below = max(ends[::2], key=itemgetter(0))
+        high, above = min(ends[1::2], key=itemgetter(0))
+        return self._replace(safe=(low, high), beyond=(below, above))
 
     def _change(self, setting: FloatArray, model: Model) -> float:
         column = model.evaluator.characteristics.names.index(self.characteristic.name)

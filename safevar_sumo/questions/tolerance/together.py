@@ -239,9 +239,9 @@ class JointSearch:
         )
         self._outer = outer
         if outer is not None:
-            broken = {**outer.broken, **self.found.broken}
-            searched = (*self.found.searched, *outer.searched)
-            self.found = self.found._replace(broken=broken, searched=searched)
+            self.found = self.found._replace(
+                broken={**outer.broken, **self.found.broken}, searched=(self.own, *outer.searched)
+            )
         self.met: Sequence[Model] = ()
         self._validators = list[Validator]()
         """Of the study's own set, then of those in which something failed."""

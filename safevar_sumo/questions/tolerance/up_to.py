@@ -59,10 +59,12 @@ def study_up_to(study: Study, text: str) -> Study:
     return (_search_up_to if name in study.scenario.search else _matrix_up_to)(study, name, high)
 
 
-def smaller_cuts(study: Study, text: str) -> list[Study]:
+def smaller_cuts(study: Study, text: str | None) -> list[Study]:
     """The study cut at smaller values than the one that an option states, in ascending order: those
-    of the matrix, or ends of equal parts of the searched range.
+    of the matrix, or ends of equal parts of the searched range. None without the option.
     """
+    if text is None:
+        return []
     name, _, high = (part.strip() for part in text.partition("="))
     if name in study.scenario.search:
         domain = study.scenario.search[name]
