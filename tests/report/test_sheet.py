@@ -96,7 +96,7 @@ def reported(
     return ReportedStudy(
         directory=Path(study.name),
         case=case,
-        versions={"libsumo": "1.28"},
+        versions={"libsumo": "1.28", "safevar_sumo": "0.5.0", "deap": "1.4.4", "numpy": "2.4.6"},
         answers=answers,
         later_changes=changes,
     )
