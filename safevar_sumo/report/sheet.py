@@ -4,10 +4,10 @@ be printed alone. Its sentences stand in `web/sheet.html.j2`.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
-from math import ceil
 from shlex import join
 from typing import Any
 
@@ -57,30 +57,46 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     unsafe = Unsafe.parse(numbers.get("unsafe", "collision"))
     is_screening = _is_relative(study.case, unsafe)
     missing = _why_no_limits(study, limits)
-    speed = study.answers[-1] if speed_question(study) else None
     wider = [] if missing or "wider" not in limits.tables else _records(limits.tables["wider"])
-    up_to, stop = _greatest_speed(study, speed, wider)
-    claim = speed.numbers if speed is not None and up_to else numbers
+    claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
+    if speed_question(study):
+        claim = study.answers[-1]
+        up_to, missing = _greatest_speed(study, claim, wider)
+        reasons = [claim.verdict]
 
     # The table, and what it is about.
-    *tests, road = claim.get("scope", "").split("; ")
-    rows = () if missing else _parts(study, limits)
-    varied = set(limits.table().get("characteristic", ()))
+    *tests, road = claim.numbers.get("scope", "").split("; ")
+    rows = {} if missing else {row["characteristic"]: row for row in _records(limits.table())}
+    items = study.case.characteristics.vehicle
+    parts = [
+        (
+            name[:1].upper() + name[1:],
+            item.measurement,
+            _limit_in_words(item, rows.get(item.name)),
+            f"{BLANK}{item.suffix}",
+            item.remedy or UNSAID,
+        )
+        for item in items
+        if item.is_for_workshop and not missing and (name := item.meaning or item.short_name)
+    ]
+    stated = study.case.study.unmeasured_values if up_to else {}
     return {
         "missing": missing,
-        "stop": stop,
         "up_to": up_to,
         "is_screening": is_screening,
-        "is_signed": not (
-            missing or stop or numbers["rough"] or study.later_changes or is_screening
-        ),
+        "is_signed": not (missing or numbers["rough"] or study.later_changes or is_screening),
         "unsafe": unsafe,
-        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, rows))),
-        "others": [] if missing else [*_others(study, limits, with_values=bool(up_to))],
+        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, parts))),
+        "others": [
+            f"{item.short_name} {stated[item.name]:.10g}{item.suffix}"
+            if item.name in stated
+            else f"{item.short_name} {_limit_in_words(item, rows.get(item.name))}"
+            for item in items
+            if not item.is_for_workshop
+        ],
         "numbers": numbers,
         "claim": claim,
-        "reasons": [limits.verdict, *limits.failures],
-        "speed": speed,
+        "reasons": reasons,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
         "tests": [_tests_in_words(phrase) for phrase in tests],
@@ -89,9 +105,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
-            f"{item.short_name} {_domain_in_words(item)}"
-            for item in study.case.characteristics.vehicle
-            if item.name in varied
+            f"{item.short_name} {_domain_in_words(item)}" for item in items if item.name in rows
         ],
     }
 
@@ -101,48 +115,27 @@ def speed_question(study: ReportedStudy) -> str:
     may work by the sheet, or the study varies no speed.
     """
     limits = _limits_of(study)
-    if limits is None or _why_no_limits(study, limits):
+    if limits is None or study.point or _why_no_limits(study, limits) or not speeds_of(study.case):
         return ""
-    if study.point or speeds_of(study.case) is None:
-        return ""
-    numbers = limits.numbers
-    unsafe = Unsafe.parse(numbers["unsafe"])
-    if _is_relative(study.case, unsafe):
+    unsafe, margin = limits.numbers["unsafe"], limits.numbers["margin"]
+    if _is_relative(study.case, Unsafe.parse(unsafe)):
         return ""
 
-    # The criterion of the limits.
-    words = ["permit", "--others", "new"]
-    if unsafe.is_collision and numbers["margin"]:
-        words += ["--margin", f"{numbers['margin']:g}"]
-    else:
-        words += ["--unsafe", numbers["unsafe"]]
-    words += ["--quick"] if numbers["rough"] else []
-
-    # The limits; what a workshop does not measure has the study's value, if it states one.
-    rows = _rows_of(limits)
+    # The criterion and the values of the limits; what a workshop does not measure has the value
+    # that the study states, if it states one.
+    is_contact = unsafe == "collision" and margin
+    words = ["--margin", f"{margin:g}"] if is_contact else ["--unsafe", unsafe]
+    words += ["--quick"] * limits.numbers["rough"]
+    rows = {row["characteristic"]: row for row in _records(limits.table())}
     for item in study.case.characteristics.vehicle:
         if item.is_for_workshop or item.name not in study.case.study.unmeasured:
-            for limit in _typed_limits(item, rows.get(item.name)):
-                words += ["--limits", limit]
-    return join(words)
-
-
-def _typed_limits(item: Characteristic, row: Mapping[Any, Any] | None) -> Iterator[str]:
-    """The limits of an item as one types them, at least one."""
-    low, high = _together(item, row)
-    if low != item.lower or high == item.upper:
-        yield f"{item.name} >= {low!r}"
-    if high != item.upper:
-        yield f"{item.name} <= {high!r}"
+            low, high = _together(item, rows.get(item.name))
+            words += ["--limits", f"{item.name} >= {low!r}", "--limits", f"{item.name} <= {high!r}"]
+    return join(["permit", "--others", "new", *words])
 
 
 def _limits_of(study: ReportedStudy) -> Answer | None:
     return next((answer for answer in study.answers if answer.question == "tolerance"), None)
-
-
-def _rows_of(limits: Answer) -> dict[str, Mapping[Any, Any]]:
-    """The limits by characteristic."""
-    return {row["characteristic"]: row for row in _records(limits.tables["limits"])}
 
 
 def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
@@ -158,24 +151,22 @@ def speeds_of(case: Case) -> Span | None:
 
 
 def _greatest_speed(
-    study: ReportedStudy, speed: Answer | None, wider: Sequence[Mapping[Any, Any]]
+    study: ReportedStudy, speed: Answer, wider: Sequence[Mapping[Any, Any]]
 ) -> tuple[str, str]:
-    """The greatest speed of vehicles within the limits, with its unit, or the least speed of the
-    study, at which they are not safe; both are empty if nobody asked.
+    """The greatest speed of vehicles within the limits, with its unit; empty if they are not safe
+    at the least one, with a sentence that says so.
 
-    It is below the least speed at which a vehicle within the limits fails in a wider study.
+    It is below the least speed at which such a vehicle fails in a wider study.
     """
     span = speeds_of(study.case)
-    if speed is None or span is None:
-        return "", ""
-    found = [*speed.tables["cars"]["up_to"]] if speed.tables else [None]
-    if pd.isna(found[0]):
-        return "", f"{span.low:g} {span.unit}"
-    failing = [row["fails_at"] for row in wider if not row["kept"] and row["fails_at"]]
-    below = [ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
-    greatest = min([float(found[0]), *below])
-    words = f"{max(greatest, span.low):g} {span.unit}"
-    return (words, "") if greatest >= span.low else ("", words)
+    assert span is not None
+    failing = [row["fails_at"] or {} for row in wider if not row["kept"]]
+    below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
+    found = [*speed.tables["cars"]["up_to"].astype(float)] if speed.tables else []
+    greatest = min([*found, *below], default=math.nan)
+    if greatest >= span.low:
+        return f"{greatest:g} {span.unit}", ""
+    return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."
 
 
 def _is_relative(case: Case, unsafe: Unsafe) -> bool:
@@ -200,33 +191,6 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     items = study.case.characteristics.vehicle
     is_measured = any(item.is_for_workshop for item in items)
     return "" if is_measured else "The study names no item that a workshop can measure."
-
-
-def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
-    """A row of `PARTS` for each characteristic that a workshop can measure."""
-    rows = _rows_of(limits)
-    for item in study.case.characteristics.vehicle:
-        if item.is_for_workshop:
-            name = item.meaning or item.short_name
-            yield (
-                f"{name[:1].upper()}{name[1:]}",
-                item.measurement,
-                _limit_in_words(item, rows.get(item.name)),
-                f"{BLANK}{item.suffix}",
-                item.remedy or UNSAID,
-            )
-
-
-def _others(study: ReportedStudy, limits: Answer, *, with_values: bool) -> Iterator[str]:
-    """The limit of each other characteristic; `with_values`, its stated value in their place."""
-    rows = _rows_of(limits)
-    stated = study.case.study.unmeasured_values if with_values else {}
-    for item in study.case.characteristics.vehicle:
-        if not item.is_for_workshop:
-            words = _limit_in_words(item, rows.get(item.name))
-            if item.name in stated:
-                words = f"{stated[item.name]:.10g}{item.suffix}"
-            yield f"{item.short_name} {words}"
 
 
 def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[float, float]:

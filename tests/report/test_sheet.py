@@ -248,7 +248,9 @@ def test_a_failure_in_a_wider_study_lowers_the_greatest_speed() -> None:
 
 def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
     sheet = sheet_with(answer_of(), speed_of(None))
-    assert "vehicles within its limits are not safe even at 10 km/h" in sheet
+    assert (
+        "Do not use this sheet. Vehicles within its limits are not safe even at 10 km/h." in sheet
+    )
     assert "ReasonSlow." in sheet
     assert "signature" not in sheet
 
@@ -257,9 +259,11 @@ def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_other
     question, values = parse_question(speed_question(reported(answer_of())))
     assert (question.name, values["margin"], values["others"]) == ("permit", 0.3, "new")
     assert values["limits"] == (
-        *("treadDepth >= 3.0", "brakeTorque >= 0.85", "brakeResponse <= 0.132"),
-        *("payload >= 75.0", "payloadCentre >= 1.3", "payloadCentre <= 2.0"),
-        *("sensorRange >= 80.0", "sensorLatency >= 0.05", "sensorLatency <= 0.05"),
+        *("treadDepth >= 3.0", "treadDepth <= 8.0", "brakeTorque >= 0.85", "brakeTorque <= 1.0"),
+        *("brakeResponse >= 0.05", "brakeResponse <= 0.132", "payload >= 75.0", "payload <= 525.0"),
+        *("payloadCentre >= 1.3", "payloadCentre <= 2.0"),
+        *("sensorRange >= 80.0", "sensorRange <= 80.0"),
+        *("sensorLatency >= 0.05", "sensorLatency <= 0.05"),
     )
     # What the study states of a value that nobody measured stands in place of a limit.
     joint = replace(answer_of(unsafe="drac > 6", rough=True), study=read_study("wear_joint"))
