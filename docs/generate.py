@@ -225,9 +225,10 @@ def characteristics() -> str:
     for study in map(read_study, study_names()):
         for key, row in study.vehicle.characteristics.items():
             model = study.vehicle.model
+            how = f"{'' if row.workshop else 'not in a workshop: '}{row.measurement}"
             seen.setdefault(
                 (model, key),
-                (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart, row.measurement),
+                (f"`{model}`", f"`{key}`", row.unit, row.meaning, row.counterpart, how),
             )
     return _table(
         (

@@ -289,6 +289,8 @@ class Question:
                 values = {**values, option: criterion}
                 if study.unsafe.source:
                     cites = f"Criterion: {criterion} ({study.unsafe.source})."
+                if study.unsafe.not_simulated:
+                    cites += f" Not simulated: {study.unsafe.not_simulated}."
             if criterion is not None:
                 unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]

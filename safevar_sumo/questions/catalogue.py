@@ -216,7 +216,9 @@ def _in_a_workshop(item: Characteristic) -> str | None:
     study says neither.
     """
     remedy = f"beyond its limit: {item.remedy}" if item.remedy else ""
-    return "; ".join(filter(None, (item.measurement, remedy))) or None
+    place = "" if item.workshop else "not in a workshop: "
+    measurement = f"{place}{item.measurement}" if item.measurement else ""
+    return "; ".join(filter(None, (measurement, remedy))) or None
 
 
 def _studies() -> Iterator[tuple[str, ...]]:

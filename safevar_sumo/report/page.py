@@ -35,7 +35,7 @@ from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, replays, tested, trust
-from safevar_sumo.report.sheet import sheet_of
+from safevar_sumo.report.sheet import sheet_of, speed_question
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
 
@@ -135,30 +135,35 @@ def report(
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
-        numbers, total = count(1), sum(map(len, asked)) + len(joint)
+        with_sheet = [text for texts in asked for text in texts if text.startswith("tolerance")]
+        numbers, total = count(1), sum(map(len, asked)) + len(with_sheet) + len(joint)
 
-        def next_answer(text: str, chosen: slice) -> Answer:
+        def next_answer(text: str, chosen: slice, *, is_asked: bool = bool(ask)) -> Answer:
             """The next answer, about these of the results."""
             question = with_criterion(text, unsafe)
             subjects = by_criterion if has_criterion(question, unsafe) else at_point
             number = next(numbers)
             name = f"question {number} of {total}, {question.split()[0]}"
             show_part = partial(show_within, show, name, (number - 1) / total, 1 / total)
-            answer = answer_to if ask else answer_or_reason
+            answer = answer_to if is_asked else answer_or_reason
             return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
-        # The answers, in the order of the page.
-        studies = [
-            ReportedStudy(
+        # The answers, in the order of the page, with the greatest speed of each sheet.
+        studies = []
+        for number, path in enumerate(paths):
+            chosen = slice(number, number + 1)
+            study = ReportedStudy(
                 directory=path,
                 case=by_criterion[number],
                 versions=read_manifest(path)["versions"],
-                answers=[next_answer(text, slice(number, number + 1)) for text in asked[number]],
+                answers=[next_answer(text, chosen) for text in asked[number]],
                 point=point or "",
                 later_changes=later_changes[number],
             )
-            for number, path in enumerate(paths)
-        ]
+            if text := speed_question(study):
+                speed = next_answer(text, chosen, is_asked=False)
+                study = replace(study, answers=[*study.answers, speed])
+            studies.append(study)
         shared = [next_answer(text, slice(None)) for text in joint]
         page = make_page(studies, shared, show)
     write_whole(out, page)

@@ -168,6 +168,12 @@ class ReportedStudy:
         return solutions.loc[list(self.choices)]
 
     @property
+    def has_workshop_parts(self) -> bool:
+        """Whether a workshop can measure at least half of the vehicle's characteristics."""
+        items = self.case.characteristics.vehicle
+        return 2 * sum(item.is_for_workshop for item in items) >= len(items)
+
+    @property
     def chosen_settings(self) -> FloatArray:
         """Their settings, shape (M, n)."""
         return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(float)

@@ -4,21 +4,27 @@ be printed alone. Its sentences stand in `web/sheet.html.j2`.
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
+from shlex import join
 from typing import Any
 
+import pandas as pd
 from markupsafe import Markup
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import SENTENCE_END, Answer, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Columns, tabulate
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.tables import html_table
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
+from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.euro_ncap import TESTS
 from safevar_sumo.vehicles import VEHICLES, Characteristic
 
@@ -42,39 +48,125 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     A sheet without joint limits that hold has no table; one whose limits are only rough or for
     screening, or that other files and versions gave, has no line to sign.
     """
-    limits = next((answer for answer in study.answers if answer.question == "tolerance"), None)
+    limits = _limits_of(study)
     if limits is None:
         return None
 
-    # What decides, the table, and what it is about.
+    # What decides: the limits, and how fast vehicles within them may drive.
     numbers = limits.numbers
-    missing = _why_no_limits(limits)
-    rows = () if missing else _parts(study, limits)
-    *tests, road = numbers.get("scope", "").split("; ")
     unsafe = Unsafe.parse(numbers.get("unsafe", "collision"))
     is_screening = _is_relative(study.case, unsafe)
-    wider = limits.tables.get("wider")
-    varied = set(limits.table().get("characteristic", ()))
+    missing = _why_no_limits(study, limits)
+    wider = [] if missing or "wider" not in limits.tables else _records(limits.tables["wider"])
+    claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
+    if speed_question(study):
+        claim = study.answers[-1]
+        up_to, missing = _greatest_speed(study, claim, wider)
+        reasons = [claim.verdict]
+
+    # The table, and what it is about.
+    *tests, road = claim.numbers.get("scope", "").split("; ")
+    rows = {} if missing else {row["characteristic"]: row for row in _records(limits.table())}
+    items = study.case.characteristics.vehicle
+    parts = [
+        (
+            name[:1].upper() + name[1:],
+            item.measurement,
+            _limit_in_words(item, rows.get(item.name)),
+            f"{BLANK}{item.suffix}",
+            item.remedy or UNSAID,
+        )
+        for item in items
+        if item.is_for_workshop and not missing and (name := item.meaning or item.short_name)
+    ]
+    stated = study.case.study.unmeasured_values if up_to else {}
     return {
         "missing": missing,
+        "up_to": up_to,
         "is_screening": is_screening,
         "is_signed": not (missing or numbers["rough"] or study.later_changes or is_screening),
         "unsafe": unsafe,
-        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, rows))),
+        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, parts))),
+        "others": [
+            f"{item.short_name} {stated[item.name]:.10g}{item.suffix}"
+            if item.name in stated
+            else f"{item.short_name} {_limit_in_words(item, rows.get(item.name))}"
+            for item in items
+            if not item.is_for_workshop
+        ],
         "numbers": numbers,
+        "claim": claim,
+        "reasons": reasons,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
         "tests": [_tests_in_words(phrase) for phrase in tests],
         "road": road,
-        "wider": [] if wider is None else wider.to_dict("records"),
+        "wider": wider,
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
-            f"{item.short_name} {_domain_in_words(item)}"
-            for item in study.case.characteristics.vehicle
-            if item.name in varied
+            f"{item.short_name} {_domain_in_words(item)}" for item in items if item.name in rows
         ],
     }
+
+
+def speed_question(study: ReportedStudy) -> str:
+    """The question how fast vehicles within the limits of the sheet may drive; empty where nobody
+    may work by the sheet, or the study varies no speed.
+    """
+    limits = _limits_of(study)
+    if limits is None or study.point or _why_no_limits(study, limits) or not speeds_of(study.case):
+        return ""
+    unsafe, margin = limits.numbers["unsafe"], limits.numbers["margin"]
+    if _is_relative(study.case, Unsafe.parse(unsafe)):
+        return ""
+
+    # The criterion and the values of the limits; what a workshop does not measure has the value
+    # that the study states, if it states one.
+    is_contact = unsafe == "collision" and margin
+    words = ["--margin", f"{margin:g}"] if is_contact else ["--unsafe", unsafe]
+    words += ["--quick"] * limits.numbers["rough"]
+    rows = {row["characteristic"]: row for row in _records(limits.table())}
+    for item in study.case.characteristics.vehicle:
+        if item.is_for_workshop or item.name not in study.case.study.unmeasured:
+            low, high = _together(item, rows.get(item.name))
+            words += ["--limits", f"{item.name} >= {low!r}", "--limits", f"{item.name} <= {high!r}"]
+    return join(["permit", "--others", "new", *words])
+
+
+def _limits_of(study: ReportedStudy) -> Answer | None:
+    return next((answer for answer in study.answers if answer.question == "tolerance"), None)
+
+
+def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
+    return frame.to_dict("records")
+
+
+def speeds_of(case: Case) -> Span | None:
+    """The speeds of a study; None if it varies none, or is rated."""
+    try:
+        return span_of(case.study, None)
+    except InputError:
+        return None
+
+
+def _greatest_speed(
+    study: ReportedStudy, speed: Answer, wider: Sequence[Mapping[Any, Any]]
+) -> tuple[str, str]:
+    """The greatest speed of vehicles within the limits, with its unit; empty if they are not safe
+    at the least one, with a sentence that says so.
+
+    It is below the least speed at which such a vehicle fails in a wider study.
+    """
+    span = speeds_of(study.case)
+    assert span is not None
+    failing = [row["fails_at"] or {} for row in wider if not row["kept"]]
+    below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
+    found = [*speed.tables["cars"]["up_to"].astype(float)] if speed.tables else []
+    greatest = min([*found, *below], default=math.nan)
+    if greatest >= span.low:
+        return f"{greatest:g} {span.unit}", ""
+    return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."
 
 
 def _is_relative(case: Case, unsafe: Unsafe) -> bool:
@@ -85,42 +177,39 @@ def _is_relative(case: Case, unsafe: Unsafe) -> bool:
     return is_default and not unsafe.is_collision and unsafe == case.unsafe
 
 
-def _why_no_limits(limits: Answer) -> str:
-    """Why nobody may work by this sheet, in sentences; empty if there are joint limits."""
+def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
+    """Why nobody may work by this sheet, in a sentence; empty if there are joint limits."""
     numbers = limits.numbers
     if "limits" not in limits.tables:
-        return limits.verdict
+        return "The question about limits has no answer."
     if not numbers["driven"]:
-        return SENTENCE_END.split(limits.verdict)[0]
+        return "The simulated vehicle does not drive with its driving system."
     if numbers["kept"] is False:
-        return f"Not kept: {'; '.join(limits.failures)}."
-    return "" if numbers["box"] else "No limits were found that hold at the same time."
+        return "The specified limits do not hold."
+    if not numbers["box"]:
+        return "No limits were found that hold at the same time."
+    items = study.case.characteristics.vehicle
+    is_measured = any(item.is_for_workshop for item in items)
+    return "" if is_measured else "The study names no item that a workshop can measure."
 
 
-def _parts(study: ReportedStudy, limits: Answer) -> Iterator[tuple[str, ...]]:
-    """A row of `PARTS` for each characteristic of the vehicle; one whose limits were not asked for
-    stays as in the original.
+def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[float, float]:
+    """The joint limits of an item; one whose limits were not asked for, and one without room, stays
+    as in the original.
     """
-    rows = {row["characteristic"]: row for row in limits.tables["limits"].to_dict("records")}
-    for item in study.case.characteristics.vehicle:
-        name = item.meaning or item.short_name
-        yield (
-            f"{name[:1].upper()}{name[1:]}",
-            item.measurement or UNSAID,
-            _limit_in_words(item, rows.get(item.name)),
-            f"{BLANK}{item.suffix}",
-            item.remedy or UNSAID,
-        )
+    if row is None or pd.isna(row["together_low"]):
+        return item.original, item.original
+    return float(row["together_low"]), float(row["together_high"])
 
 
 def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     """A limit: `at least 3 mm`. An end of the domain is none, unless both are; an item whose
     original is at one end has a limit on the other side all the same.
     """
-    # An item without a limit or without room, on either side, stays as it was.
+    # An item without room on either side stays as it was.
     domain = (item.lower, item.upper)
-    low, high = (None, None) if row is None else (row["together_low"], row["together_high"])
-    if low == high and low not in domain:
+    low, high = _together(item, row)
+    if row is None or (low == high and low not in domain):
         return f"{item.original:.10g}{item.suffix}, as in the original vehicle"
 
     # A pure number that is 1 in the original vehicle is a share of its value.

@@ -57,11 +57,13 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
     """One row of the characteristics table; f_diff multiplies its change by `weight`.
 
     `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
-    measures it, and `remedy` what to do with a vehicle beyond its limit.
+    measures it, or, if `workshop` is false, who else does; `remedy` says what to do with a vehicle
+    beyond its limit.
     """
 
     weight: PositiveNumber = 1.0
     counterpart: ShortText = ""
+    workshop: Annotated[bool, WITHOUT_EFFECT] = True
     measurement: ShortText = ""
     remedy: ShortText = ""
 

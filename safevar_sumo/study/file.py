@@ -313,10 +313,13 @@ def _model_and_network(table: object) -> object:
 
 def _merge(base: Tables, overrides: Tables) -> Parameters:
     """Override `base` by `overrides`; another `model` or `distribution`, and the tables
-    that are inherited as a whole, replace a whole table.
+    that are inherited as a whole, replace a whole table; false in place of a table leaves it out.
     """
     result = dict(base)
     for key, value in overrides.items():
+        if value is False and isinstance(result.get(key), dict):
+            del result[key]
+            continue
         result[key] = _merge(base[key], value) if _refines(key, base.get(key), value) else value
     return result
 

@@ -37,6 +37,8 @@ def schema_text() -> str:
     del tables["Origin"], tables["Study"]["properties"]["origin"]
     tables["Study"]["properties"]["extends"] = EXTENDS
     tables["SearchTable"]["additionalProperties"] = {"type": "object"}
+    rows = tables["VehicleTable"]["properties"]["characteristics"]
+    rows["additionalProperties"] = {"anyOf": [rows["additionalProperties"], {"const": False}]}
     tables["RepairTable"]["additionalProperties"] = {"$ref": "#/$defs/FreeParameter"}
     tables["ScenarioTable"]["properties"] |= FROM_FILE
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"

@@ -120,7 +120,7 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
 
 class VehicleTable(Table, frozen=True, kw_only=True):
     """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that
-    vary.
+    vary; false in place of one leaves out that of the study that is extended.
 
     `files` are data files, or folders of them, that a model of your own reads, relative to the
     study's file.
@@ -276,11 +276,12 @@ class MatrixTable(Table, frozen=True, kw_only=True):
 
 class UnsafeTable(Table, frozen=True, kw_only=True):
     """What a study calls unsafe, unless `--unsafe` says otherwise: a `criterion` as of that option,
-    and its `source`, such as a regulation.
+    its `source`, such as a regulation, and the parts of this source that are `not_simulated`.
     """
 
     criterion: str = ""
     source: str = ""
+    not_simulated: str = ""
 
 
 class RepairTable(Table, frozen=True, kw_only=True):

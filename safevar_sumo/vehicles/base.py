@@ -143,8 +143,8 @@ class Vehicle:
     UNITS
         Units of the characteristics by name.
     OPTIONAL
-        Characteristics that a study may leave out: then they are 0, which may be their original
-        value, too.
+        Characteristics that a study may leave out: then they have no effect. Their original value
+        may be 0.
     PLAUSIBLE
         Plausible values of characteristics and parameters by name; a study with others is refused.
         A name may be missing.

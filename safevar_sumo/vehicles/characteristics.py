@@ -36,10 +36,10 @@ class Characteristic:
     (`is_scenario`); all quantities are in `unit`.
 
     A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names
-    the part of a real vehicle that determines it, `measurement` says how a workshop measures it,
-    and `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in
-    sentences: by default the meaning up to the first comma or bracket, such as `engine drag`, or
-    the name if the study gives no meaning.
+    the part of a real vehicle that determines it, `measurement` says how a workshop measures it or,
+    unless `workshop`, who else does, and `remedy` what to do beyond a limit; all of them may be
+    empty. `short_name` is its name in sentences: by default the meaning up to the first comma or
+    bracket, such as `engine drag`, or the name if the study gives no meaning.
     """
 
     name: str
@@ -51,6 +51,7 @@ class Characteristic:
     meaning: str = ""
     short_name: str = ""
     counterpart: str = ""
+    workshop: bool = True
     measurement: str = ""
     remedy: str = ""
     is_scenario: bool = False
@@ -65,6 +66,11 @@ class Characteristic:
         """Meaning and real-world counterpart in one line; empty if the study gives neither."""
         counterpart = f"counterpart: {self.counterpart}" if self.counterpart else ""
         return "; ".join(text for text in (self.meaning, counterpart) if text)
+
+    @property
+    def is_for_workshop(self) -> bool:
+        """Whether a workshop can measure it, and the study says how."""
+        return self.workshop and bool(self.measurement)
 
     @property
     def threshold(self) -> float:

@@ -30,6 +30,8 @@ from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_frictio
 
 TANGENT_DECIMALS = 12
 """Decimals to which a tangent is rounded: its last bits differ between machines."""
+UNLIMITED = 1e6
+"""Range of sensors that a study does not have [m]."""
 RELEASED_BRAKE = 1e-6
 """Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command
 that fades out between two steps must not hold the engine off.
@@ -200,10 +202,10 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 
     Notes
     -----
-    With a `sensorAngle` the lateral place of what is seen is off by its gap times the tangent of
-    the angle, above 0 away from the side that it comes from. Of the sensors' frames the share
-    `sensorDropout` is lost, the same frames in all vehicles: then the driving system sees the last
-    one again.
+    A study without `sensorRange` and `sensorLatency` has perfect sensors. With a `sensorAngle` the
+    lateral place of what is seen is off by its gap times the tangent of the angle, above 0 away
+    from the side that it comes from. Of the sensors' frames the share `sensorDropout` is lost, the
+    same frames in all vehicles: then the driving system sees the last one again.
 
     The friction coefficient mu on a dry road is `tyre_friction` times the weather's
     `road_friction`, whatever the tread. Under water this is the grip at rest, and mu falls with
@@ -229,7 +231,7 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         "sensorAngle": "deg",
         "sensorDropout": "-",
     }
-    OPTIONAL = ("sensorAngle", "sensorDropout")
+    OPTIONAL = ("sensorRange", "sensorLatency", "sensorAngle", "sensorDropout")
     PLAUSIBLE = {
         "treadDepth": Plausible(0.1, 50),
         "brakeTorque": Plausible(0.01, 10),
@@ -303,8 +305,8 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             front_load=1 - rear_load,
             rear_load=rear_load,
             brake_delay=c["brakeResponse"],
-            sensor_range=c["sensorRange"],
-            latency=c["sensorLatency"],
+            sensor_range=c.get("sensorRange", UNLIMITED + 0 * mass),
+            latency=c.get("sensorLatency", 0 * mass),
             slope=slope,
             tangent=tangent,
             dropout=c.get("sensorDropout"),

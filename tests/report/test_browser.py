@@ -24,9 +24,12 @@ from selenium.webdriver.common.keys import Keys
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
-from safevar_sumo.replay.animation import animate
+from safevar_sumo.replay.animation import animate, player_files
 from safevar_sumo.replay.comparison import comparison_of
+from safevar_sumo.report.page import TEMPLATE_FOLDER
+from safevar_sumo.study.file import study_names
 from safevar_sumo.sumo.system import assemble
+from tests.report.test_sheet import sheet_of_shipped
 
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
 """The part of a page within its margins [px]."""
@@ -243,6 +246,24 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", study_names())
+def test_each_shipped_study_has_its_sheet_on_one_page(
+    name: str, browser: Chrome, tmp_path: Path
+) -> None:
+    css = player_files()["css"] + (TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")
+    sheet = sheet_of_shipped(name)
+    assert "Name and signature" in sheet
+    page = tmp_path / "sheet.html"
+    body = f"<style>{css}</style><main><h1>Safety report: {name}</h1>{sheet}</main>"
+    page.write_text(f"<!DOCTYPE html><meta charset=utf-8>{body}", encoding="utf-8")
+    browser.get(page.as_uri())
+    options = {"printBackground": True, "preferCSSPageSize": True}
+    pdf = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", options)["data"])
+    (tmp_path / "sheet.pdf").write_bytes(pdf)
+    assert pdf.count(b"/Type /Page\n") == 1
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from hashlib import sha256
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,11 +15,17 @@ import pytest
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
+from safevar_sumo.questions.ask import parse_question
+from safevar_sumo.questions.permit.rows import CARS
+from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.replay.animation import template_environment
+from safevar_sumo.report import sheet as module
 from safevar_sumo.report.page import TEMPLATE_FOLDER
-from safevar_sumo.report.sheet import sheet_of
+from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.report.sheet import sheet_of, speed_question
 from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.report.test_report import words_of
 
@@ -64,24 +71,58 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
     )
 
 
-def sheet_with(
+def speed_of(up_to: float | None = 40.0, study: Study = STUDY) -> Answer:
+    """How fast vehicles within the limits may drive."""
+    row = ("all cars", up_to, 40.0, "km/h", "up to", "At 41 km/h it hits somebody in CPFA.")
+    numbers = {"fits": 12, "attacked": 120000, "scope": scope_of(study)}
+    tables = {"cars": tabulate("Cars", dict.fromkeys([*CARS][: len(row)], ""), [row])}
+    return Answer(question="permit", study=study, verdict="Slow.", numbers=numbers, tables=tables)
+
+
+def reported(
     *answers: Answer,
     changes: tuple[str, ...] = (),
     unsafe: str = "collision",
     stated: Unsafe | None = None,
-) -> str:
-    """The words of the sheet; empty without a sheet."""
-    case = SimpleNamespace(
-        characteristics=CHARACTERISTICS, study=STUDY, stated=stated, unsafe=Unsafe.parse(unsafe)
+) -> ReportedStudy:
+    """Answers about the study of the first one, by default `wear`."""
+    study = answers[0].study if answers else STUDY
+    case: Any = SimpleNamespace(
+        characteristics=CharacteristicSet.of(study),
+        study=study,
+        stated=stated,
+        unsafe=Unsafe.parse(unsafe),
     )
-    study: Any = SimpleNamespace(case=case, answers=answers, later_changes=changes)
-    parts = {"name": "wear", "title": "A car", "anchor": "a", "versions": {"libsumo": "1.28"}}
+    return ReportedStudy(
+        directory=Path(study.name),
+        case=case,
+        versions={"libsumo": "1.28", "safevar_sumo": "0.5.0", "deap": "1.4.4", "numpy": "2.4.6"},
+        answers=answers,
+        later_changes=changes,
+    )
+
+
+def html_of(study: ReportedStudy) -> str:
+    """The sheet; empty if there is none."""
+    tables = study.case.study
+    parts = {"name": tables.name, "title": tables.title, "anchor": "a", "versions": study.versions}
     template = template_environment(TEMPLATE_FOLDER).get_template("sheet.html.j2")
     sheet = sheet_of(study)
     if sheet is None:
         return ""
-    page = template.module.sheet_section({**parts, "tables": STUDY, "sheet": sheet})  # type: ignore[attr-defined]
-    return words_of(page)
+    return str(template.module.sheet_section({**parts, "tables": tables, "sheet": sheet}))  # type: ignore[attr-defined]
+
+
+def sheet_with(*answers: Answer, **options: Any) -> str:
+    """The words of the sheet, whose limits are about no speed unless an answer is; empty without a
+    sheet.
+    """
+    study = reported(*answers, **options)
+    if any(answer.question == "permit" for answer in answers):
+        return words_of(html_of(study))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "speeds_of", lambda case: None)
+        return words_of(html_of(study))
 
 
 def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do() -> None:
@@ -89,11 +130,14 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
     sheet = sheet_with(answer)
     for item, (*_, limit) in zip(CHARACTERISTICS, LIMITS, strict=True):
         blank = f"________{item.suffix}"
-        assert "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy)) in sheet
+        part = "".join((item.meaning[1:], item.measurement, limit, blank, item.remedy))
+        assert (part in sheet) is item.workshop
     for words in (
         "Valid only for the vehicle that the study wear simulates, and for no other car.",
         "do what the last column says, measure this item again and enter the new value.",
         "every simulated vehicle within them keeps at least 0.3 m of clearance in the tests",
+        "which a workshop cannot measure, have these values: brake actuator delay at most 0.132 s;"
+        " detection range of the sensors at least 80 m; perception latency 0.05 s, as in the",
         "The driving system must stay off as long as a value is missing or beyond its limit.",
         "The workshop enters every value except those marked “operator”,",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
@@ -106,7 +150,7 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         "Simulated vehicleworn (A car with two axles",
         "; study wear",
         "Driving systemaeb (Holds its speed; brakes in part, then fully,",
-        "Scopecrossing (CPFA and CPNCO) at 10 to 40 km/h;",
+        "Scope of the limitscrossing (CPFA and CPNCO) at 10 to 40 km/h;",
         "Tested rangestread depth 1.6 to 8 mm; relative brake torque 0.5 to 1; brake",
         "sensors 15 to 80 mVersionslibsumo 1.28",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
@@ -114,7 +158,7 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         assert words in sheet
     for_workshop = sheet.partition("For the manufacturer's engineer")[0]
     assert not re.search("21,?234|confidence|0.30? %", sheet), "no statistics"
-    assert not re.search("worn|CPFA|1.28|sha256", for_workshop), "no words of the engineer"
+    assert not re.search(r"worn \(|CPFA|1.28|sha256", for_workshop), "no words of the engineer"
 
 
 def test_a_limit_has_one_side_if_the_original_is_at_an_end_of_the_domain() -> None:
@@ -135,8 +179,8 @@ def test_a_clearance_is_claimed_only_with_one_parameter_set() -> None:
         ({"rough": True}, (), "sheet: its limits are rough.", True),
         ({}, ("libsumo",), "sheet: files or versions have changed since the results.", True),
         ({"box": False}, (), "sheet. No limits were found that hold at the same time.", False),
-        ({"kept": False}, (), "sheet. Not kept: limit of brakeTorque 0.5: the car hits", False),
-        ({"driven": False}, (), "sheet. The worst of 21,234 is safe.", False),
+        ({"kept": False}, (), "sheet. The specified limits do not hold.", False),
+        ({"driven": False}, (), "sheet. The simulated vehicle does not drive with its", False),
     ],
 )
 def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
@@ -146,6 +190,7 @@ def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
     assert f"Do not use this {reason}" in sheet
     assert "signature" not in sheet
     assert ("at least 3 mm" in sheet) is has_table
+    assert (f"Reason{VERDICT} limit of brakeTorque 0.5: the car hits" in sheet) is not has_table
 
 
 def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None:
@@ -164,13 +209,99 @@ def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None
 
 def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked() -> None:
     sheet = sheet_with(replace(answer_of(), numbers={}, tables={}))
-    assert f"Do not use this sheet. {VERDICT}" in sheet
+    assert "Do not use this sheet. The question about limits has no answer." in sheet
+    assert f"Reason{VERDICT}" in sheet
     assert sheet_with() == ""
 
 
-@pytest.mark.parametrize(("kept", "found"), [(True, "no failure of these"), (False, "A child")])
-def test_wider_tests_stand_on_the_sheet(kept: bool, found: str) -> None:
+@pytest.mark.parametrize(
+    ("kept", "found"), [(True, "No failure of these limits was found"), (False, "limits fails.")]
+)
+def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
+    kept: bool, found: str
+) -> None:
     answer = answer_of()
-    row = ("wear_joint", "up to 60 km/h", kept, "A child is hit.", None)
+    row = ("wear_joint", "CPNCO up to 60 km/h", kept, "A child is hit.", None)
     answer.tables["wider"] = tabulate("Wider", WIDER, [row])
-    assert f"In the study wear_joint (up to 60 km/h), {found}" in sheet_with(answer)
+    foreman, _, engineer = sheet_with(answer).partition("For the manufacturer's engineer")
+    assert found in foreman
+    assert "Study wear_jointCPNCO up to 60 km/h" in engineer
+
+
+def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_codes() -> None:
+    foreman, _, engineer = sheet_with(answer_of(), speed_of()).partition(
+        "For the manufacturer's engineer"
+    )
+    assert "Greatest speed: 40 km/h. Up to this speed every simulated vehicle within" in foreman
+    assert not re.search("CP[FNL]|parameter set", foreman)
+    assert "in CPFA. 12 parameter sets; 120,000 simulations that search" in engineer
+
+
+def test_a_failure_in_a_wider_study_lowers_the_greatest_speed() -> None:
+    answer = answer_of()
+    row = ("wear_joint", "up to 60 km/h", False, "A child is hit.", {"speed": 36.2})
+    answer.tables["wider"] = tabulate("Wider", WIDER, [row])
+    sheet = sheet_with(answer, speed_of())
+    assert "Greatest speed: 36 km/h." in sheet
+    assert "a vehicle within these limits fails above the greatest speed." in sheet
+
+
+def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
+    sheet = sheet_with(answer_of(), speed_of(None))
+    assert (
+        "Do not use this sheet. Vehicles within its limits are not safe even at 10 km/h." in sheet
+    )
+    assert "ReasonSlow." in sheet
+    assert "signature" not in sheet
+
+
+def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> None:
+    question, values = parse_question(speed_question(reported(answer_of())))
+    assert (question.name, values["margin"], values["others"]) == ("permit", 0.3, "new")
+    assert values["limits"] == (
+        *("treadDepth >= 3.0", "treadDepth <= 8.0", "brakeTorque >= 0.85", "brakeTorque <= 1.0"),
+        *("brakeResponse >= 0.05", "brakeResponse <= 0.132", "payload >= 75.0", "payload <= 525.0"),
+        *("payloadCentre >= 1.3", "payloadCentre <= 2.0"),
+        *("sensorRange >= 80.0", "sensorRange <= 80.0"),
+        *("sensorLatency >= 0.05", "sensorLatency <= 0.05"),
+    )
+    # What the study states of a value that nobody measured stands in place of a limit.
+    joint = replace(answer_of(unsafe="drac > 6", rough=True), study=read_study("wear_joint"))
+    _, values = parse_question(speed_question(reported(joint)))
+    assert not [limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))]
+    assert (values["unsafe"], values["quick"]) == ("drac > 6", True)
+    sheet = sheet_with(joint, speed_of(study=joint.study))
+    assert "these values: brake actuator delay 0.2 s; detection range of the sensors 40 m;" in sheet
+    # Nobody asks where there is no speed, or nothing to work by.
+    assert not speed_question(reported(replace(answer_of(), study=read_study("r13h"))))
+    assert not speed_question(reported(answer_of(box=False)))
+
+
+def sheet_of_shipped(name: str) -> str:
+    """The sheet of a shipped study in which each characteristic has all limits that it can have;
+    empty if a workshop can measure none.
+    """
+    study = read_study(name)
+    items = CharacteristicSet.of(study).vehicle
+    ends = [
+        item.rounded_inwards(((item.lower + item.original) / 2, (item.original + item.upper) / 2))
+        for item in items
+    ]
+    rows = [(item.name, *end, "") for item, end in zip(items, ends, strict=True)]
+    limits = answer_of(
+        rows=rows, scope=scope_of(study), unsafe=study.unsafe.criterion or "collision"
+    )
+    if study.wider:
+        row = (study.wider, scope_of(read_study(study.wider)), False, "A child is hit. " * 20, {})
+        limits.tables["wider"] = tabulate("Wider", WIDER, [row])
+    answers = [replace(limits, study=study)]
+    if speed_question(reported(*answers)):
+        answers.append(speed_of(study=study))
+    return html_of(reported(*answers))
+
+
+@pytest.mark.parametrize(("name", "leads"), [("wear", True), ("native", True), ("sun", False)])
+def test_a_workshop_can_measure_most_of_a_worn_car_and_not_an_engines_drag(
+    name: str, leads: bool
+) -> None:
+    assert reported(replace(answer_of(), study=read_study(name))).has_workshop_parts is leads
