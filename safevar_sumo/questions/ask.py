@@ -290,7 +290,7 @@ class Question:
                 if study.unsafe.source:
                     cites = f"Criterion: {criterion} ({study.unsafe.source})."
                 if study.unsafe.not_simulated:
-                    cites += f" Not simulated: {study.unsafe.not_simulated}."
+                    cites = f"{cites} Not simulated: {study.unsafe.not_simulated}.".strip()
             if criterion is not None:
                 unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]

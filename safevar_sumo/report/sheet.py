@@ -153,17 +153,18 @@ def speeds_of(case: Case) -> Span | None:
 def _greatest_speed(
     study: ReportedStudy, speed: Answer, wider: Sequence[Mapping[Any, Any]]
 ) -> tuple[str, str]:
-    """The greatest speed of vehicles within the limits, with its unit; empty if they are not safe
-    at the least one, with a sentence that says so.
+    """The greatest speed of vehicles within the limits, with its unit; empty if there is no answer
+    or they are not safe at the least one, with a sentence that says so.
 
     It is below the least speed at which such a vehicle fails in a wider study.
     """
+    if not speed.tables:
+        return "", "The question about the greatest speed has no answer."
     span = speeds_of(study.case)
     assert span is not None
     failing = [row["fails_at"] or {} for row in wider if not row["kept"]]
     below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
-    found = [*speed.tables["cars"]["up_to"].astype(float)] if speed.tables else []
-    greatest = min([*found, *below], default=math.nan)
+    greatest = min([*speed.tables["cars"]["up_to"].astype(float), *below])
     if greatest >= span.low:
         return f"{greatest:g} {span.unit}", ""
     return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."

@@ -255,6 +255,15 @@ def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
     assert "signature" not in sheet
 
 
+def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -> None:
+    refused = replace(speed_of(), verdict="No answer: it is refused.", numbers={}, tables={})
+    sheet = sheet_with(answer_of(), refused)
+    assert "The question about the greatest speed has no answer." in sheet
+    assert "not safe even at" not in sheet
+    assert "No answer: it is refused." in sheet
+    assert "signature" not in sheet
+
+
 def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> None:
     question, values = parse_question(speed_question(reported(answer_of())))
     assert (question.name, values["margin"], values["others"]) == ("permit", 0.3, "new")
