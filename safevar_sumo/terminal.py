@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from threading import Event, Thread
-from typing import Self
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
@@ -20,30 +20,22 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the phase, the amount done in it, and its total, 0
-where it is unknown; first with nothing done.
+"""A function that shows progress, called with the phase, and with the number of simulations that
+are done and their total, both of the whole command; the total is an estimate while it is not known
+how many rounds follow, and 0 where nothing is known.
 """
 SECONDS_BETWEEN_LINES = 30.0
 """Interval of the lines that show progress without a terminal [s]."""
-SETTLING_TIME = 2.0
-"""Work before the time left is shown [s]: batches that end together make earlier estimates
-meaningless.
+MEASURED_SHARE = 0.25
+"""The share of the time so far, at its end, over which the speed is measured: a phase that the
+cache answered, or that is cheap, is soon forgotten.
+"""
+STALLED_SHARE = 0.25
+"""The least time left as a share of the time since the last sign of progress: what takes longer
+than expected does not end at once.
 """
 UNLIMITED_WIDTH = 1_000_000
 """Width in which no line is broken [characters]."""
-
-
-class Phase(str):
-    """The name of a phase of something larger, which knows what share of the whole is done; a text,
-    as users' functions take one.
-    """
-
-    share: float
-
-    def __new__(cls, name: str, share: float) -> Self:
-        phase = super().__new__(cls, name)
-        phase.share = share
-        return phase
 
 
 class WholeTable(Table):
@@ -120,59 +112,75 @@ def show_no_progress(phase: str, done: int, total: int) -> None:
     """Show no progress."""
 
 
-def show_within(
-    progress: Progress, whole: str, earlier: float, width: float, phase: str, done: int, total: int
-) -> None:
-    """Show a phase of something larger, which is named before it: it begins when a share `earlier`
-    of that is done, and is a share `width` of it.
+class Parts:
+    """The progress of parts of a command that come one after another, such as its questions: each
+    with the number of simulations that take as long as it is `expected` to take at least.
     """
-    share = share_done(phase, done, total) or 0.0
-    progress(Phase(f"{whole}: {phase}", earlier + width * share), done, total)
+
+    def __init__(self, show: Progress, expected: Iterable[int] = ()) -> None:
+        self._show = show
+        self._expected = [*expected]
+        self._before = self._whole = 0
+        """Number of simulations of the parts before this one, and of this one."""
+
+    def begin(self, name: str = "") -> Progress:
+        """The progress of the next part, whose name, if it has one, stands before its phases."""
+        self._before += self._whole
+        expected = self._whole = self._expected.pop(0) if self._expected else 0
+        later = sum(self._expected)
+
+        def show_part(phase: str, done: int, total: int) -> None:
+            # What costs more than its simulations, such as workers that start, is spread over them.
+            self._whole = max(total, expected)
+            done_of_whole = self._whole * done // max(total, 1)
+            phase = f"{name}: {phase}" if name else phase
+            self._show(phase, self._before + done_of_whole, self._before + self._whole + later)
+
+        return show_part
 
 
-def share_done(phase: str, done: int, total: int) -> float | None:
-    """The share that is done of the whole, or of a phase that is the whole; None if unknown."""
-    if isinstance(phase, Phase):
-        return phase.share
-    return done / total if total else None
-
-
-class _Pace(ProgressColumn):
-    """The mean speed of the phase under way, and the time left at that speed: of a phase of several
-    or of a round it says so, and a phase that has ended has none.
-    """
+class Pace:
+    """The time left of a command, from when which share of its work was done."""
 
     def __init__(self) -> None:
-        super().__init__()
-        self._done = 0
-        self._total = 0
-        self._last = 0.0
-        self._of = ""
-        self._begun: tuple[int, float] | None = None
-        """What was done when the phase began, such as by an earlier command, and the time [s]."""
+        self._marks = deque[tuple[float, int]]()
+        """Times [s] and what was done, from the beginning of the measurement of the speed on."""
+        self._begin = 0.0
+        self._left = 0
 
-    def update(self, phase: str, done: int, total: int) -> None:
-        self._of = ""
-        if isinstance(phase, Phase):
-            self._of = " of this round" if ", round " in phase else " of this phase"
-        is_new = self._begun is None or done == 0 or done < self._done or not self._total
-        self._done = done
-        self._total = total
-        self._last = time.monotonic()
-        if is_new:
-            self._begun = done, self._last
+    def update(self, done: int, total: int) -> None:
+        """Note what is done now, and how much there is in all."""
+        now = time.monotonic()
+        if not self._marks or done < self._marks[-1][1]:
+            self._marks.clear()
+            self._begin = now
+        self._marks.append((now, done))
+        self._left = total - done
+        while len(self._marks) > 2 and self._marks[1][0] < now - MEASURED_SHARE * (
+            now - self._begin
+        ):
+            self._marks.popleft()
+
+    def seconds_left(self) -> float | None:
+        """The time left [s]; None before anything is done."""
+        if not self._marks:
+            return None
+        (start, before), (last, done) = self._marks[0], self._marks[-1]
+        since = time.monotonic() - last
+        if done == before:
+            return None
+        seconds = self._left * (last - start) / (done - before)
+        return max(seconds - since, STALLED_SHARE * since)
+
+
+class _TimeLeft(ProgressColumn):
+    def __init__(self, pace: Pace) -> None:
+        super().__init__()
+        self._pace = pace
 
     def render(self, task: Task | None = None) -> Text:
-        if not self._total or self._done >= self._total:
-            return Text("")
-        done_before, start = self._begun or (0, 0.0)
-        done = self._done - done_before
-        worked = self._last - start
-        if done <= 0 or worked < SETTLING_TIME:
-            return Text(f"-:--:-- left{self._of}")
-        seconds = (self._total - self._done) * worked / done - (time.monotonic() - self._last)
-        left = timedelta(seconds=max(math.ceil(seconds), 1))
-        return Text(f"{done / worked:.3g}/s, {left} left{self._of}")
+        seconds = self._pace.seconds_left()
+        return Text("" if seconds is None else f"{timedelta(seconds=math.ceil(seconds))} left")
 
 
 @contextmanager
@@ -186,26 +194,25 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
 
     # A bar on a terminal, lines elsewhere.
     console = console or Console(stderr=True)
-    pace = _Pace()
+    pace = Pace()
+    left = _TimeLeft(pace)
     ended = Event()
     line = "searching"
 
     def show(phase: str, done: int, total: int) -> None:
         nonlocal line
-        line = f"{phase}: {done} of {total}" if total else f"{phase}: {done}"
-        pace.update(phase, done, total)
-        count = f"{done}/{total}" if total else f"{done}" if done else ""
-        share = share_done(phase, done, total)
-        whole = None if share is None else 1.0
-        bar.update(task, description=phase, completed=share or 0.0, total=whole, count=count)
+        pace.update(done, total)
+        count = f"{done:,} of {total:,}" if total else ""
+        line = f"{phase}: {count}" if total else phase
+        bar.update(task, description=phase, completed=done, total=total or None, count=count)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, ", ".join(filter(None, (line, str(pace.render())))))
+            print_text(console, ", ".join(filter(None, (line, str(left.render())))))
 
     text = TextColumn("{task.description}", markup=False)
     count = TextColumn("{task.fields[count]}", markup=False)
-    columns = (text, BarColumn(bar_width=None), count, pace)
+    columns = (text, BarColumn(bar_width=None), count, left)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None, count="")

@@ -40,7 +40,7 @@ PAGES = [
 ]
 WIDTH = 84
 """Width of the text of an output [characters]."""
-TABLE_WIDTH = "120"
+TABLE_WIDTH = "100"
 """Width in which commands print their tables [characters]."""
 
 

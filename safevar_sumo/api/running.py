@@ -48,7 +48,8 @@ def run(
         Pool that simulates, in place of new worker processes or a cluster.
     progress
         True for a bar on the terminal; or a function called with a phase (the study's name and its
-        finished runs), the number of evaluations done, and the number to do at most.
+        finished runs), the number of evaluations done, and the number to do at most: one in SUMO
+        counts as those in recorded scenes that would take as long.
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once
         every run is finished.

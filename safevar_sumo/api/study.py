@@ -53,11 +53,16 @@ from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
-from safevar_sumo.terminal import show_no_progress
+from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
+INTERRUPTED = "finished evaluations are kept in {}: run the same command again to continue"
+VERDICT_COST = 80_000
+"""Number of simulations of a search that take as long as the verdict on it, roughly; the search
+states its own number.
+"""
 ALGORITHMS: Columns = {
     "algorithm": "algorithm",
-    "finished": "finished runs",
+    "finished": Column("", "finished runs", is_detail=True),
     "runs": "runs",
     "simulated": "different settings simulated so far",
     "collisions": "those that collide, and the original vehicle is safe in the same encounter",
@@ -68,6 +73,7 @@ ALGORITHMS: Columns = {
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
     "solutions": "solutions of finished runs",
 }
+NO_CHANGE = "no change is needed."
 CHANGES: Columns = {
     "characteristic": "characteristic that is changed",
     "unit": "unit of its values",
@@ -180,27 +186,30 @@ def study(
         with open_pool(jobs, cluster) as pool:
             return _measured(loaded, system, len(keys), engine, batch, pool)
     try:
-        results = run(
-            loaded,
-            directory,
-            progress=not quiet,
-            retry_failed=retry_failed,
-            jobs=jobs,
-            cluster=cluster,
-            only=keys,
-            batch=batch,
-            engine=engine,
-        )
+        with open_progress(not quiet) as show:
+            parts = Parts(show, [0, VERDICT_COST])
+            results = run(
+                loaded,
+                directory,
+                progress=parts.begin(),
+                retry_failed=retry_failed,
+                jobs=jobs,
+                cluster=cluster,
+                only=keys,
+                batch=batch,
+                engine=engine,
+            )
+            return _found(results, system, unsafe, jobs, parts.begin())
     except KeyboardInterrupt:
-        warn(
-            f"finished evaluations are kept in {directory}: run the same command again to continue"
-        )
+        warn(INTERRUPTED.format(directory))
         raise
-    return _found(results, system, unsafe, jobs)
 
 
-def _found(results: Results, system: System, unsafe: str | None, jobs: int | None) -> Answer:
+def _found(
+    results: Results, system: System, unsafe: str | None, jobs: int | None, progress: Progress
+) -> Answer:
     """What was found, and what to ask next."""
+    progress("the fewest unsafe changes", 0, 1)
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
@@ -218,13 +227,16 @@ def _found(results: Results, system: System, unsafe: str | None, jobs: int | Non
             " original vehicle is safe, as questions demand"
         )
     sentence, changes = _verdict(results, case, jobs)
+    if sentence.endswith(NO_CHANGE):
+        following = ""
     tables = answer.tables
     if changes:
         frame = tabulate("The fewest unsafe changes that were found", CHANGES, changes)
         tables = {"algorithms": tables["algorithms"], "fewest": frame, **tables}
     return replace(
         answer,
-        verdict=f"{reason or sentence} Next: {following}",
+        verdict=reason or sentence,
+        next=following,
         numbers={"driven": not reason, **answer.numbers},
         tables=tables,
     )
@@ -308,7 +320,7 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[
         original = drive_and_score(system, members.original_settings)
         if case.unsafe.of(original)[0]:
             breach = case.unsafe.breach_in_words(original)
-            return f"The original vehicle itself {breach}: no change is needed.", []
+            return f"The original vehicle itself {breach}: {NO_CHANGE}", []
 
     # The solution with the fewest changes, of which as many as possible are undone.
     solutions = case.solutions.drop_duplicates([*members.names])
@@ -373,7 +385,7 @@ def summarise(results: Results) -> Answer:
 
     # The study's metrics are columns, too.
     metrics = {
-        metric.name: Column(metric.unit, "mean over solutions", ".2f")
+        metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
         for metric in case.scoring.metrics
     }
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))

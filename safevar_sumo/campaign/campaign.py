@@ -41,7 +41,7 @@ from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.terminal import Progress, show_no_progress
+from safevar_sumo.terminal import Parts, Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
 
 BATCHES_PER_SHARE = 2
@@ -54,6 +54,8 @@ PROBE_VEHICLES = 4000
 """Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
 UNSAFE_REPEATED = 150
 """Largest number of unsafe solutions that SUMO repeats after a search in recorded scenes."""
+SUMO_COST = 60
+"""How many simulations in recorded scenes take as long as one in SUMO, roughly."""
 SETTINGS_PER_JOB = 150
 """Largest number of settings that a worker repeats in SUMO at once."""
 ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
@@ -119,9 +121,13 @@ def run_campaign(
     )
 
     # What the user should know before the search begins.
-    show_journals = journal_progress(study, keys, directory, progress)
+    asked = len(keys) * study.search.evaluations
+    repeated = min(asked, MAX_REPEATED) if engine_used is Engine.RECORDED else 0
+    parts = Parts(progress, [asked, SUMO_COST * repeated])
+    show_search = parts.begin()
+    show_journals = journal_progress(study, keys, directory, show_search)
     show_journals([])
-    compile_vehicle(study, pool, progress)
+    compile_vehicle(study, pool, show_search)
     no_verdict = ask_why_no_verdict(study, pool)
     original = evaluate_original(task, pool)
     undeclared = [name for name in use.opened if name not in results.manifest["files"]]
@@ -147,7 +153,8 @@ def run_campaign(
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
     if engine_used is Engine.RECORDED and runs:
-        for remark in repeat_in_sumo(task, choose_sample(study, original, runs), pool, progress):
+        sample = choose_sample(study, original, runs)
+        for remark in repeat_in_sumo(task, sample, pool, parts.begin()):
             warn(remark)
     return Campaign(original, runs, system.measuring.scoring, no_verdict)
 
@@ -234,7 +241,7 @@ def repeat_in_sumo(task: Task, sample: Evaluations, pool: Pool, progress: Progre
     """Repeat evaluations in SUMO; returns remarks on what could not be simulated. Raises the error
     of `verify_in_sumo`.
     """
-    phase = f"{task.study.name}: verifying in SUMO, settings"
+    phase = f"{task.study.name}: verifying in SUMO"
     batches = np.array_split(np.arange(len(sample)), math.ceil(len(sample) / SETTINGS_PER_JOB) or 1)
     jobs = [(task, sample.settings[rows], sample.points[rows]) for rows in batches]
     verified = 0
@@ -244,22 +251,26 @@ def repeat_in_sumo(task: Task, sample: Evaluations, pool: Pool, progress: Progre
         verified += sum(len(batches[number]) for number in ended)
         progress(phase, verified, len(sample))
 
+    show([])
     return {remark for remark in carry_out(verify_settings, jobs, pool, show) if remark}
 
 
 def journal_progress(
     study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
 ) -> Callable[[Sequence[int]], None]:
-    """A function that shows the evaluations that runs have asked for, as their journals tell."""
+    """A function that shows the evaluations that runs have asked for, as their journals tell; of
+    those that have not finished, all others are to come.
+    """
     readers = [
         JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys
     ]
 
     def show(ended: Sequence[int]) -> None:
         asked = sum(reader.asked() for reader in readers)
+        left = sum(reader.left for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
-        phase = f"{study.name}: {finished}/{len(keys)} runs, evaluations"
-        progress(phase, asked, len(keys) * study.search.evaluations)
+        phase = f"{study.name}: {finished} of {len(keys)} runs"
+        progress(phase, asked, asked + left)
 
     return show
 

@@ -22,9 +22,10 @@ from rich.console import Console
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import check_writable
-from safevar_sumo.questions.answer import FORMATS, Answer, Contents, contents_of
+from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.ask import Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.questions.render import FORMATS, WIDTH
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.study import study_names
 
@@ -87,6 +88,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     def print_answer(
         form: str,
         as_json: bool,
+        details: bool,
         table: str | None,
         plot: Path | None,
         fail_if: tuple[str, ...],
@@ -104,7 +106,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         with nullcontext() if form == "text" else prints_to_standard_error():
             answer: Answer = call(**values)
         if form != "text" or table or not values.get("quiet"):
-            _print(answer, form, table)
+            _print(answer, form, table, details=details)
         if plot is not None:
             from safevar_sumo.questions.figures import save
 
@@ -246,11 +248,8 @@ def _output_options() -> list[click.Option]:
             help="How to print.",
         ),
         click.Option(["--json", "as_json"], is_flag=True, help="Short for --format json."),
-        click.Option(
-            ["--table"],
-            metavar="NAME",
-            help="Print this table only.  [default: all; of csv the first]",
-        ),
+        click.Option(["--details"], is_flag=True, help="Print all tables and numbers."),
+        click.Option(["--table"], metavar="NAME", help="Print this table only."),
         click.Option(
             ["--plot"], type=path, metavar="FILE", help="Draw the answer: png, pdf or svg."
         ),
@@ -266,17 +265,18 @@ def _output_options() -> list[click.Option]:
     ]
 
 
-def _print(answer: Answer, form: str, table: str | None) -> None:
+def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> None:
     """Print an answer or one of its tables; the whole answer if it lacks the table, which may have
     taken long.
     """
     try:
         shown = answer.only(table) if table else answer
     except InputError:
-        _print(answer, "json" if form == "csv" else form, None)
+        _print(answer, "json" if form == "csv" else form, None, details=True)
         raise
     if form == "text":
-        shown.print(Console())
+        width = None if sys.stdout.isatty() or os.environ.get("COLUMNS") else WIDTH
+        shown.print(Console(width=width), details=details)
     else:
         click.echo(shown.render(form), nl=False)
 

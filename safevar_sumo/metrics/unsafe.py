@@ -159,8 +159,8 @@ class Unsafe:
         if not self.is_half:
             return ""
         return (
-            "No vehicle collided, so this limit stands in for a collision. To count only"
-            " collisions, ask with --unsafe collision."
+            "Remark: No vehicle collided, so this limit stands in for a collision; --unsafe"
+            " collision counts collisions alone."
         )
 
     def smaller_demand(self, original: Evaluations) -> str:

@@ -1,65 +1,49 @@
-"""What every question returns: a verdict, numbers and tables; and the one renderer of them in every
-format.
-"""
+"""What every question returns: a verdict, numbers and tables."""
 
 from __future__ import annotations
 
-import json
-import re
-import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from html import escape
+from functools import wraps
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, check_name, did_you_mean, one_of
+from safevar_sumo.questions.render import print_answer, render
 from safevar_sumo.questions.tables import (
     HIGH as HIGH,
-    LATEX_PREAMBLE,
     LOW as LOW,
     Column as Column,
     Columns as Columns,
     Wide as Wide,
     cell_text,
     columns_of,
-    csv_cell,
-    html_table,
-    latex_notes,
-    latex_table,
     plain,
-    reader_tables,
     tabulate as tabulate,
-    terminal_tables,
     with_interval as with_interval,
 )
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
-from safevar_sumo.terminal import print_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
-FORMATS = ("text", "json", "csv", "latex", "html")
-SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z])")
-"""Between two sentences, each of which a page puts on lines of its own."""
-MAX_ROWS = 200
-"""Number of rows up to which readers see a table; JSON and CSV have them all."""
-WIDTH = 80
-"""Width of text that is not printed to a terminal [characters]."""
 
 
 class Contents(NamedTuple):
     """The names of an answer's numbers, and of the columns of its tables; `...` among them stands
-    for names that a study gives, such as its metrics.
+    for names that a study gives, such as its metrics. The name of the table that leads, by default
+    the first; and of the question that comes next.
     """
 
     numbers: Collection[str | EllipsisType]
     tables: Mapping[str, Collection[str | EllipsisType]]
+    lead: str = ""
+    next: str = ""
 
     def in_study(self, given: Mapping[str, list[str]]) -> Contents:
         """The names that an answer has with those that a study has `given`, by table; of numbers
@@ -73,7 +57,7 @@ class Contents(NamedTuple):
             ]
             for table, names in {"": self.numbers, **self.tables}.items()
         }
-        return Contents(tables.pop(""), tables)
+        return self._replace(numbers=tables.pop(""), tables=tables)
 
     def check_table(self, name: str) -> None:
         """Refuse the name of no table; raises an InputError."""
@@ -112,16 +96,24 @@ class Contents(NamedTuple):
 
 
 def contents(
-    *numbers: str | EllipsisType, **tables: Collection[str | EllipsisType]
+    *numbers: str | EllipsisType,
+    lead: Any = "",
+    next: Any = "",
+    **tables: Collection[str | EllipsisType],
 ) -> Callable[[AnswerFunction], AnswerFunction]:
     """Decorator: declares the names of all numbers that a function's answers may hold, and of the
-    columns of their tables, so that its command refuses others before anything is computed.
-    `driven` is among the numbers.
+    columns of their tables, so that its command refuses others before anything is computed; the
+    table that leads them, and the question that comes next. `driven` is among the numbers.
     """
 
     def declare(function: AnswerFunction) -> AnswerFunction:
-        vars(function)["contents"] = Contents(("driven", *numbers), tables)
-        return function
+        @wraps(function)
+        def with_lead(*arguments: Any, **options: Any) -> Answer:
+            answer = function(*arguments, **options)
+            return replace(answer, lead=answer.lead or lead)
+
+        vars(with_lead)["contents"] = Contents(("driven", *numbers), tables, lead, next)
+        return cast("AnswerFunction", with_lead)
 
     return declare
 
@@ -142,8 +134,8 @@ class Answer:
     study
         The study that was examined; `list` is about none.
     verdict
-        Conclusion, evidence and next step in a few sentences; what it covers stands in the last
-        one, which begins with `Scope:`.
+        Conclusion, evidence and next step in a few sentences, of which one screen has the first
+        three, and each that begins with `Scope:` or `Remark:`.
     tested
         How the conclusion was tested, in sentences that readers see below the tables.
     numbers
@@ -153,8 +145,16 @@ class Answer:
     failures
         Sentences that say which of the user's limits are not kept; the command then ends with exit
         code 3.
+    lead
+        The table of the one screen, by default the first; none if no table has this name. Its
+        attribute `lead_rows` holds the places of the rows that it shows, the most important first;
+        by default all.
     folded
-        Names of tables that readers see only if they ask for them; JSON and CSV have all.
+        Names of tables that readers see only by name; JSON and CSV have all.
+    is_whole
+        Whether readers see all of it, not one screen.
+    next
+        The command that comes next.
     command
         The command line that gives this answer.
     listing
@@ -169,7 +169,10 @@ class Answer:
     numbers: JsonObject
     tables: dict[str, pd.DataFrame]
     failures: tuple[str, ...] = ()
+    lead: str = ""
     folded: tuple[str, ...] = ()
+    is_whole: bool = False
+    next: str = ""
     command: str = ""
     tested: str = ""
     listing: pd.DataFrame | None = field(default=None, compare=False)
@@ -225,113 +228,17 @@ class Answer:
                 remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
             )
             tables["remarks"] = remarks[is_about_it]
-        return replace(self, tables=tables, folded=())
+        return replace(self, tables=tables, folded=(), is_whole=True)
 
-    def render(self, form: str, table: str | None = None) -> str:
+    def render(self, form: str, table: str | None = None, *, details: bool = False) -> str:
         """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default
-        the first, as CSV.
+        the first, as CSV. Text is one screen, with a table's name or `details` all.
         """
-        # A table as CSV, or the answer with this table alone.
-        if form == "csv":
-            frame = self.table(table) if table or self.listing is None else self.listing
-            return frame.map(csv_cell).to_csv(index=False, lineterminator="\n")
-        if table is not None:
-            return self.only(table).render(form)
-        if form == "json":
-            return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
-        if form == "latex":
-            shown = self._short_tables
-            remarks = shown.pop("remarks", None)
-            parts = [
-                LATEX_PREAMBLE,
-                *(latex_table(self._label_of(name), frame) for name, frame in shown.items()),
-            ]
-            parts += [] if remarks is None else [latex_notes(remarks)]
-            tested = pd.DataFrame([self._tested_in_words])
-            parts += [latex_notes(tested)] if self.tested else []
-            return "\n".join(parts)
-        if form == "html":
-            first, *later = map(escape, SENTENCE_END.split(self.verdict))
-            verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])
-            texts = filter(None, (self._tested_in_words, self._other_tables))
-            others = [f"<p>{escape(text)}</p>" for text in texts]
-            return "\n".join(
-                [f"<p>{verdict}</p>", *map(html_table, self._short_tables.values()), *others]
-            )
+        return render(self, form, table, details=details)
 
-        # Text as on a terminal of fixed width.
-        console = Console(width=WIDTH, no_color=True, force_terminal=False)
-        with console.capture() as capture:
-            self.print(console)
-        return capture.get()
-
-    def print(self, console: Console) -> None:
-        """Print the verdict, the tables and the numbers."""
-        # Verdict, tables, and what else there is.
-        print_text(console, self.verdict.replace(" Scope: ", "\nScope: "))
-        for frame in self._short_tables.values():
-            for part in terminal_tables(frame, console.width):
-                if isinstance(part, str):
-                    print_text(console, part)
-                elif part.row_count:
-                    console.print(part)
-        for text in filter(None, (self._tested_in_words, self._other_tables)):
-            print_text(console, text)
-        if self.study is not None:  # `list` has checked nothing
-            in_table = self.tables.get("results", pd.DataFrame({"result": []}))["result"].tolist()
-            numbers = {name: value for name, value in self.numbers.items() if name not in in_table}
-            texts = (f"{name}: {cell_text(value)}" for name, value in numbers.items())
-            print_text(console, "; ".join(texts))
-
-    @property
-    def _tested_in_words(self) -> str:
-        return f"How this was tested: {self.tested}" if self.tested else ""
-
-    @property
-    def _reader_tables(self) -> dict[str, pd.DataFrame]:
-        """The tables that readers see, by name; without remarks on others, and without a table of
-        no remark.
-        """
-        shown = {name: frame for name, frame in self.tables.items() if name not in self.folded}
-        remarks = shown.pop("remarks", None)
-        if remarks is not None:
-            about = remarks[~remarks["table"].isin(self.folded)] if "table" in remarks else remarks
-            if "table" in about:  # "all" would be read as a part of the remark
-                about = about.replace({"table": {"all": ""}})
-            shown |= {} if about.empty else {"remarks": about}
-        return {
-            label: part
-            for name, frame in shown.items()
-            for label, part in reader_tables(name, frame)
-        }
-
-    @property
-    def _short_tables(self) -> dict[str, pd.DataFrame]:
-        return {
-            name: frame for name, frame in self._reader_tables.items() if len(frame) <= MAX_ROWS
-        }
-
-    @property
-    def _other_tables(self) -> str:
-        """The tables that readers do not see, in sentences."""
-        long = [
-            f"{name} ({len(frame):,} rows)"
-            for name, frame in self._reader_tables.items()
-            if len(frame) > MAX_ROWS
-        ]
-        sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
-        folded = [name for name in self.folded if len(self.tables.get(name, ()))]
-        by_all = "--all, or " if self.question == "tables" else ""
-        sentences += [f"By {by_all}--table NAME: {', '.join(folded)}."] if folded else []
-        return " ".join(sentences)
-
-    def _label_of(self, table: str) -> str:
-        """The label of a table in LaTeX, which tables of other studies, questions and commands do
-        not have.
-        """
-        digest = f"-{zlib.crc32(self.command.encode()) % 0x10000:04x}" if self.command else ""
-        study = getattr(self.study, "name", "safevar")
-        return f"{study}-{self.question.replace(':', '-')}-{table}{digest}"
+    def print(self, console: Console, *, details: bool = False) -> None:
+        """Print one screen; with `details` all tables and numbers."""
+        print_answer(self, console, details=details)
 
     def _repr_html_(self) -> str:
         return self.render("html")

@@ -29,7 +29,7 @@ from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, s
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
-from safevar_sumo.terminal import Progress, open_progress, print_text
+from safevar_sumo.terminal import Parts, Progress, open_progress, print_text
 
 if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
@@ -84,7 +84,7 @@ Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
-ROUGH = "Rough answer (--quick): {}a short search. It proves nothing."
+ROUGH = "Rough answer (--quick: {}a short search; it proves nothing):"
 OWN_SET = "the study's own parameter set alone, and "
 """The beginning of such an answer, and what it says where one parameter set was tried."""
 COMMON_OPTIONS = (
@@ -95,7 +95,8 @@ COMMON_OPTIONS = (
         "progress",
         Any,
         False,
-        "True for a bar on the terminal, or a function of a phase, the number done and its total.",
+        "True for a bar on the terminal, or a function of a phase, the number of simulations done,"
+        " and their total.",
     ),
     (
         *("as_it_is_now", bool, False),
@@ -244,6 +245,7 @@ class Question:
             return reduce_to_point(subject, point)
 
         from safevar_sumo.campaign.cache import keep_simulations  # SUMO takes long to load
+        from safevar_sumo.questions.answer import contents_of
 
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
@@ -252,10 +254,17 @@ class Question:
             subjects.append(Path(str(other)) if is_file else subject_of(other))
         with keep_simulations(command, fresh=fresh):
             if self._is_long(values) and progress is True and sys.stderr.isatty():
-                first = self.answer(subjects, {**values, "quick": True}, pool=pool, jobs=jobs)
+                with open_progress(True) as show:
+                    part = Parts(show).begin("rough answer")
+                    rough = {**values, "quick": True}
+                    first = self.answer(subjects, rough, pool=pool, jobs=jobs, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
             answer = self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress)
-        return replace(answer, command=command)
+        declared = contents_of(self.compute)
+        if declared is None or not declared.next:
+            return replace(answer, command=command)
+        following = f"{PROGRAM_COMMAND} {declared.next} {quote(_name(source))}"
+        return replace(answer, command=command, next=following)
 
     def _is_long(self, values: JsonObject) -> bool:
         """Whether a rough answer, which comes much earlier, may be shown before the answer."""
@@ -476,7 +485,9 @@ def _undefined_in_words(evaluator: Evaluator) -> str:
     total = sum(number for _, number in evaluator.undefined)
     of_all = f"{undefined:,} of {total:,} simulated settings, which count as safe"
     return (
-        f"{evaluator.measure} is undefined, without a collision, in {of_all}." if undefined else ""
+        f"Remark: {evaluator.measure} is undefined, without a collision, in {of_all}."
+        if undefined
+        else ""
     )
 
 

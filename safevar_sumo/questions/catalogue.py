@@ -161,7 +161,12 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     verdict = f"A study can name {', '.join(own) or counts}."
     no_study: Any = None
     return Answer(
-        question="list", study=no_study, verdict=verdict, numbers={"passed": True}, tables=tables
+        question="list",
+        study=no_study,
+        verdict=verdict,
+        numbers={"passed": True},
+        tables=tables,
+        is_whole=True,
     )
 
 
@@ -178,6 +183,7 @@ def _list_characteristics(name: str | None) -> Answer:
     title = f"Characteristics of {study.name}"
     return Answer(
         question="list",
+        is_whole=True,
         study=study,
         verdict=f"{study.name} varies {number_of(len(rows), 'characteristic')}.",
         numbers={"passed": True},
@@ -204,6 +210,7 @@ def _list_cache() -> Answer:
     no_study: Any = None
     return Answer(
         question="list",
+        is_whole=True,
         study=no_study,
         verdict=verdict,
         numbers={"passed": True},

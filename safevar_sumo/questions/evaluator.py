@@ -12,7 +12,7 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import (
     ask_why_no_verdict,
@@ -101,13 +101,15 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, usual_shares: Mapping[str, float], repeated: str = "") -> None:
-        """Plan the phases of a question, as `Phases.plan` says."""
-        self.phases.plan(usual_shares, repeated)
+    def plan(self, settings: Mapping[str, float]) -> None:
+        """Plan the phases of a question, each with the number of settings that it is expected to
+        simulate.
+        """
+        self.phases.plan(settings, len(self.system.points))
 
     def stage(
-        self, name: str, total: int | None = None
-    ) -> AbstractContextManager[Callable[[int], None]]:
+        self, name: str, total: float | None = None
+    ) -> AbstractContextManager[Callable[[float], None]]:
         """Show all that is evaluated within the context, by evaluators of other studies, too, as
         one phase, as `Phases.stage` says.
         """
@@ -128,20 +130,14 @@ class Evaluator:
         """Evaluate settings while progress is shown."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
-        done = 0
         total = len(np.unique(settings, axis=0))
-        self.phases.show_part(stage, done, total)
-
-        def show_more_done(increment: int) -> None:
-            nonlocal done
-            done += increment
-            self.phases.show_part(stage, done, total)
-
+        points = len(selection.of(system_of(self.study)).points)
+        self.phases.begin_part(stage, points * total)
         evaluations = evaluate_all(
             self.study,
             settings,
             self._pool,
-            show_more_done,
+            lambda number: self.phases.add(points * number),
             verified,
             selection,
             begin=self._compile,
@@ -159,7 +155,7 @@ class Evaluator:
         return self._without_unsafe_originals(evaluations)
 
     def _compile(self) -> None:
-        compile_vehicle(self.study, self._pool, self.phases.show_part)
+        compile_vehicle(self.study, self._pool, self.phases.say)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """Evaluations whose results are undefined where the original vehicle is not safe in the

@@ -1,127 +1,128 @@
-"""Progress of a question: its phases one after another, and the share of the whole, which never
-falls.
-"""
+"""Progress of a question: its phases one after another, and its simulations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from itertools import accumulate
 
-from safevar_sumo.campaign.questions import COMPILING
-from safevar_sumo.terminal import Phase, Progress
+from safevar_sumo.terminal import Progress
+
+OVERRUN = 0.18
+"""The least share of its simulations so far that follow in a phase of rounds whose number is not
+known: nobody knows whether this round is the last.
+"""
+
+
+LEAST_SHARE = 0.06
+"""The least share of its simulations so far that follow in a phase that says what it expects."""
 
 
 class Phases:
     """Progress of a question whose phases come one after another, without a way back.
 
-    A phase is planned, or is the first part of its name. What is not planned, belongs to an earlier
-    phase, or begins again, counts in the phase under way. No count and no share of the whole falls.
+    A phase is planned, or is the first part that is simulated. What is not planned, or belongs to
+    an earlier phase, counts in the phase under way.
     """
 
     def __init__(self, show: Progress) -> None:
-        self._show_phase = show
-        self._planned: list[str] = []
-        self._repeated = ""
-        self._ends = [0.0]
-        """Planned phases, the one of several rounds, and shares of the whole at the phases' ends,
-        first at the beginning.
-        """
-        self._number = self._round = 0
-        self._names = [""]
-        """The number of the planned phase under way, and of its round, from 1; 0 before the first;
-        names of all phases so far.
-        """
-        self._part, self._done_in_part, self._total_of_part = "", 0, 0
-        """The part of the phase that is under way: its name, what is done, and its total."""
-        self._done = self._before_part = self._before_round = 0
-        """What is done in the phase in all, and was done before this part and this round."""
+        self._show_whole = show
+        self._points = 1
+        """Number of points at which a setting is simulated."""
+        self._later = dict[str, float]()
+        """The planned phases that have not begun, with their expected numbers of simulations."""
+        self._done = self._before = 0
+        """Number of simulations so far, and of those before the phase under way."""
+        self._name = self._round = ""
         self._is_stage = False
-        self._expected: int | None = None
-        """Whether a stage is open, and how many settings are done at its end, if that is known."""
-        self._share = 0.0
-
-    def plan(self, usual_shares: Mapping[str, float], repeated: str = "") -> None:
-        """Plan the phases, each with its usual share of the time; the `repeated` one has rounds, of
-        which nobody knows how many follow.
+        self._expected = self._planned_round = 0.0
+        """The phase under way, its round, whether all parts belong to it, how many simulations it
+        is expected to take, and each of its rounds if their number is known.
         """
-        self._planned = [*usual_shares]
-        self._repeated = repeated
-        total = sum(usual_shares.values())
-        self._ends = [0.0, *(end / total for end in accumulate(usual_shares.values()))]
+        self._waiting = 0
+        """Number of simulations that the part under way still has to do."""
 
-    def show_part(self, part: str, done: int, total: int) -> None:
-        """Show the progress of a part: by itself a phase, or within a stage."""
-        if part == COMPILING:
-            self._show_phase(Phase(part, self._share), done, total)
-            return
+    def plan(self, settings: Mapping[str, float], points: int = 1) -> None:
+        """Plan the phases, each with the number of settings that it is expected to simulate, at so
+        many points.
+        """
+        self._points = points
+        self._later = {name: points * number for name, number in settings.items()}
+
+    def begin_part(self, part: str, simulations: int) -> None:
+        """Begin a part, by itself a phase or within one."""
         if not self._is_stage:
             self._begin(part)
-        # A part that follows another one, or begins again, goes on where that one ended.
-        if part != self._part or done < self._done_in_part:
-            self._before_part = self._done - done
-        self._part, self._done_in_part, self._total_of_part = part, done, total
-        self._done = self._before_part + done
+        self._waiting = simulations
         self._show()
 
+    def add(self, simulations: int) -> None:
+        """Count simulations that the part under way has done."""
+        self._done += simulations
+        self._waiting -= simulations
+        self._show()
+
+    def say(self, what: str, done: int, total: int) -> None:
+        """Show something that is no simulation."""
+        self._show_whole(what, *self._counts())
+
     @contextmanager
-    def stage(self, name: str, total: int | None) -> Iterator[Callable[[int], None]]:
-        """Within the block, all parts count in one phase of about `total` settings, None where that
-        is open; a stage within a stage is a part of it. The function that it yields takes a better
-        estimate of how many follow the part under way.
+    def stage(self, name: str, settings: float | None = None) -> Iterator[Callable[[float], None]]:
+        """Within the block, all parts count in one phase, of about so many settings, by default as
+        planned; a stage within a stage is a part of it. The function that it yields takes a better
+        estimate of how many follow.
         """
         if self._is_stage:
             yield lambda left: None
             return
-        self._begin(name)
-        if name == self._names[-1] == self._repeated:
-            self._round += 1
-            self._before_round = self._done
-        self._end_part()
+        self._begin(name, settings)
         self._is_stage = True
-        self._expected = None if total is None else self._done + total
         self._show()
-
-        def expect(left: int) -> None:
-            self._expected = self._before_part + self._total_of_part + left
-
         try:
-            yield expect
+            yield self.expect
         finally:
             self._is_stage = False
-            self._end_part()
 
-    def _begin(self, name: str) -> None:
-        """Begin the phase of this name, if it is later than the one under way."""
-        number = self._planned.index(name) + 1 if name in self._planned else 0
-        if number > self._number or (not self._number and name not in self._names):
-            self._number = number
-            self._names.append(name)
-            self._round = self._done = self._before_round = 0
-            self._end_part()
+    def begin_round(self, number: int, most: int, *, is_known: bool = False) -> None:
+        """Begin a round of the phase under way, from 1 on; there are at most, or known to be, as
+        many as `most`.
+        """
+        self._round = f", round {number} of {'' if is_known else 'at most '}{most}"
+        done = self._done - self._before
+        if not is_known:
+            self._expected = max(self._expected, (1 + OVERRUN) * done)
+        else:
+            # The mean of the rounds so far, and of one as it was planned.
+            self._planned_round = self._planned_round or self._expected / most
+            of_round = (self._planned_round + done) / number
+            self._expected = done + (most - number + 1) * of_round
+        self._show()
 
-    def _end_part(self) -> None:
-        self._part, self._done_in_part, self._total_of_part = "", 0, 0
-        self._before_part = self._done
+    def _begin(self, name: str, settings: float | None = None) -> None:
+        """Begin a phase, if it is later than the one under way."""
+        if name not in self._later and self._name:
+            return
+        planned = 0.0
+        for earlier in [*self._later]:
+            if name not in self._later:
+                break
+            planned = self._later.pop(earlier)
+        self._name, self._round = name, ""
+        self._planned_round = 0.0
+        self._before = self._done
+        self._waiting = 0
+        self._expected = planned if settings is None else self._points * settings
+
+    def expect(self, left: float) -> None:
+        """Expect that so many settings follow in the phase under way, and at least a small share of
+        those so far: nobody knows whether one of them fails, and more are necessary.
+        """
+        done = self._done - self._before
+        self._expected = done + max(self._points * left, LEAST_SHARE * done)
 
     def _show(self) -> None:
-        """Show the phase under way."""
-        # What is known of its total.
-        total = self._before_part + self._total_of_part if self._total_of_part else 0
-        if self._is_stage:
-            total = 0 if self._expected is None else max(self._expected, total)
+        self._show_whole(f"{self._name}{self._round}", *self._counts())
 
-        # The share of the phase; of rounds the next ones get half, a third, ... of what is left.
-        share = 0.0
-        if total > self._before_round:
-            share = (self._done - self._before_round) / (total - self._before_round)
-        name = self._names[-1]
-        if name == self._repeated:
-            share = 1 - 1 / (max(self._round, 1) + share)
-            name += f", round {max(self._round, 1)}"
-        if self._number:
-            begin, end = self._ends[self._number - 1 : self._number + 1]
-            self._share = max(self._share, begin + share * (end - begin))
-            if len(self._planned) > 1:
-                name = f"{self._number} of {len(self._planned)}, {name}"
-        self._show_phase(Phase(name, self._share), self._done, total)
+    def _counts(self) -> tuple[int, int]:
+        """The number of simulations that are done, and the expected total."""
+        left = max(self._before + self._expected - self._done, self._waiting)
+        return self._done, round(self._done + left + sum(self._later.values()))

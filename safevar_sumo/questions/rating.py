@@ -53,9 +53,9 @@ TESTS: Columns = TEST | {
     "first_speed": Column(
         "km/h", "slowest test speed at which a cell is not green; of a variant, is worse", "g"
     ),
-    "standard": POINTS(meaning="points of the standard range"),
-    "extended": POINTS(meaning="points of the extended range"),
-    "robustness": POINTS(meaning="points of robustness layers"),
+    "standard": POINTS(meaning="points of the standard range", is_detail=True),
+    "extended": POINTS(meaning="points of the extended range", is_detail=True),
+    "robustness": POINTS(meaning="points of robustness layers", is_detail=True),
     "possible_standard": POINTS(meaning="points of the test in the standard range", is_shown=False),
     "possible_extended": POINTS(meaning="points of the test in the extended range", is_shown=False),
     "failing_layers": "robustness layers that the vehicle does not pass",
@@ -87,6 +87,8 @@ CELLS: Columns = TEST | {
 @question
 @contents(
     *("points", "possible", "lost", "not_simulated", "layers_not_simulated"),
+    lead="tests",
+    next="explain",
     tests=TESTS,
     vehicles=VEHICLES,
     not_simulated=NOT_SIMULATED,
@@ -117,7 +119,6 @@ def rating(
     """
     # The vehicles, in a study that is rated.
     study = evaluator.study
-    evaluator.plan({CELLS_STAGE: 1})
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
     if study.scenario.search:
@@ -192,6 +193,8 @@ def rate(
 
     # Tables of tests, vehicles and cells.
     tests = tabulate("Points by test", TESTS, _rows_of_tests(rater, scores, names))
+    loses = tests["lost"] > 0 if len(names) > 1 else tests["points"] < tests["possible"]
+    tests.attrs["lead_rows"] = np.flatnonzero(loses).tolist()
     changes = [_changes(study, setting) for setting in settings.values()]
     invalid = (~cells.valid).sum(axis=1)
     remarks = [*_remarks(rater, scores, cells)]

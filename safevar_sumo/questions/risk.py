@@ -54,6 +54,8 @@ MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
 RARE = 1e-4
 """If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
+MAX_DECIDING = 5
+"""Number of characteristics that one screen names."""
 MAX_RIVALS = 3
 """Largest number of characteristics that the verdict names beside the one with the largest share.
 """
@@ -87,7 +89,10 @@ interval.
 
 @question
 @contents(
-    *("unsafe", "samples", "failures", "probability", "interval", "confidence"), sensitivity=COLUMNS
+    *("unsafe", "samples", "failures", "probability", "interval", "confidence"),
+    lead="sensitivity",
+    next="explain",
+    sensitivity=COLUMNS,
 )
 def risk(
     subject: Study | Case,
@@ -112,14 +117,15 @@ def risk(
     # Vehicles as the study says that they vary.
     study = evaluator.study
     model = VariationModel(evaluator.study)
+    has_design = not (model.is_correlated or model.region or study.scenario.search)
+    design = BASE_POINTS * (len(evaluator.characteristics) + 2) if has_design else 0
+    evaluator.plan({SAMPLING: samples, SENSITIVITY: design})
     criterion = evaluator.choose_criterion(unsafe, subject)
     rng = np.random.default_rng(study.search.seed)
     batches = []
-    evaluator.plan({SAMPLING: 1, SENSITIVITY: 2})
-    with evaluator.stage(SAMPLING, samples):
-        for start in range(0, samples, VEHICLES_PER_CALL):
-            vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
-            batches.append(evaluator.evaluate(vehicles, SAMPLING))
+    for start in range(0, samples, VEHICLES_PER_CALL):
+        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
+        batches.append(evaluator.evaluate(vehicles, SAMPLING))
 
     # How many are unsafe.
     drawn = Evaluations.concatenate(batches)
@@ -133,10 +139,10 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
-    if model.is_correlated or model.region or study.scenario.search:
-        table = given_data_indices(evaluator, simulated, criterion, confidence)
-    else:
+    if has_design:
         table = sobol_indices(evaluator, model, criterion, confidence)
+    else:
+        table = given_data_indices(evaluator, simulated, criterion, confidence)
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -151,12 +157,13 @@ def risk(
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
         f"{NO_PROBABILITY if not study.variation else ''}"
-        f"{'' if failures else _bound_in_words(high, total, confidence)}"
     )
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
+    verdict += "" if failures else _bound_in_words(high, total, confidence)
+    table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
     return Answer(
         question="risk",
@@ -339,9 +346,11 @@ def _table(
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
-            head = f"{of_what} {index}" if of_what == criterion.measure else ""
+            head = f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
             meaning = f"share of the variance of {of_what}: {meaning}"
-            columns |= with_interval(name, Column("-", meaning, ".2f", head=head))
+            is_detail = output == "unsafe"
+            column = Column("-", meaning, ".2f", head=head, is_detail=is_detail)
+            columns |= with_interval(name, column)
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})

@@ -59,7 +59,16 @@ COLUMNS: Columns = {
 
 
 @question
-@contents("unsafe", "samples", "failures", "share", "interval", rules=COLUMNS)
+@contents(
+    "unsafe",
+    "samples",
+    "failures",
+    "share",
+    "interval",
+    lead="rules",
+    next="explain",
+    rules=COLUMNS,
+)
 def rules(
     subject: Study | Case,
     evaluator: Evaluator,
@@ -82,7 +91,7 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.plan({SAMPLED_STAGE: 1})
+    evaluator.plan({SAMPLED_STAGE: samples})
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
@@ -185,8 +194,9 @@ def _boxes(
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
         return _find_boxes(settings, is_unsafe, characteristics), ""
     remark = (
-        f" A rule needs at least {MIN_SETTINGS} unsafe and as many safe vehicles: ask for more"
-        " with --samples."
+        f" Regions are found in {len(settings):,} of these vehicles, of which"
+        f" {int(is_unsafe.sum()):,} are unsafe; at least {MIN_SETTINGS} unsafe and {MIN_SETTINGS}"
+        " safe ones are needed. Ask for more with --samples."
     )
     return [], remark
 

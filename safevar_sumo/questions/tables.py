@@ -24,6 +24,8 @@ LONG_TEXT = 60
 [characters].
 """
 LEAST_TEXT = 36
+MAX_LEAD_ROWS, MAX_LEAD_COLUMNS = 12, 6
+"""Size of the table of one screen."""
 LATEX_PREAMBLE = "% In the preamble: " + " ".join(
     rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
 )
@@ -43,7 +45,8 @@ LATEX_CODES = str.maketrans(
 
 class Column(NamedTuple):
     """A column of a table: its unit, its meaning, how its numbers are written for readers, whether
-    readers see it or JSON and CSV alone have it, and its heading, by default its name.
+    readers see it or JSON and CSV alone have it, its heading, by default its name, and whether one
+    screen leaves it to the details.
     """
 
     unit: str
@@ -51,6 +54,7 @@ class Column(NamedTuple):
     number_format: str = ".4g"
     is_shown: bool = True
     head: str = ""
+    is_detail: bool = False
 
 
 Columns = dict[str, Column | str]
@@ -186,8 +190,11 @@ def _meaning_of(ends: Sequence[Column]) -> str:
 
 
 class _ReaderColumn(NamedTuple):
-    """A column as a reader sees it: its heading with the unit, its meaning, and texts."""
+    """A column as a reader sees it: columns of the frame, its heading with the unit, its meaning,
+    and texts.
+    """
 
+    names: list[str]
     head: str
     meaning: str
     texts: list[str]
@@ -230,11 +237,38 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
                     text if exact or text == "-" else f"{text} ({interval})"
                     for text, interval, exact in behind
                 ]
-        unit = "" if column.unit in ("", "-") else f" [{column.unit}]"
+        has_unit = column.unit not in ("", "-") and not column.unit.startswith("as ")
+        unit = f" [{column.unit}]" if has_unit else ""
         is_number = pd.api.types.is_numeric_dtype(frame[name])
         yield _ReaderColumn(
-            f"{column.head or base.replace('_', ' ')}{unit}", column.meaning, texts, is_number
+            [each for each in (name, *ends) if each in frame],
+            f"{column.head or base.replace('_', ' ')}{unit}",
+            column.meaning,
+            texts,
+            is_number,
         )
+
+
+def lead_table(frame: pd.DataFrame, max_rows: int) -> pd.DataFrame:
+    """The rows and columns of a table that one screen shows: at most so many of the most important
+    rows, and no column that says the same in each of them, or nothing.
+    """
+    rows = frame.attrs.get("lead_rows", range(len(frame)))
+    lead = frame.iloc[[*rows][:max_rows]]
+    declared = columns_of(frame)
+    kept = list[str]()
+    shown = 0
+    for column in reader_columns(lead):
+        is_same = len(lead) > 1 and len(set(column.texts)) == 1
+        says_something = not is_same and not set(column.texts) <= {"-", "0"}
+        is_detail = declared.get(column.names[0], Column("", "")).is_detail
+        is_label = not kept and len(lead) > 1
+        if not is_detail and (is_label or says_something) and shown < MAX_LEAD_COLUMNS:
+            kept += column.names
+            shown += 1
+    lead = lead[list(dict.fromkeys(kept))]
+    lead.attrs = {name: value for name, value in frame.attrs.items() if name != "bars"}
+    return lead
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
@@ -254,8 +288,8 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     every = list(reader_columns(frame))
     long = [column for column in every if column.is_long]
     columns = [column for column in every if not column.is_long]
-    if long and len(columns) < 2:  # lines say it all
-        yield frame.attrs.get("title", "")
+    if long and not any(column.is_number for column in columns) and len(columns) < 2:
+        yield frame.attrs.get("title", "")  # lines say it all
         for first, *others in zip(*(column.texts for column in (*columns, *long)), strict=True):
             yield ": ".join(filter(None, (first, " ".join(filter(None, others)))))
         return

@@ -24,7 +24,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.subject import study_in, study_or_case
-from safevar_sumo.questions.words import ending_in_words, number_of, points_in_words
+from safevar_sumo.questions.words import change_texts, ending_in_words, number_of, points_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
@@ -96,6 +96,8 @@ OUTCOME_NAMES = (
     "f_num_diff",
 )
 """What every study says of a simulation besides its metrics."""
+OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
+"""Results that say what others say, or that a search minimises."""
 NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
 """Why a setting of a study that searches its scenario is in no result."""
 
@@ -242,7 +244,6 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
             f"f_diff and f_num_diff are of the filtered setting, as in a search: they count"
             f" {' and '.join(small)} as unchanged. Everything else is of the vehicle as given."
         )
-    remarks += _acted_early(system, setting)
 
     # Values and results of both vehicles.
     original = simulation.original.numbers
@@ -253,6 +254,9 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         "characteristics": _characteristics(simulation),
         "results": _without_repetition(tabulate("Results", RESULTS, results), simulation),
     }
+    names = tables["results"]["result"]
+    tables["results"].attrs["words"] = {name: name.replace("_", " ") for name in names}
+    tables["results"].attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
 
     # The verdict; of a matrix with the points at which it fails.
     verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
@@ -261,16 +265,12 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
             f"The command `rating` simulates all {len(system.matrix)} cells and variations."
         )
     elif system.matrix:
-        results_by_point = [*simulate_all_points(system, setting[np.newaxis])]
-        records = map(point_record, results_by_point)
-        points = [
-            {**row, **row.get("contact", {})} for row in records
-        ]  # side and place are columns
-        tables["points"] = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
-        failing = [one.point.name for one in results_by_point if _fails(study, one)]
+        tables["points"], failing = _points(study, system, setting)
         is_changed = simulation.setting != simulation.original.setting
         who = "changed" if is_changed else "original"
-        verdict.append(points_in_words(f"The {who} vehicle", failing, len(points)))
+        verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
+
+    verdict += _acted_early(system, setting)
 
     # The model's own uncertainty.
     if with_spread:
@@ -283,6 +283,9 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = _remark_table(remarks)
+    members = system.characteristics.vehicle
+    if texts := change_texts(members, system.characteristics.named(setting)):
+        verdict.append(f"Changed: {', '.join(texts)}.")
     solution = {} if target.handle is None else {"solution": str(target.handle)}
     return Answer(
         question="simulate",
@@ -290,7 +293,20 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         verdict=" ".join(filter(None, verdict)),
         numbers={**solution, **simulation.numbers},
         tables=tables,
+        lead="points" if "points" in tables else "results",
     )
+
+
+def _points(study: Study, system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str]]:
+    """The table of the points of a matrix, of which the worst ones lead, and the points at which a
+    setting fails.
+    """
+    results = [*simulate_all_points(system, setting[np.newaxis])]
+    records = map(point_record, results)
+    points = [{**row, **row.get("contact", {})} for row in records]  # side and place are columns
+    table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
+    table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
+    return table, [one.point.name for one in results if _fails(study, one)]
 
 
 def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
@@ -303,8 +319,8 @@ def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
             if np.isfinite(acted):  # NaN: it never did
                 at = f"{result.point.name}: " if result.point.name else ""
                 yield (
-                    f"{at}invalid test: {result.point.scenario.dependence}, and the driving system"
-                    f" acts at {acted:.1f} s: other simulators would show another encounter."
+                    f"Remark: {at}invalid test: {result.point.scenario.dependence}, and the driving"
+                    f" system acts at {acted:.1f} s: other simulators would show another encounter."
                 )
 
 
@@ -392,21 +408,25 @@ def _sweep(study: Study, system: System, settings: FloatArray, names: list[str])
     # What a reader should know of the settings.
     collisions = int(evaluations.collided[1:].sum())
     remarks = [*_remarks(system), degree_note(contact)]
+    read_first = list[str]()
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
-        remarks.append(f"In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
+        read_first.append(f"Remark: In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")
     if len(names) == 1 and rises_again(frame, names[0], characteristics):
+        read_first.append(
+            "Remark: The safety degree does not fall steadily along this sweep: it rises again"
+            " further from the original value, so do not extrapolate from two values."
+        )
         remarks.append(
-            "The safety degree does not fall steadily along this sweep: it rises again further"
-            " from the original value. The driving system decides only once per frame, so a weaker"
-            " vehicle may get a harder or an earlier brake command. Do not extrapolate from two"
-            " values."
+            "The driving system decides only once per frame, so a weaker vehicle may get a harder"
+            " or an earlier brake command."
         )
     verb = "collide" if collisions > 1 else "collides"
     counts = f"Of {number_of(len(frame), 'setting')}, {collisions or 'none'} {verb}."
+    sentences = [no_verdict, counts, _original_in_words(system, evaluations), *read_first]
     return Answer(
         question="simulate",
         study=study,
-        verdict=f"{no_verdict} {counts} {_original_in_words(system, evaluations)}".strip(),
+        verdict=" ".join(filter(None, sentences)),
         numbers={"driven": not no_verdict, "settings": len(frame), "collisions": collisions},
         tables={"sweep": tabulate(study.title, columns, frame), "remarks": _remark_table(remarks)},
     )

@@ -48,7 +48,7 @@ from safevar_sumo.results import (
 )
 from safevar_sumo.study import Origin, Study, convert_table, tables_of, user_code_names, write_study
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.terminal import Progress
+from safevar_sumo.terminal import Parts, Progress
 
 STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
 """Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
@@ -213,7 +213,7 @@ class Packed:
         study = ReportedStudy(
             directory=self._directory, case=self.shown, versions=versions, answers=answers
         )
-        return make_page([study], progress=self._progress).encode()
+        return make_page([study], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:
         """A study file with all that the study extends."""

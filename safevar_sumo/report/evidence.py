@@ -8,7 +8,6 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
@@ -63,7 +62,7 @@ from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
-from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
+from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 
 def evidence(
@@ -97,8 +96,8 @@ def evidence(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a phase, the number done in it, and its
-        total.
+        True for a bar on the terminal, or a function of a phase, the number of simulations done,
+        and their total.
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
 
@@ -165,7 +164,7 @@ def _pack_study(
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
-    show_part = partial(show_within, progress, study.name, 0.0, 1.0)
+    show_part = Parts(progress).begin(study.name)
     packed = Packed(described, files, study.origin.places, jobs, show_part)
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
@@ -244,8 +243,8 @@ def verify(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a phase, the number done in it, and its
-        total.
+        True for a bar on the terminal, or a function of a phase, the number of simulations done,
+        and their total.
 
     Raises
     ------

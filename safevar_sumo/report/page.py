@@ -1,5 +1,5 @@
-"""The page about results: for each study first the sheet of a workshop and what decides, then
-replays, then each answer, folded.
+"""The page about results: for each study first what decides, a replay, and the sheet of a workshop,
+then all other answers.
 """
 
 from __future__ import annotations
@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from io import BytesIO
 from itertools import chain, count
 from pathlib import Path
@@ -34,10 +33,10 @@ from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.report.sections import ReportedStudy, facts, page_commands, replays, tested, trust
-from safevar_sumo.report.sheet import sheet_of, speed_question
+from safevar_sumo.report.sections import ReportedStudy, page_commands, replays, tested, trust
+from safevar_sumo.report.sheet import sheet_of, speed_question, speeds_of
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
-from safevar_sumo.terminal import Progress, open_progress, show_no_progress, show_within
+from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,6 +49,12 @@ USUAL_QUESTIONS = (
 )
 """Questions of a page, the one whose verdict decides first; with smaller samples than those of the
 commands.
+"""
+LEAST_COST = 40_000
+USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
+PAGE_COSTS = 25_000, 5_000
+"""Numbers of simulations that take as long as a question at least, with its start; and as the
+figures of a study, and its replays.
 """
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
@@ -92,8 +97,8 @@ def report(
     jobs
         Number of worker processes, by default one for each core.
     progress
-        True for a bar on the terminal, or a function of a phase, the number done in it, and its
-        total.
+        True for a bar on the terminal, or a function of a phase, the number of simulations done,
+        and their total.
     as_it_is_now
         If results were computed with other files or versions, simulate with the present ones and
         say so.
@@ -135,16 +140,17 @@ def report(
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
-        with_sheet = [text for texts in asked for text in texts if text.startswith("tolerance")]
-        numbers, total = count(1), sum(map(len, asked)) + len(with_sheet) + len(joint)
+        texts = [*chain(*map(_with_speed, asked, by_criterion)), *joint]
+        numbers = count(1)
+        costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
+        parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(text: str, chosen: slice, *, is_asked: bool = bool(ask)) -> Answer:
             """The next answer, about these of the results."""
             question = with_criterion(text, unsafe)
             subjects = by_criterion if has_criterion(question, unsafe) else at_point
-            number = next(numbers)
-            name = f"question {number} of {total}, {question.split()[0]}"
-            show_part = partial(show_within, show, name, (number - 1) / total, 1 / total)
+            name = f"question {next(numbers)} of {len(texts)}, {question.split()[0]}"
+            show_part = parts.begin(name)
             answer = answer_to if is_asked else answer_or_reason
             return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
 
@@ -165,9 +171,15 @@ def report(
                 study = replace(study, answers=[*study.answers, speed])
             studies.append(study)
         shared = [next_answer(text, slice(None)) for text in joint]
-        page = make_page(studies, shared, show)
+        page = make_page(studies, shared, parts)
     write_whole(out, page)
     return out
+
+
+def _with_speed(asked: Sequence[str], case: Case) -> list[str]:
+    """The questions about results, with that of the greatest speed that their sheet has."""
+    has_sheet = any(text.startswith("tolerance") for text in asked)
+    return [*asked, *(["permit"] if has_sheet and speeds_of(case) else [])]
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
@@ -242,12 +254,11 @@ def _no_answer(question: str, case: Case, error: InputError) -> Answer:
 
 
 def make_page(
-    studies: Sequence[ReportedStudy],
-    shared: Sequence[Answer] = (),
-    progress: Progress = show_no_progress,
+    studies: Sequence[ReportedStudy], shared: Sequence[Answer] = (), parts: Parts | None = None
 ) -> str:
     """The page about studies, with answers about all of them."""
     # Commands that give the numbers of the page.
+    parts = parts or Parts(show_no_progress)
     of_studies = chain(*map(page_commands, studies))
     of_shared = [
         (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
@@ -255,25 +266,21 @@ def make_page(
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
     page = template.render(
         title=f"Safety report: {', '.join(study.case.name for study in studies)}",
-        studies=[_study_parts(number, study, progress) for number, study in enumerate(studies, 1)],
+        studies=[_study_parts(number, study, parts) for number, study in enumerate(studies, 1)],
         shared=list(_sections("all", shared)),
         commands=[*of_studies, *of_shared],
         player=player_files(),
         css=_web_file("report.css"),
-        js=_web_file("report.js"),
     )
     return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
 
 
-def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonObject:
-    """One study for the template: first the sheet of a workshop. On the front stand all verdicts,
-    the first of them with its first table.
-    """
+def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
+    """One study for the template: what decides, which is the first answer, and all others."""
     anchor = f"study-{number}"
+    parts.begin()("figures", 0, 1)
     answers = study.answers
-    trusted = trust(study)
-    sections = list(_sections(anchor, [*answers, tested(study), trusted]))
-    leading = answers[0] if answers else trusted
+    front, *sections = _sections(anchor, [*answers, tested(study), trust(study)])
     return {
         "name": study.case.name,
         "title": study.case.study.title,
@@ -284,23 +291,15 @@ def _study_parts(number: int, study: ReportedStudy, progress: Progress) -> JsonO
         "sheet": sheet_of(study),
         "tables": study.case.study,
         "versions": study.versions,
-        "facts": facts(study),
-        "front": _on_front(leading),
-        "verdicts": [*sections[1 : len(answers)], sections[-1]],
-        "replays": list(replays(study, progress)),
+        "is_for_workshop": study.has_workshop_parts,
+        "front": front,
+        "replays": list(replays(study, parts.begin())),
         "sections": sections,
     }
 
 
-def _on_front(answer: Answer) -> Markup:
-    """An answer with its first table alone."""
-    return Markup(replace(answer, tables=dict([*answer.tables.items()][:1])).render("html"))
-
-
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
-    """Answers for the template: the heading, the verdict, the answer in HTML, and its figure if it
-    has one.
-    """
+    """Answers for the template: the heading, the answer in HTML, and its figure if it has one."""
     for number, answer in enumerate(answers, 1):
         name = answer.question
         try:
@@ -310,7 +309,6 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
         yield {
             "anchor": f"{anchor}-{number}-{re.sub('[^a-z]', '-', name.lower())}",
             "heading": name[:1].upper() + name[1:],
-            "verdict": answer.verdict,
             "html": Markup(answer.render("html")),
             "picture": picture,
         }

@@ -33,7 +33,7 @@ from safevar_sumo.replay.comparison import comparison_of, list_differences, why_
 from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
-from safevar_sumo.study import SAFETY_DEGREE, unit_text
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
@@ -73,6 +73,7 @@ GENERAL_LIMITS = (
         " says how far the models agree with them."
     ),
 )
+NO_TABLE = "no table"
 CHARACTERISTICS = {
     "characteristic": Column("", "characteristic of the vehicle, or of its encounter"),
     "unit": Column("", "unit of its values"),
@@ -213,65 +214,7 @@ def tested(study: ReportedStudy) -> Answer:
             "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
             "remarks": _remarks(remarks),
         },
-    )
-
-
-def facts(study: ReportedStudy) -> list[tuple[str, str]]:
-    """What a signature under the page is about, each with its name: the results, how they were
-    computed, and how the limits of the first answer were tested.
-    """
-    # Which results, and by which versions.
-    numbers = {
-        name: value for answer in study.answers[:1] for name, value in answer.numbers.items()
-    }
-    rows = [
-        ("Results", f"{study.directory.name}, seed {study.case.study.search.seed}"),
-        ("Versions", ", ".join(f"{name} {value}" for name, value in study.versions.items())),
-    ]
-
-    # How the limits were tested.
-    if numbers.get("fits_tried"):
-        text = f"the limits hold in {numbers['fits']} of {numbers['fits_tried']} that were tried"
-        rows.append(("Parameter sets", text))
-    if numbers.get("attacked") and numbers.get("at_most") is not None:
-        at_some = numbers.get("attacked_at_worst_points") or 0
-        where = f" at all points, and {at_some:,} at the worst points" if at_some else ""
-        text = (
-            f"{numbers['attacked']:,} simulations{where} searched for a counterexample; at most"
-            f" {100 * numbers['at_most']:.2f} % of uniformly sampled vehicles within the limits are"
-            " unsafe"
-        )
-        rows.append(("Falsification", text))
-
-    # What moves limits alone, and how far the parameter sets differ.
-    tables = study.answers[0].tables if numbers else {}
-    if "uncertainty" in tables:
-        rows.append(
-            (
-                "Limits alone",
-                "limits with the study's own parameter set, and with all sets:"
-                f" {_moved_limits(tables['uncertainty'])}",
-            )
-        )
-    if "fits" in tables and numbers.get("margin"):
-        corners = tables["fits"].loc[tables["fits"]["specified"] == "kept", "corners"].dropna()
-        if len(corners):
-            text = (
-                f"the worst corner of all limits keeps {corners.min():.2f} to {corners.max():.2f}"
-                " m, depending on the parameter set"
-            )
-            rows.append(("Spread", text))
-    return rows
-
-
-def _moved_limits(uncertainty: pd.DataFrame) -> str:
-    """The limits alone that moved, before and after: `brakeTorque 0.53 to 0.58`."""
-    return "; ".join(
-        f"{row['characteristic']} {row[f'own_fit_{end}']:.10g} to"
-        f" {row[f'alone_{end}']:.10g}{unit_text(row['unit'])}"
-        for row in uncertainty.to_dict("records")
-        for end in ("low", "high")
-        if row[f"own_fit_{end}"] != row[f"alone_{end}"]
+        lead=NO_TABLE,
     )
 
 

@@ -196,9 +196,7 @@ class JournalReader:
         self.is_finished = False
 
     def asked(self) -> int:
-        """Number of evaluations that the run has asked for; a finished one, all that it was
-        allowed.
-        """
+        """Number of evaluations that the run has asked for."""
         with suppress(FileNotFoundError), open(self._path, "rb") as file:
             file.seek(self._end)
             for text in file:
@@ -214,8 +212,12 @@ class JournalReader:
                     self._asked = min(progress.evaluation[-1] + 1, self._budget)
                 elif progress.budget == self._budget:
                     self.is_finished = True
-                    self._asked = self._budget
         return self._asked
+
+    @property
+    def left(self) -> int:
+        """Number of evaluations that the run may still ask for."""
+        return 0 if self.is_finished else self._budget - self._asked
 
 
 def open_and_lock(path: Path) -> IO[bytes]:

@@ -285,4 +285,4 @@ def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
         " 4\npopulation = 4\n"
     )
     results = sv.run("mine.toml", jobs=1)
-    assert "My own search" in sv.tables(results).only("rq1").render("text")
+    assert "My own search" in sv.tables(results).render("text", "rq1")

@@ -122,8 +122,8 @@ def test_progress_has_its_total_from_the_start_and_begins_with_the_journals(
     shown = list[tuple[str, int, int]]()
     carried_out(study, tmp_path, keys=[RunKey("rs", 0)])
     carried_out(study, tmp_path, progress=lambda *values: shown.append(values))
-    assert shown[0] == ("smoke: 1/2 runs, evaluations", 100, 200)
-    assert shown[-1] == ("smoke: 2/2 runs, evaluations", 200, 200)
+    assert shown[0] == ("smoke: 1 of 2 runs", 100, 200)
+    assert shown[-1] == ("smoke: 2 of 2 runs", 200, 200)
 
 
 @pytest.mark.parametrize(

@@ -59,21 +59,19 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
 
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
-    assert "[red]x[/blue]" in run("simulate", "mine.toml").stdout
+    assert "[red]x[/blue]" in run("simulate", "mine.toml", "--details").stdout
     run("study", "mine.toml", "--evaluations", "10", "--runs", "1", "--algorithms", "rs", "--quiet")
 
 
 @SLOW
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
-    output = run("study", "smoke").stdout
+    following = "explain results/smoke, python -m safevar_sumo tolerance results/smoke"
+    assert f"Next: python -m safevar_sumo {following}" in run("study", "smoke").stdout
+    output = run("study", "smoke", "--details").stdout
     for part in (
         "original_outcome: stopped",
         "NSGA-II",
         "None of the 8 tests of RQ1 can be significant: after Holm's correction, a test needs at",
-        (
-            "Next: python -m safevar_sumo explain results/smoke, python -m safevar_sumo tolerance"
-            " results/smoke"
-        ),
     ):
         assert part in output
     assert "RQ1 over runs" not in output, "no test of so few runs can be significant"
@@ -124,7 +122,7 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
 ) -> None:
     simulated = len(load_runs(whole).evaluations)
     again = ("study", "small.toml", "--out", str(whole))
-    assert f"evaluations: {simulated};" in run(*again).stdout
+    assert f"evaluations: {simulated};" in run(*again, "--details").stdout
     assert run(*again, "--quiet").stdout == ""
     assert json_of(*again, "--quiet")["numbers"]["evaluations"] == simulated
     assert "NSGA-II" in run(*again, "--quiet", "--table", "algorithms").stdout
@@ -133,7 +131,7 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
 def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     output = run("study", "small.toml", "--dry-run").stdout
     assert output.startswith("About ")
-    for word in ("nsga2, rs, safe_fuzzer", "900", "evaluations_per_second", "seconds"):
+    for word in ("nsga2, rs, safe_fuzzer", "900"):
         assert word in output
     assert not Path("results").exists()
 
@@ -141,7 +139,7 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
 @SLOW
 def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
     """Half of its domain has encounters that cannot be driven."""
-    assert "seconds" in run("study", "alks_joint_cut_out", "--dry-run").stdout
+    assert run("study", "alks_joint_cut_out", "--dry-run").stdout.startswith("About ")
 
 
 ADS = """
@@ -276,4 +274,4 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
     )
     verdict = json.loads(demanded.stdout)["verdict"]
     assert verdict.startswith("The original vehicle itself has ave_dece ")
-    assert verdict.endswith("tolerance results/smoke --unsafe 'ave_dece >= 2'")
+    assert verdict.endswith(": no change is needed."), "and no question follows"

@@ -49,9 +49,12 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
             module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
         )
     system_of = questions.system_of
-    monkeypatch.setattr(
-        questions, "system_of", lambda study: smoke if study.name == "made-up" else system_of(study)
-    )
+    for module in (evaluator, questions):
+        monkeypatch.setattr(
+            module,
+            "system_of",
+            lambda study: smoke if study.name == "made-up" else system_of(study),
+        )
 
 
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0

@@ -20,8 +20,9 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
-from safevar_sumo.questions.answer import MAX_ROWS, Answer, Column, Wide, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, Column, Wide, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
+from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, refused, run
@@ -77,10 +78,27 @@ def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
     )
     long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
     for form in ("text", "html"):
-        assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in long.render(form)
-        assert "Many" not in long.render(form)
+        shown = long.render(form, details=True)
+        assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in shown
+        assert "Many" not in shown
     assert len(long.render("csv", "many").splitlines()) == MAX_ROWS + 2
-    assert "--table" not in ANSWER.render("text") + ANSWER.render("html")
+    assert "--table" not in ANSWER.render("text", details=True) + ANSWER.render("html")
+
+
+def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
+    """The first ones; a column that says the same in each row is left out."""
+    rows = [(str(row), "words " * 40, "same") for row in range(15)]
+    columns = {name: Column("", name) for name in ("name", "text", "constant")}
+    answer = replace(ANSWER, tables={"long": tabulate("Long", columns, rows)})
+    text = answer.render("text")
+    assert len(text.splitlines()) <= MAX_LINES
+    assert "constant" not in text
+    left_out = re.search(r"^(\d+) more rows: --details\.$", text, re.MULTILINE)
+    assert left_out is not None
+    last = 14 - int(left_out[1])
+    assert f"{last} " in text
+    assert f"│ {last + 1} " not in text
+    assert "same" in answer.render("text", details=True)
 
 
 def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
@@ -102,7 +120,7 @@ def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
     frame = tabulate(
         "Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h")
     )
-    page = replace(ANSWER, tables={"lengths": frame}).render("html")
+    page = replace(ANSWER, tables={"lengths": frame}).render("html").partition("<details>")[0]
     assert re.findall("<th.*?>([^<]*)</th>", page) == ["part", "to 20 km/h", "to 30 km/h"]
     assert re.findall("<td.*?>([^<]*)</td>", page) == ["a", "1 to 2", "1.5", "b", "up to 2", "-"]
     assert (
@@ -140,7 +158,7 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     long = tabulate(
         "Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)]
     )
-    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text")
+    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text", details=True)
     assert "Others" not in ANSWER.render("latex", "parts")
     others = replace(
         answer, tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]}
@@ -149,9 +167,10 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
         "no table, whose label would repeat"
     )
     for form in ("text", "html"):
-        assert "Remarks" in answer.render(form)
-        assert "Remarks" not in replace(others, folded=("others",)).render(form), "an empty table"
-        assert "Remarks" not in others.only("parts").render(form)
+        assert "Remarks" in answer.render(form, details=True)
+        without = replace(others, folded=("others",))
+        assert "Remarks" not in without.render(form, details=True), "an empty table"
+        assert "Remarks" not in others.render(form, "parts")
     with pytest.raises(sv.InputError, match="did you mean 'parts'"):
         ANSWER.only("part")
 
@@ -160,9 +179,9 @@ def test_readers_see_folded_tables_only_if_they_ask() -> None:
     other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
     answer = replace(ANSWER, tables={**ANSWER.tables, "others": other}, folded=("others",))
     for form in ("text", "latex", "html"):
-        assert "Others" not in answer.render(form)
+        assert "Others" not in answer.render(form, details=True)
         assert "Others" in answer.render(form, "others")
-    assert "By --table NAME: others." in answer.render("text")
+    assert "By --table NAME: others." in answer.render("text", details=True)
     assert [*json.loads(answer.render("json"))["tables"]] == ["parts", "others"]
 
 

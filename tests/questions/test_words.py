@@ -117,4 +117,4 @@ def test_half_of_the_originals_is_said_by_every_question(
         answer = json_of(*typed)
         assert answer["numbers"]["unsafe"].startswith("below="), typed
         assert "half of the original's" in answer["verdict"], typed
-        assert "To count only collisions, ask with --unsafe collision." in answer["verdict"], typed
+        assert "--unsafe collision counts collisions alone." in answer["verdict"], typed

@@ -146,20 +146,10 @@ def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
 
 
 @pytest.mark.slow
-def test_a_link_opens_its_answer_and_the_keyboard_plays(browser: Chrome, report: Path) -> None:
+def test_the_keyboard_opens_a_replay_and_plays(browser: Chrome, report: Path) -> None:
     opened(browser, report)
     browser.execute_script(
         "document.querySelectorAll('details').forEach((one) => { one.open = false; })"
-    )
-    link = browser.find_element(By.CSS_SELECTOR, ".verdicts a")
-    link.send_keys(Keys.ENTER)
-    time.sleep(0.3)
-    section = browser.find_element(By.ID, str(link.get_attribute("href")).partition("#")[2])
-    assert section.get_attribute("open") is not None
-    assert browser.execute_script(
-        "const box = arguments[0].getBoundingClientRect(); return box.top >= -1 && box.top <"
-        " innerHeight",
-        section,
     )
     replay = browser.find_element(By.CSS_SELECTOR, "details.replay")
     replay.find_element(By.TAG_NAME, "summary").send_keys(Keys.ENTER)
@@ -211,7 +201,7 @@ BROKEN_NAMES = """
 
 
 @pytest.mark.slow
-def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
+def test_it_prints_on_few_pages_what_is_unfolded_and_nothing_to_press(
     browser: Chrome, report: Path
 ) -> None:
     opened(browser, report)
@@ -219,7 +209,7 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
         browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})["data"]
     )
     assert printed.startswith(b"%PDF")
-    assert 3 <= printed.count(b"/Type /Page\n") <= 14
+    assert 3 <= printed.count(b"/Type /Page\n") <= 8
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     browser.execute_cdp_cmd(
         "Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False}
@@ -227,22 +217,15 @@ def test_it_prints_on_few_pages_with_all_values_and_nothing_to_press(
     try:
         assert browser.execute_script(TOO_WIDE) == []
         assert browser.execute_script(BROKEN_NAMES) == []
-        bottom = "return document.querySelector('.sheet').getBoundingClientRect().bottom + scrollY"
-        assert browser.execute_script(bottom) <= A4["height"], "the sheet of a workshop is one page"
-        height = "return document.querySelector('.front').getBoundingClientRect().height"
-        assert browser.execute_script(height) <= A4["height"], "verdicts and limits are one page"
-        every = "return document.querySelectorAll(arguments[0]).length"
+        height = "return document.querySelector(arguments[0]).getBoundingClientRect().height"
+        for part in (".front", ".sheet"):
+            assert browser.execute_script(height, part) <= A4["height"], f"{part} is one page"
         seen = (
             "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
             " one.checkVisibility()).length"
         )
         assert browser.execute_script(seen, ".controls, .play") == 0
-        stills = browser.execute_script(seen, ".player")
-        assert stills == browser.execute_script(every, ".replay") > 1, "a still for each replay"
-        values = "details li, details td"
-        assert browser.execute_script(seen, values) == browser.execute_script(every, values) > 0, (
-            "closed details are printed too"
-        )
+        assert browser.execute_script(seen, ".player") == 1, "a still of the first replay"
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})

@@ -265,8 +265,10 @@ def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> N
         path.write_bytes(whole[:size])
         assert reader.asked() == ROWS * max(sum(end <= size for end in ends) - 1, 0)
         assert not reader.is_finished
+        assert reader.asked() + reader.left == BUDGET
+    asked = reader.asked()
     path.write_bytes(whole)
-    assert (reader.asked(), reader.is_finished) == (BUDGET, True)
+    assert (reader.asked(), reader.left, reader.is_finished) == (asked, 0, True)
 
 
 @pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])

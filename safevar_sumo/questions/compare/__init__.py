@@ -28,12 +28,14 @@ from safevar_sumo.questions.compare.differences import (
     GROWN,
     LIMIT_COLUMNS,
     SHRUNK,
+    SUMMARY_COLUMNS,
     Difference,
     compare_counts,
     compare_limits,
     compare_originals,
     compare_values,
     limits_of_both,
+    summary_of,
 )
 from safevar_sumo.questions.compare.settings import (
     BOTH_STAGE,
@@ -59,7 +61,7 @@ from safevar_sumo.questions.pairs import (
 )
 from safevar_sumo.questions.research_questions.statistics import fewest_runs
 from safevar_sumo.questions.subject import study_in
-from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
+from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
@@ -98,6 +100,8 @@ PAIR_COLUMNS = {
     ),
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
     "benign_scenes",
+    lead="summary",
+    summary=SUMMARY_COLUMNS,
     limits=LIMIT_COLUMNS,
     pairs=PAIR_COLUMNS,
     settings=["source", *SETTING_COLUMNS, ...],
@@ -139,7 +143,7 @@ def compare(
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
-    evaluator.plan({BOTH_STAGE: 1, SCAN_STAGE: 2})
+    evaluator.plan({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):
@@ -186,7 +190,7 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={"limits": alone, "pairs": tested.pairs, "settings": _table(common, settings)},
+        tables=_tables(numbers, tested, titles, limits=alone, settings=_table(common, settings)),
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
@@ -295,6 +299,19 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
     return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
 
 
+def _tables(
+    numbers: JsonObject,
+    tested: _PairedTest,
+    titles: Sequence[str],
+    *,
+    limits: pd.DataFrame,
+    settings: pd.DataFrame,
+) -> dict[str, pd.DataFrame]:
+    """The tables of an answer, the summary first."""
+    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
+    return {"summary": summary, "limits": limits, "pairs": tested.pairs, "settings": settings}
+
+
 class _PairedTest(NamedTuple):
     """The p-value and A12 of a test in pairs, the table of the pairs, what they are, and of which
     quantity.
@@ -320,7 +337,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     sample = frame[frame["source"] == SAMPLE]
     pairs = sample.groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
-    unit = "lines of settings"
+    unit = "straight lines through the domain"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):

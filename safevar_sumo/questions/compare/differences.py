@@ -41,6 +41,11 @@ LIMIT_COLUMNS = {
     ),
     "change": Column("", "how the interval changes from A to B: grown, shrunk, both, or the same"),
 }
+SUMMARY_COLUMNS = {
+    "what": Column("", "what is compared"),
+    "a": Column("", "in A", ".3g"),
+    "b": Column("", "in B", ".3g"),
+}
 GROWN = "grown"
 SHRUNK = "shrunk"
 BOTH = "both"
@@ -65,6 +70,26 @@ class Difference(NamedTuple):
     phrase: str
     is_better: bool
     weight: int = SAFETY
+
+
+def summary_of(
+    numbers: JsonObject, pairs: pd.DataFrame, quantity: str, titles: Sequence[str]
+) -> pd.DataFrame:
+    """The table of what is compared: the new car, changed cars, needless braking, and limits."""
+    rows = [("original vehicle: safety degree", numbers["a_degree"], numbers["b_degree"])]
+    both = numbers["both"]
+    counts = (numbers["only_a_unsafe"] + both, numbers["only_b_unsafe"] + both)
+    rows.append((f"unsafe of {numbers['settings']} changed vehicles", *counts))
+    rows.append((f"changed vehicles: mean {quantity}", *pairs[[*SIDES]].mean()))
+    braking = (numbers["a_needless_braking"], numbers["b_needless_braking"])
+    rows.append((f"needless braking in {numbers['benign_scenes']} benign scenes", *braking))
+    closer = (numbers["limits_grown"], numbers["limits_shrunk"])
+    rows.append(("characteristics whose limit alone is closer", *closer))
+    heads = zip(SIDES, titles, strict=True)
+    columns = SUMMARY_COLUMNS | {
+        side: SUMMARY_COLUMNS[side]._replace(head=title) for side, title in heads
+    }
+    return tabulate("What was compared", columns, rows)
 
 
 def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:

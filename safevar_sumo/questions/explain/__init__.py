@@ -24,6 +24,7 @@ from safevar_sumo.questions.causes import (
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import (
+    SAMPLED_SETTINGS,
     TO_EXPLAIN,
     Population,
     choose_failures,
@@ -68,8 +69,8 @@ if TYPE_CHECKING:
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
-USUAL_SHARES = {TO_EXPLAIN: 2, SUBSETS: 2, REFERENCE_DRIVERS: 1, OTHER_SETS: 1, BOUNDARIES: 1}
-"""The phases of progress, with their usual shares of the time."""
+LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
+"""The last phases of progress, with their usual numbers of settings."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
 """What the settings are of which some are unsafe."""
 
@@ -86,6 +87,8 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over t
         "original_degree",
     ),
     *("rough", "analysed", "explained", *COLLISION_NUMBERS),
+    lead="causes",
+    next="tolerance",
     causes=CAUSE_COLUMNS,
     solutions=SOLUTION_COLUMNS,
     characteristics=CHARACTERISTIC_COLUMNS,
@@ -128,8 +131,9 @@ def explain(
     """
     if quick:
         fits, limit = 0, min(limit, QUICK_LIMIT)
-    evaluator.plan(USUAL_SHARES)
     study = evaluator.study
+    settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
+    evaluator.plan({TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)} | LATER)
 
     # The failures, and the minimal causes of a sample of them.
     population = gather_failures(subject, evaluator, solution, unsafe)
@@ -162,8 +166,9 @@ def explain(
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
     sentences = [
-        _verdict(evaluator, population, kind, tables["causes"]),
+        *_verdict(evaluator, population, tables["causes"]),
         _avoided_in_words(verdicts),
+        _number_in_words(population, kind),
         *_counted(study, population, kind),
     ]
     return Answer(
@@ -232,35 +237,39 @@ def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) ->
     )
 
 
-def _verdict(evaluator: Evaluator, population: Population, kind: str, causes: pd.DataFrame) -> str:
-    """How little is enough, how sure that is, and how many settings are unsafe."""
+def _number_in_words(population: Population, kind: str) -> str:
+    """How many settings are unsafe."""
+    unsafe = population.unsafe
+    runs = population.evaluations
+    number = int(np.count_nonzero(unsafe.of(runs)))
+    return f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
+
+
+def _verdict(evaluator: Evaluator, population: Population, causes: pd.DataFrame) -> Iterator[str]:
+    """How little is enough, and how sure that is."""
     unsafe = population.unsafe
     contact = evaluator.system.contact
     runs = population.evaluations
-    number = int(np.count_nonzero(unsafe.of(runs)))
-    counts = f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
 
     # Nothing has to change if the original is unsafe.
     if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
-        demand = f" {unsafe.smaller_demand(population.original)}".rstrip()
-        return f"The original vehicle itself {words}: no change is necessary.{demand} {counts}"
+        yield f"The original vehicle itself {words}: no change is necessary."
+        yield unsafe.smaller_demand(population.original)
+        return
 
     # Without a cause, how the worst setting and the original end.
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
-        ends = [
-            f"The {who} {ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)}."
-            for who, run in (("worst vehicle", nearest), ("original vehicle", population.original))
-            if len(run)
-        ]
-        return " ".join([counts, *ends])
+        for who, run in (("worst vehicle", nearest), ("original vehicle", population.original)):
+            if len(run):
+                ending = ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)
+                yield f"The {who} {ending}."
+        return
     leading = causes.iloc[0]
     if not leading["changes"]:
-        return (
-            "The original vehicle itself is unsafe in this encounter: no change is necessary."
-            f" {counts}"
-        )
+        yield "The original vehicle itself is unsafe in this encounter: no change is necessary."
+        return
 
     # Its limits, its encounter, and how sure the cause is.
     members = evaluator.characteristics
@@ -273,15 +282,12 @@ def _verdict(evaluator: Evaluator, population: Population, kind: str, causes: pd
     encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
     where = " in an encounter in which the original vehicle is safe" if encounter else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    sentences = [
-        f"With {join_phrases(limits)} the vehicle {verb}{where}.",
-        f"The encounter has {encounter.partition(' with ')[2]}." if encounter else "",
-        robustness_in_words(leading["robust_share"]),
-    ]
+    yield f"With {join_phrases(limits)} the vehicle {verb}{where}."
+    yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
+    yield robustness_in_words(leading["robust_share"])
     if pd.notna(leading["holds"]):
         holding = f"{leading['holds']} of {leading['fits']}"
-        sentences.append(f"The cause holds in {holding} parameter sets of the vehicle model.")
-    return " ".join([*filter(None, sentences), counts])
+        yield f"The cause holds in {holding} parameter sets of the vehicle model."
 
 
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:

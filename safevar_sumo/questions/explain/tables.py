@@ -43,7 +43,7 @@ from safevar_sumo.records import BoolArray
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
 CAUSE_COLUMNS: Columns = {
-    "solution": "handle of the failure",
+    "solution": Column("", "handle of the failure", is_detail=True),
     "changes": Column(
         "",
         "a smallest set of the failure's changes that is unsafe by itself",
@@ -56,6 +56,7 @@ CAUSE_COLUMNS: Columns = {
         "the values if these changes are made as small as they can be and still unsafe; rounded to"
         " the unsafe side, and simulated as they stand here",
         EXACT,
+        head="cause",
     ),
     "single_boundary": Column(
         "",
@@ -73,11 +74,17 @@ CAUSE_COLUMNS: Columns = {
     "safety_degree": Column(
         "m", "safety degree with these changes only; -m/s on a collision", is_shown=False
     ),
-    "share": Column("-", "share of the failures that have such a cause", ".2f"),
+    "share": Column(
+        "-", "share of the failures that have such a cause", ".2f", head="share of failures"
+    ),
     "robust_share": Column(
         "-", "share of vehicles with nearly the values of the cause alone that are unsafe", ".2f"
     ),
-    "holds": "number of parameter sets of the vehicle model with which these changes are a cause",
+    "holds": Column(
+        "",
+        "number of parameter sets of the vehicle model with which these changes are a cause",
+        head="holds in parameter sets",
+    ),
     "fits": "number of parameter sets that were tried",
     "avoided_by": Column(
         "", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False
@@ -220,7 +227,9 @@ def causes_table(
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"holds": "Int64", "fits": "Int64"})
     omitted = () if study.scenario.search else OF_ENCOUNTER
     columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
-    return tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
+    table = tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
+    table.attrs["lead_rows"] = np.flatnonzero(~frame["boundary"].astype(str).duplicated()).tolist()
+    return table
 
 
 def printed_limits(

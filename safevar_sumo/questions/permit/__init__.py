@@ -43,6 +43,7 @@ NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
 @contents(
     *("unsafe", "margin", "scope", "cars", "drive", "limited", "stop", "fits", "attacked"),
     *("step", "need", "not_driven_above", "rough"),
+    lead="cars",
     cars=CARS,
     sets=SETS,
 )
@@ -160,7 +161,9 @@ def _drive(
     members = evaluator.characteristics.vehicle
     # Repairs of cars, not of limits.
     repairs = [REPAIR_STAGE] if not is_rough and len(asked[0].vehicles) == 1 else []
-    evaluator.plan({**dict.fromkeys(search.stages(), 1.0), **dict.fromkeys(repairs, 6.0)})
+    # Tests are simulated alone, so that settings at all points of a matrix are fewer.
+    each = search.usual_simulations(1 + len(asked)) / len(evaluator.system.points)
+    evaluator.plan({**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)})
     above = [-np.inf, *[None] * len(asked)]
     new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
     if new_car.up_to is None:

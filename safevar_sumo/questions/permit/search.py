@@ -14,6 +14,8 @@ from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSea
 from safevar_sumo.records import BoolArray, FloatArray
 
 REPAIR_STAGE = "cars with one part as new"
+USUAL_PLACES = 40
+"""Usual number of encounters at a speed, those of all tests."""
 MOST_LIMITING = 3
 """Number of failures of a car that each repair of it meets first."""
 
@@ -87,6 +89,10 @@ class PermitSearch:
     def stages(self) -> list[str]:
         """The phases of progress."""
         return [self._stage(model.fit) for model in self._models.members]
+
+    def usual_simulations(self, cars: int) -> float:
+        """The usual number of simulations of cars in a parameter set."""
+        return cars * (len(self.values) * USUAL_PLACES + self._budget)
 
     def _stage(self, fit: int) -> str:
         return f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"

@@ -35,7 +35,6 @@ from safevar_sumo.questions.models import Models, check_margin, fit_names, model
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
-from safevar_sumo.questions.repair.validation import ATTACK_STAGE, PROOF_STAGE, SEARCH_STAGE
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -45,6 +44,10 @@ from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
+ROUNDS_STAGE, USUAL_ROUNDS = "smallest change that survives", 8
+"""The phase of progress, and its usual number of rounds: each takes about the simulations of a
+falsification.
+"""
 SOBOL_VEHICLES = 256
 """Sobol points of the promise among the first counterexamples, and corners: the same points
 rounded.
@@ -62,9 +65,14 @@ REPAIRS = {
     "fits": Column(
         "-", "number of parameter sets of the vehicle model in which it holds", is_shown=False
     ),
-    "largest_change": Column("-", "largest change of a parameter, as a share of its range"),
+    "largest_change": Column(
+        "-", "largest change of a parameter, as a share of its range", is_detail=True
+    ),
     "metres_earlier": Column(
-        "m", "how much earlier a new vehicle brakes, at most over all test cases", ".2f"
+        "m",
+        "how much earlier a new vehicle brakes, at most over all test cases",
+        ".2f",
+        head="brakes earlier",
     ),
     "metres_earlier_mean": Column(
         "m", "how much earlier it brakes on average over all test cases", ".2f", is_shown=False
@@ -76,7 +84,9 @@ REPAIRS = {
         is_shown=False,
     ),
     "most_at": Column("", "the test case with the most metres", is_shown=False),
-    "largest_deceleration": Column("m/s^2", "largest deceleration of a new vehicle", ".1f"),
+    "largest_deceleration": Column(
+        "m/s^2", "largest deceleration of a new vehicle", ".1f", is_detail=True
+    ),
     "needless_braking": Column(
         "-", "number of benign scenes in which the changed driving system brakes"
     ),
@@ -85,9 +95,13 @@ REPAIRS = {
     ),
     "benign_scenes": Column("-", "number of scenes in which nobody needs to brake"),
     "proof_samples": Column(
-        "-", "number of worn vehicles sampled after the parameters were chosen"
+        "-",
+        "number of worn vehicles sampled after the parameters were chosen",
+        head="proof: vehicles sampled",
     ),
-    "proof_failures": Column("-", "number of these vehicles that are unsafe"),
+    "proof_failures": Column(
+        "-", "number of these vehicles that are unsafe", head="of them unsafe"
+    ),
     "at_most": Column(
         "-",
         f"upper bound of the share of unsafe vehicles, with {100 * CONFIDENCE:g} % confidence",
@@ -109,6 +123,7 @@ REPAIRS = {
         "simulations",
     ),
     *("rough", "fits", "fits_tried"),
+    lead="repairs",
     repairs=REPAIRS,
 )
 def repair(
@@ -176,7 +191,7 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    evaluator.plan({SEARCH_STAGE: 1, ATTACK_STAGE: 5, PROOF_STAGE: 10}, PROOF_STAGE)
+    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * (LEAST_SIMULATIONS if quick else USUAL_BUDGET)})
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -208,7 +223,8 @@ def repair(
     survivors = Survivors([], len(problems), ())
     worst = vehicles[0]
     if is_repairable.any():
-        survivors = find_survivors(problems, between, vehicles[is_repairable])
+        with evaluator.stage(ROUNDS_STAGE):
+            survivors = find_survivors(problems, between, vehicles[is_repairable])
         worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
     answer = _answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
@@ -291,24 +307,32 @@ def _answer_of(
         "fits_tried": len(models.members),
     }
     verdict = _verdict(
-        problem, models, survivors, worst=worst, repairs=repairs, not_repairable=not_repairable
+        problem, survivors, worst=worst, repairs=repairs, not_repairable=not_repairable
     )
+    tested = ""
+    if survivors.changes:
+        proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
+        tested = f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
     return Answer(
-        question="repair", study=problem.study, verdict=verdict, numbers=numbers, tables=tables
+        question="repair",
+        study=problem.study,
+        verdict=verdict,
+        numbers=numbers,
+        tables=tables,
+        tested=tested,
     )
 
 
 def _verdict(
     problem: RepairProblem,
-    models: Models,
     survivors: Survivors,
     *,
     worst: float,
     repairs: list[JsonObject],
     not_repairable: list[dict[str, float]],
 ) -> str:
-    """Whether a repair is necessary, the smallest that was found, its price and its validation, and
-    what no driving system survives.
+    """Whether a repair is necessary, the smallest that was found and its price, and what no driving
+    system survives.
     """
     unsafe = problem.unsafe
     wear = problem.promise.in_words
@@ -321,10 +345,9 @@ def _verdict(
         verdict = (
             "No repair is necessary: with the driving system of today all tested vehicles"
             f"{where} {safe} within the required range ({wear}). The worst of them {ending}."
-            f" {_proof_in_words(**_columns_of(survivors.changes[0][1]))}"
         )
     elif repairs:
-        verdict = f"{_repair_in_words(repairs, wear, safe)} {_proof_in_words(**repairs[0])}"
+        verdict = _repair_in_words(repairs, wear, safe)
     else:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         verdict = (
@@ -332,23 +355,22 @@ def _verdict(
             f" required range ({wear}) {safe}."
         )
     verdict += demand
-    verdict += _fits_in_words(models, survivors)
     if not_repairable:
         fewest = sorted(not_repairable, key=len)
         parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
         more = len(fewest) - SHOWN_LIMITS
         others = f" ({more} more are in the numbers, not_repairable)" if more > 0 else ""
         verdict += (
-            f" Even full braking at the first possible moment fails with {parts}{others}: that"
-            " needs another part, not another parameter."
+            f" Remark: Even full braking at the first possible moment fails with {parts}{others}:"
+            " that needs another part, not another parameter."
         )
     return verdict
 
 
 def _fits_in_words(models: Models, survivors: Survivors) -> str:
-    """In how many parameter sets the answer holds, in a sentence; empty with one model."""
+    """In how many parameter sets the answer holds; empty with one model."""
     count = len(models.members)
-    if count == 1 or not survivors.changes:
+    if count == 1:
         return ""
     broken = (
         f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
@@ -360,8 +382,8 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
         else ""
     )
     return (
-        f" It holds in {survivors.fits} of {count} parameter sets of the vehicle model, each with a"
-        f" search for counterexamples{broken}{left_out}."
+        f"; it holds in {survivors.fits} of {count} parameter sets of the vehicle model, each with"
+        f" a search for counterexamples{broken}{left_out}"
     )
 
 
@@ -409,25 +431,25 @@ def _repair_in_words(repairs: Sequence[JsonObject], wear: str, safe: str) -> str
         found = f"{kind} changes of the driving system that were"
     metres = repair["metres_earlier"]
     earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
-    needless = "Needless braking was not measured: the study has no benign scenes."
+    needless = "; needless braking was not measured: the study has no benign scenes"
     if repair["benign_scenes"]:
         needless = (
-            f"It brakes needlessly in {repair['needless_braking']} of {repair['benign_scenes']}"
-            f" benign scenes ({repair['needless_braking_today']} today)."
+            f", and needlessly in {repair['needless_braking']} of {repair['benign_scenes']} benign"
+            f" scenes ({repair['needless_braking_today']} today)"
         )
     return (
         f"The {found} found: {repair['change']}. Then all tested vehicles within the"
         f" required range ({wear}) {safe}. The price: a new vehicle"
-        f" {earlier}. {needless}"
+        f" {earlier}{needless}."
     )
 
 
 def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, **_: object) -> str:
-    """The validation of a change, in a sentence."""
+    """The validation of a change, without a full stop."""
     return (
         f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
         f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe: with"
-        f" {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.2g} % are."
+        f" {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.2g} % are"
     )
 
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from safevar_sumo.questions.box import Proof
+from safevar_sumo.questions.box import Proof, proof_size
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
-from safevar_sumo.questions.repair.validation import SEARCH_STAGE, find_failures, prove_change
+from safevar_sumo.questions.repair.validation import MAX_UNSAFE_SHARE, find_failures, prove_change
 from safevar_sumo.records import FloatArray
 
 MAX_ROUNDS = 30
@@ -66,21 +67,30 @@ def _survivors_in(
     proofs = dict[bytes, Proof]()
     attacks = 0
     failed_proofs = 0
-    for _ in range(MAX_ROUNDS):
-        with problems[0].evaluator.stage(SEARCH_STAGE):
-            changes = search.smallest_changes()
+    # What the attack and the proof of a change take if it survives, and the last search.
+    own = problems[0]
+    phases = own.evaluator.phases
+    points = len(own.evaluator.system.points)
+    attack = own.budget + 2 * LEAST_SIMULATIONS * len(between) / points
+    proof = proof_size(0, MAX_UNSAFE_SHARE) * min(len(problems), 2)
+    for each_round in range(1, MAX_ROUNDS + 1):
+        changes = search.smallest_changes()
         unproved = [change for change in changes if change.tobytes() not in proofs]
         if not unproved:
             return [(change, proofs[change.tobytes()]) for change in changes]
-        for change in unproved:
+        phases.begin_round(each_round, MAX_ROUNDS)
+        for later, change in zip(reversed(range(len(unproved))), unproved, strict=True):
             attacks += 1
+            left = later * (attack + proof) + len(changes) * len(search.settings)
+            phases.expect(attack + proof + left)
             failures = find_failures(problems, between, change, search.settings, attacks)
             if not failures:
-                proof, failures = prove_change(problems, change, attacks, failed_proofs)
+                phases.expect(proof + left)
+                proved, failures = prove_change(problems, change, attacks, failed_proofs)
                 if failures:
                     failed_proofs += 1
                 else:
-                    proofs[change.tobytes()] = proof
+                    proofs[change.tobytes()] = proved
             for number, settings in failures.items():
                 if number not in search.settings_of and number < len(problems):
                     search.add(number, _worst_with_fit(problems[number], vehicles))

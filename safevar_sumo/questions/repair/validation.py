@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from safevar_sumo.questions.between import PLACES
-from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.box import Judgement, Proof, prove
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.sampling import Stream
@@ -21,11 +21,7 @@ KNOWN_BETWEEN = 64
 """Number of the worst known vehicles with which an attack between the tests begins."""
 MAX_UNSAFE_SHARE = 0.001
 """Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
-SEARCH_STAGE, ATTACK_STAGE, PROOF_STAGE = (
-    "search of a change",
-    "attack on the change",
-    "proof on fresh wear",
-)
+ATTACK_STAGE, PROOF_STAGE = "attack on the change", "proof on fresh wear"
 Failures = dict[int, FloatArray]
 """Failures by the number of the problem, of one parameter set, in which they are, shape (M, n)."""
 
@@ -46,19 +42,18 @@ def find_failures(
     rng = np.random.default_rng((own.study.search.seed, number))
     judges = [partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems]
     starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
-    with own.evaluator.stage(ATTACK_STAGE, own.budget):
-        failures = falsify(own.promise, judges, starts, own.budget, rng).failures
-        for row, problem in enumerate(between, len(problems)):
-            if failures:
-                break
-            # The worst known vehicles, each at some random places on the axes.
-            vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
-            start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
-            start[:, : vehicles.shape[1]] = vehicles
-            judge = partial(problem.robustness, change, stage=ATTACK_STAGE)
-            found = falsify(problem.promise, [judge], [start], LEAST_SIMULATIONS, rng)
-            if found.failures:
-                failures = {row: found.failures[0]}
+    failures = falsify(own.promise, judges, starts, own.budget, rng).failures
+    for row, problem in enumerate(between, len(problems)):
+        if failures:
+            break
+        # The worst known vehicles, each at some random places on the axes.
+        vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
+        start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
+        start[:, : vehicles.shape[1]] = vehicles
+        judge = partial(problem.robustness, change, stage=ATTACK_STAGE)
+        found = falsify(problem.promise, [judge], [start], LEAST_SIMULATIONS, rng)
+        if found.failures:
+            failures = {row: found.failures[0]}
     return {row: np.unique(settings, axis=0) for row, settings in failures.items()}
 
 
@@ -81,17 +76,15 @@ def prove_change(
         )
 
     rng = Stream.REPAIRED_BOUND.generator(seed, number)
-    size = proof_size(attempt, MAX_UNSAFE_SHARE)
-    with own.evaluator.stage(PROOF_STAGE, size if len(problems) == 1 else 2 * size):
-        proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
-        failures = {0: unsafe} if len(unsafe) else {}
-        if failures or len(problems) == 1:
-            return proof, failures
-        settings = own.draw(proof.samples, rng)
-        fits = rng.integers(1, len(problems), size=len(settings))
-        for row in range(1, len(problems)):
-            of_fit = settings[fits == row]
-            is_unsafe = problems[row].robustness(change, of_fit, PROOF_STAGE) < 0
-            if is_unsafe.any():
-                failures[row] = of_fit[is_unsafe]
+    proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
+    failures = {0: unsafe} if len(unsafe) else {}
+    if failures or len(problems) == 1:
+        return proof, failures
+    settings = own.draw(proof.samples, rng)
+    fits = rng.integers(1, len(problems), size=len(settings))
+    for row in range(1, len(problems)):
+        of_fit = settings[fits == row]
+        is_unsafe = problems[row].robustness(change, of_fit, PROOF_STAGE) < 0
+        if is_unsafe.any():
+            failures[row] = of_fit[is_unsafe]
     return proof, failures

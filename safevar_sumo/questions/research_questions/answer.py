@@ -72,15 +72,13 @@ def tables(
     algorithm: str = "",
     alpha: Fraction = ALPHA,
     causes: Annotated[int, Range(0, 100_000)] = 0,
-    all: bool = False,
     figures: Path | None = None,
     jobs: Jobs = None,
 ) -> Answer:
     """Answer the research questions of the paper from results, one for each case, as tables and
     figures.
 
-    Readers see RQ1 and RQ2 over runs, collisions and causes; JSON has every table, and `--table`
-    prints any.
+    RQ1 over runs leads; `--details` and JSON have every table, and `--table` prints any.
 
     Parameters
     ----------
@@ -92,8 +90,6 @@ def tables(
     causes
         Simulate the minimal causes of up to this many unsafe solutions of each run, and compare
         their numbers.
-    all
-        Show every table.
     figures
         Draw every figure into this directory, as png and pdf.
     jobs
@@ -118,12 +114,8 @@ def tables(
     words += ["--alpha", str(alpha)] if alpha != ALPHA else []
     words += ["--causes", str(causes)] if causes else []
     main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
-    folded = (
-        ()
-        if all
-        else tuple(name for name in answer.tables if name not in (*main_tables, "remarks"))
-    )
-    return replace(answer, command=" ".join(words), folded=folded)
+    lead = next((name for name in main_tables if name in answer.tables), "")
+    return replace(answer, command=" ".join(words), lead=lead)
 
 
 def figures(*results: Results | str | Path) -> dict[str, Figure]:

@@ -13,7 +13,6 @@ from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import limit_criterion
-from safevar_sumo.questions.tolerance.alone import ALONE_STAGE
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
@@ -22,13 +21,11 @@ from safevar_sumo.questions.tolerance.limits import (
     OF_BOX,
     POINTS,
     answer_limits,
+    phases_of,
 )
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
-from safevar_sumo.questions.tolerance.scans import SCAN_STAGE
-from safevar_sumo.questions.tolerance.search import SEARCH_STAGE
 from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
-from safevar_sumo.questions.tolerance.validation import VALIDATION_STAGE
-from safevar_sumo.questions.tolerance.wider import WIDER, WIDER_STAGE
+from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -38,6 +35,8 @@ if TYPE_CHECKING:
 @question
 @contents(
     *("unsafe", "margin", "kept", "rough", "scope", "up_to", "boxes", *OF_BOX),
+    lead="limits",
+    next="report",
     limits=LIMITS,
     intervals=INTERVALS,
     uncertainty=UNCERTAINTY,
@@ -108,10 +107,11 @@ def tolerance(
     if up_to is not None:
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
-    phases = {SCAN_STAGE: 1.0, ALONE_STAGE: 3.0, SEARCH_STAGE: 2.0, VALIDATION_STAGE: 12.0}
-    phases |= {WIDER_STAGE: 4.0} if study.wider else {}
-    evaluator.plan(phases, VALIDATION_STAGE)
+    budget = min(attack, LEAST_SIMULATIONS) if quick else attack
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
+    smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
+    phases = phases_of(evaluator, len(columns), budget, 0 if quick else fits)
+    evaluator.plan({name: (1 + len(smaller)) * cost for name, cost in phases.items()})
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
@@ -130,11 +130,11 @@ def tolerance(
         criterion=unsafe,
         margin=margin,
         fits=0 if quick else fits,
-        budget=min(attack, LEAST_SIMULATIONS) if quick else attack,
+        budget=budget,
         is_quick=quick,
         at_tests=at_tests,
         up_to=up_to,
         left_out=names_left_out(whole.study, study),
-        smaller=[*map(whole.for_study, smaller_cuts(whole.study, up_to))],
+        smaller=smaller,
     )
     return answer_limits(asked)

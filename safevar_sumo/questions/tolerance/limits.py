@@ -14,14 +14,15 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
-from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import USUAL_BUDGET
+from safevar_sumo.questions.falsify import USUAL_BUDGET, enough
+from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.tolerance.alone import ALONE_STAGE, VALUES, AloneLimit, AloneSearch
+from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.rows import (
     CHARACTERISTIC,
@@ -37,14 +38,23 @@ from safevar_sumo.questions.tolerance.scans import (
     OneAtATimeScan,
     scan,
 )
-from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether
-from safevar_sumo.questions.tolerance.wider import WIDER, wider_rows
+from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether, budget_of_set
+from safevar_sumo.questions.tolerance.wider import (
+    SLOWNESS,
+    WIDER,
+    WIDER_STAGE,
+    usual_settings,
+    wider_rows,
+)
 from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences, why_not_kept
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles.region import REJECTIONS
 
+OWN_SET_STAGE = "joint limits with the study's own parameter set"
+OTHER_SETS_STAGE = "limits in each further parameter set"
+"""Phases of progress; the first has a round for each box, the second one for each set."""
 LIMITS_TITLE = "Joint limits, and limits of each characteristic alone, rounded to the safe side"
 INTERVALS: Columns = {
     **CHARACTERISTIC,
@@ -80,6 +90,10 @@ OF_BOX = (
     "least_attacked",
 )
 """Numbers about joint limits."""
+USUAL_BOXES = 80
+"""Usual number of boxes of the study's own parameter set: each takes the simulations of a
+falsification, at the worst points of a matrix alone.
+"""
 MAX_REFUTED = 4
 """Largest number of searches for joint limits, each without what refuted the one before."""
 NEAREST: Columns = {
@@ -117,6 +131,24 @@ class FoundLimits(NamedTuple):
         return all(one.safe is not None for one in self.scans)
 
 
+def phases_of(
+    evaluator: Evaluator, columns: int, budget: int, fits: int | None
+) -> dict[str, float]:
+    """The phases of progress, each with the number of settings that it usually simulates."""
+    study = evaluator.study
+    points = len(evaluator.system.points)
+    phases = {SCAN_STAGE: float(SCAN_VALUES * columns)}
+    if is_rated(study):
+        return phases
+    sets = len(studies_of_sets(study)[1:fits]) if study.spread and fits != 0 else 0
+    own = USUAL_BOXES * enough(max(budget, 1)) / points
+    of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
+    phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
+    if study.wider and budget:
+        phases[WIDER_STAGE] = SLOWNESS * usual_settings(evaluator, budget, 1 + sets)
+    return phases
+
+
 def find_nested_limits(asked: Asked) -> FoundLimits:
     """Search the limits that a question asks for: those up to a value within those up to each
     smaller one at which the original vehicle is safe.
@@ -143,8 +175,7 @@ def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
     is_safe = not asked.unsafe.of(asked.original)[0]
     is_scanned = is_safe or not is_sought
     within = None if is_scanned else [(members.original[column],) * 2 for column in asked.columns]
-    with evaluator.stage(SCAN_STAGE, SCAN_VALUES * len(asked.columns)):
-        scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_scanned else 1)
+    scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_scanned else 1)
     models = Models.own_alone(evaluator, asked.unsafe)
     if is_sought and is_safe:
         models = models_of(evaluator, asked.unsafe, asked.fits)
@@ -184,22 +215,24 @@ def _find_together(
     }
     joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget, outer)
     known = np.concatenate([asked.unsafe_solutions, _unsafe_alone(asked, scans)])
-    encounters = 1 + len(asked.evaluator.critical_encounters)
-    for model in models.members:
-        with asked.evaluator.stage(ALONE_STAGE, VALUES * len(asked.columns) * encounters):
+    phases = asked.evaluator.phases
+    for number, model in enumerate(models.members):
+        with phases.stage(OTHER_SETS_STAGE if number else OWN_SET_STAGE):
+            if number:
+                phases.begin_round(number, len(models.members) - 1, is_known=True)
             search_alone.add(model, tests[model.fit])
             search_alone.attack(model, asked.budget)
-        for _ in range(MAX_REFUTED):
-            if model.fit == 0:
-                joint.find(scans, np.concatenate([known, search_alone.failures]))
+            for _ in range(MAX_REFUTED):
+                if model.fit == 0:
+                    joint.find(scans, np.concatenate([known, search_alone.failures]))
+                else:
+                    joint.cut(model, search_alone.failures)
+                search_alone.meet(joint.met, joint.found.failures_alone)
+                box = joint.found.box
+                if box is None or not box.holds(search_alone.failures).any():
+                    break
             else:
-                joint.cut(model, search_alone.failures)
-            search_alone.meet(joint.met, joint.found.failures_alone)
-            box = joint.found.box
-            if box is None or not box.holds(search_alone.failures).any():
-                break
-        else:
-            joint.give_up()
+                joint.give_up()
     return joint.found
 
 
@@ -264,10 +297,19 @@ def _tables(
 ) -> dict[str, pd.DataFrame]:
     """The tables of an answer, the limits first; those without rows are left out."""
     scans = found.scans
-    limits = tabulate(LIMITS_TITLE, LIMITS, rows)
-    limits.attrs["bars"] = bars_of(
-        limits, [(one.characteristic.lower, one.characteristic.upper) for one in scans]
-    )
+    # Joint limits lead, without those of the whole domain; else those of each alone.
+    is_joint = found.together is not None and found.together.box is not None
+    end = LIMITS["alone_low"]
+    assert isinstance(end, Column)
+    columns = {**LIMITS, "alone_low": end._replace(is_detail=is_joint)}
+    found_beyond = [row[[*LIMITS].index("fails_first")] for row in rows]
+    words = {text: text.removeprefix("the car ") for text in found_beyond if text}
+    limits = tabulate(LIMITS_TITLE, columns, rows, words=words)
+    domains = np.array([(one.characteristic.lower, one.characteristic.upper) for one in scans])
+    is_open = (limits[["together_low", "together_high"]].to_numpy(float) == domains).all(axis=1)
+    if not is_open.all():
+        limits.attrs["lead_rows"] = np.flatnonzero(~is_open).tolist()
+    limits.attrs["bars"] = bars_of(limits, domains.tolist())
     intervals = tabulate(
         "Safe values of each characteristic if it alone changes", INTERVALS, _intervals(scans)
     )

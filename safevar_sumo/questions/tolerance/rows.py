@@ -37,7 +37,11 @@ LIMITS: Columns = {
                 "that is safe with all others as in the original, in every parameter set",
                 ALONE,
             ),
-            ("together", "that is safe with all others within theirs, in every parameter set", ""),
+            (
+                "together",
+                "that is safe with all others within theirs, in every parameter set",
+                "limit, all together",
+            ),
             ("specified", "that the user's limit allows", ""),
         )
         for end in ("low", "high")
@@ -46,9 +50,13 @@ LIMITS: Columns = {
         "whether every vehicle within the specified limits is safe in every parameter set; empty"
         " without a specified limit"
     ),
-    "fails_first": Column("", "what fails first beyond the limit", is_shown=False),
+    "fails_first": Column("", "what fails first beyond the limit", head="just beyond it"),
     "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
-    "sentence": "sentence for a maintenance manual; all these limits hold at the same time",
+    "sentence": Column(
+        "",
+        "sentence for a maintenance manual; all these limits hold at the same time",
+        is_shown=False,
+    ),
 }
 UNCERTAINTY: Columns = {
     **CHARACTERISTIC,

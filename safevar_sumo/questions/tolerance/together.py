@@ -11,13 +11,12 @@ import numpy as np
 
 from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, enough
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
-from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
+from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.validation import (
     KNOWN_BETWEEN,
     Failures,
@@ -268,10 +267,11 @@ class JointSearch:
                 *(row[np.newaxis] for row in self._outer.beyond.values()),
             ]
             search.unsafe_settings = np.concatenate(known)
-        boxes = _Boxes(search, _start_of(search, self._columns, scans), self.own.evaluator)
+        boxes = _Boxes(search, _start_of(search, self._columns, scans))
         validator = self._validator(self.own, self._budget)
         self._validators = [validator]
         for number in range(1, MAX_BOXES + 1):
+            self.own.evaluator.phases.begin_round(number, MAX_BOXES)
             box = boxes.next(number)
             if box is None:
                 break
@@ -325,9 +325,8 @@ class JointSearch:
                 )
                 break
             met += [failures.model for failures in validation.failures]
-            with self.own.evaluator.stage(SEARCH_STAGE):
-                for failures, causes in _learn(search, validation):
-                    search.approach(causes, failures.model)
+            for failures, causes in _learn(search, validation):
+                search.approach(causes, failures.model)
             if validator not in self._validators:
                 self._validators.append(validator)
         else:
@@ -360,7 +359,7 @@ class JointSearch:
 
     def _validator(self, model: Model, budget: int) -> Validator:
         budgets = budget, budget_of_set(budget) if model.fit == 0 else budget
-        return Validator(model, self._tests[model.fit], budgets, self.own.evaluator)
+        return Validator(model, self._tests[model.fit], budgets)
 
     def _note(self, models: Sequence[Model]) -> None:
         """Note what was met, and what is beyond the box."""
@@ -405,12 +404,11 @@ class _Boxes:
         The validation of the largest box that passed.
     """
 
-    def __init__(self, search: BoxSearch, start: FloatArray, evaluator: Evaluator) -> None:
+    def __init__(self, search: BoxSearch, start: FloatArray) -> None:
         self.search = search
         self.extension = Extension(search)
         self.passed: Validation | None = None
         self._start = start
-        self._evaluator = evaluator
         self._outer: Box | None = None
         self._growths = MAX_GROWTHS
         self._failed = 0
@@ -422,8 +420,7 @@ class _Boxes:
         """The next box; None if no search finds one."""
         is_explored = self._growths == MAX_GROWTHS and number <= EXPLORED
         if self._outer is None or is_explored:
-            with self._evaluator.stage(SEARCH_STAGE):
-                sides = self.search.best(self._start)
+            sides = self.search.best(self._start)
             if sides is None:
                 return None
             self._outer = self.search.printed(sides)
@@ -440,9 +437,8 @@ class _Boxes:
     def refuse(self, validation: Validation) -> None:
         """Take failures, and the models in which they are, into the search."""
         search = self.search
-        with self._evaluator.stage(SEARCH_STAGE):
-            for _ in _learn(search, validation):
-                pass
+        for _ in _learn(search, validation):
+            pass
         if self.passed and len(search.unsafe_inside(search.sides_of(self.passed.box))):
             self.passed = None
         self._failed += 1
@@ -454,8 +450,7 @@ class _Boxes:
         self._failed = 0
         if self._growths and may_grow:
             self._growths -= 1
-            with self._evaluator.stage(SEARCH_STAGE):
-                self._outer = self.extension.of(validation.box)
+            self._outer = self.extension.of(validation.box)
 
 
 def _start_of(

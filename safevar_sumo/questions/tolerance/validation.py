@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.between import MovingTest, with_tests
-from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, proof_size, prove
-from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
 from safevar_sumo.questions.falsify import Falsification, falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.narrowing import NarrowedJudge
@@ -80,20 +79,13 @@ class Validation(NamedTuple):
 class Validator:
     """Validates boxes in one model, whose matrix gains the encounters that fail between its tests.
     `budget` simulations falsify each box at the tests' points, and as many as `budget_between` in
-    each of the tests that move; progress is shown by the evaluator of the question.
+    each of the tests that move.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        tests: Sequence[MovingTest],
-        budgets: tuple[int, int],
-        evaluator: Evaluator,
-    ) -> None:
+    def __init__(self, model: Model, tests: Sequence[MovingTest], budgets: tuple[int, int]) -> None:
         self.model = model
         self.tests = tests
         self.budget, self.budget_between = budgets
-        self.evaluator = evaluator
         self.seed = model.evaluator.study.search.seed
         self._judge = NarrowedJudge(model, VALIDATION_STAGE)
         self._proofs = 0
@@ -108,17 +100,15 @@ class Validator:
         corners = self._corners(box, attempt)
         first = corners[:FIRST_CORNERS]
         is_searched = len(box.region.characteristics.scenario) > 0
-        total = self.budget + len(corners if is_searched else first)
-        with self.evaluator.stage(VALIDATION_STAGE, total):
-            validation, robustness = self._test(Validation(box), first)
-            if validation.failures or not self.budget:
-                return validation
-            worst = first[np.argsort(robustness, kind="stable")]
-            rng = Stream.JOINT_LIMITS.generator(self.seed, attempt, self.model.fit)
-            validation = self._search(validation, worst[:KNOWN_BETWEEN], worst[:KNOWN], rng)
-            if is_searched and not validation.failures:
-                validation, _ = self._test(validation, corners)
+        validation, robustness = self._test(Validation(box), first)
+        if validation.failures or not self.budget:
             return validation
+        worst = first[np.argsort(robustness, kind="stable")]
+        rng = Stream.JOINT_LIMITS.generator(self.seed, attempt, self.model.fit)
+        validation = self._search(validation, worst[:KNOWN_BETWEEN], worst[:KNOWN], rng)
+        if is_searched and not validation.failures:
+            validation, _ = self._test(validation, corners)
+        return validation
 
     def complete(self, validation: Validation, attempt: int, confirmations: int) -> Validation:
         """Test a box that is to be printed with all that it has to pass beside `validate`; the
@@ -130,20 +120,18 @@ class Validator:
             Stream.VALIDATION.generator(self.seed, attempt, number, self.model.fit)
             for number in range(confirmations if self.budget else 0)
         ]
-        total = len(corners) + confirmations * self.budget
-        with self.evaluator.stage(VALIDATION_STAGE, total):
-            validation, robustness = self._test(validation, corners[:MAX_CORNERS])
-            worst = corners[np.argsort(robustness, kind="stable")]
-            # Further searches for counterexamples.
-            for rng in rngs:
-                if not validation.failures:
-                    starts = box.with_ends(STARTS, rng)
-                    known = np.concatenate([worst[: KNOWN_BETWEEN // 2], starts[:KNOWN]])
-                    validation = self._search(validation, known, starts, rng)
-            # Of a study that searches its scenario there are more corners.
+        validation, robustness = self._test(validation, corners[:MAX_CORNERS])
+        worst = corners[np.argsort(robustness, kind="stable")]
+        # Further searches for counterexamples.
+        for rng in rngs:
             if not validation.failures:
-                validation, _ = self._test(validation, corners[MAX_CORNERS:])
-            return validation
+                starts = box.with_ends(STARTS, rng)
+                known = np.concatenate([worst[: KNOWN_BETWEEN // 2], starts[:KNOWN]])
+                validation = self._search(validation, known, starts, rng)
+        # Of a study that searches its scenario there are more corners.
+        if not validation.failures:
+            validation, _ = self._test(validation, corners[MAX_CORNERS:])
+        return validation
 
     def recheck(self, box: Box, attempt: int) -> Validation:
         """Test corners of a box that is within one that passed."""
@@ -160,13 +148,9 @@ class Validator:
             return Judgement(model.robustness_by(evaluations) < 0, failed, ~evaluations.infeasible)
 
         rng = Stream.CONFIDENCE_BOUND.generator(self.seed, attempt)
-        with self.evaluator.stage(VALIDATION_STAGE, proof_size(self._proofs, MAX_UNSAFE_SHARE)):
-            proof, unsafe = prove(
-                lambda number: validation.box.draw(number, rng),
-                judge,
-                MAX_UNSAFE_SHARE,
-                self._proofs,
-            )
+        proof, unsafe = prove(
+            lambda number: validation.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs
+        )
         return validation._replace(proof=proof, failures=self._failures(unsafe))
 
     def _corners(self, box: Box, attempt: int) -> FloatArray:

@@ -61,8 +61,8 @@ def verdict_sentences(
         yield from _box_in_words(models, together, asked)
 
     # What is unsafe elsewhere.
-    for name, scope, _, verdict, _ in wider:
-        yield f"In the wider scope of {name} ({scope}) {verdict}"
+    for name, _, _, verdict, _ in wider:
+        yield f"In the wider scope of {name} {verdict}"
     names = [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]
     if len(names) > 1:
         yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
@@ -148,7 +148,8 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
         described = describe(model, {"": model.evaluator.characteristics.original})
         words = described[""].words if described else f"parameter set {model.fit} is unsafe"
         yield f"With the original vehicle itself {words}: there no limit is claimed."
-    yield from one_set_in_words(models.members, models.left_out)
+    if not asked.is_quick:
+        yield from one_set_in_words(models.members, models.left_out)
     if names := _without_room(models, together):
         yield f"No room was found for {join_phrases(names)}: they stay as in the original."
 
