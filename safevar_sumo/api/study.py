@@ -73,7 +73,6 @@ ALGORITHMS: Columns = {
     "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
     "solutions": "solutions of finished runs",
 }
-NO_CHANGE = "no change is needed."
 CHANGES: Columns = {
     "characteristic": "characteristic that is changed",
     "unit": "unit of its values",
@@ -226,9 +225,11 @@ def _found(
             "a smaller scenario.margin, or original values of scenario.search with which the"
             " original vehicle is safe, as questions demand"
         )
-    sentence, changes = _verdict(results, case, jobs)
-    if sentence.endswith(NO_CHANGE):
-        following = ""
+    changes = list[tuple[Any, ...]]()
+    if breach := _breach_of_original(case):
+        sentence, following = f"{breach}: no change is needed.", ""
+    else:
+        sentence, changes = _verdict(results, case, jobs)
     tables = answer.tables
     if changes:
         frame = tabulate("The fewest unsafe changes that were found", CHANGES, changes)
@@ -308,21 +309,25 @@ def _measured(
     )
 
 
+def _breach_of_original(case: Case) -> str:
+    """How the original vehicle is unsafe itself, in words; empty if it is not, or if it depends on
+    the encounter.
+    """
+    system = assemble(case.study)
+    if system.rater or case.characteristics.scenario:
+        return ""
+    original = drive_and_score(system, case.characteristics.original_settings)
+    if not case.unsafe.of(original)[0]:
+        return ""
+    return f"The original vehicle itself {case.unsafe.breach_in_words(original)}"
+
+
 def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[tuple[Any, ...]]]:
     """How many solutions of a case of the results are unsafe, and how few changes are enough; and
     the rows of `CHANGES` of a vehicle with these.
     """
-    members = case.characteristics
-
-    # An original vehicle that is unsafe itself needs no change.
-    system = assemble(case.study)
-    if not system.rater and not members.scenario:
-        original = drive_and_score(system, members.original_settings)
-        if case.unsafe.of(original)[0]:
-            breach = case.unsafe.breach_in_words(original)
-            return f"The original vehicle itself {breach}: {NO_CHANGE}", []
-
     # The solution with the fewest changes, of which as many as possible are undone.
+    members = case.characteristics
     solutions = case.solutions.drop_duplicates([*members.names])
     if solutions.empty:
         return f"The search found no solution: {case.why_no_solution}.", []

@@ -105,6 +105,8 @@ def contents(
     columns of their tables, so that its command refuses others before anything is computed; the
     table that leads them, and the question that comes next. `driven` is among the numbers.
     """
+    if lead:
+        check_name("contents", f"lead = {lead!r} is no table that it declares", lead, tables)
 
     def declare(function: AnswerFunction) -> AnswerFunction:
         @wraps(function)
@@ -146,9 +148,8 @@ class Answer:
         Sentences that say which of the user's limits are not kept; the command then ends with exit
         code 3.
     lead
-        The table of the one screen, by default the first; none if no table has this name. Its
-        attribute `lead_rows` holds the places of the rows that it shows, the most important first;
-        by default all.
+        The table of the one screen, by default the first; None for none. Its attribute `lead_rows`
+        holds the places of the rows that it shows, the most important first; by default all.
     folded
         Names of tables that readers see only by name; JSON and CSV have all.
     is_whole
@@ -169,7 +170,7 @@ class Answer:
     numbers: JsonObject
     tables: dict[str, pd.DataFrame]
     failures: tuple[str, ...] = ()
-    lead: str = ""
+    lead: str | None = ""
     folded: tuple[str, ...] = ()
     is_whole: bool = False
     next: str = ""

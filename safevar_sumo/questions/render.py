@@ -26,6 +26,7 @@ from safevar_sumo.questions.tables import (
     reader_tables,
     terminal_tables,
 )
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.terminal import print_text
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ CODE = re.compile("`([^`<>]+)`")
 """What a text quotes as code."""
 SCOPE = "Scope: "
 NOTES = (
-    *(SCOPE, "Remark: ", "Changed: ", "Not simulated: "),
-    *("Only encounters count", "Only vehicles that satisfy", "Left out", "Counted as unsafe: "),
+    *(SCOPE, "Remark: ", "Changed: ", "Criterion: ", "Not simulated: ", "Counted as unsafe: "),
+    *("Only encounters count", "Only vehicles that satisfy", "Left out"),
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200
@@ -59,6 +60,8 @@ class Screen(NamedTuple):
     ----------
     sentences
         The first sentences of the verdict.
+    unsaid
+        Number of its further sentences.
     lead
         The one table; empty if there is none.
     notes
@@ -68,6 +71,7 @@ class Screen(NamedTuple):
     """
 
     sentences: list[str]
+    unsaid: int
     lead: pd.DataFrame
     notes: list[str]
     others: dict[str, pd.DataFrame]
@@ -84,26 +88,31 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
         else:
             plain_sentences.append(sentence)
     if answer.tested:
-        notes.insert(1, f"Tested: {SENTENCE_END.split(answer.tested)[0]}")
+        first, *further = SENTENCE_END.split(answer.tested)
+        notes.insert(1, f"Tested: {first}")
+        notes += [sentence for sentence in further if sentence.startswith(NOTES)]
 
     # The lead, and what it does not show.
     lead = pd.DataFrame()
     others = dict(answer.tables)
-    name = answer.lead or next(iter(others), "")
+    name = next(iter(others), "") if answer.lead == "" else answer.lead or ""
     if name not in answer.folded and len(others.get(name, ())):
         whole = next(reader_tables(name, others.pop(name)))[1]
         lead = lead_table(whole, max_rows)
         cut = len(whole.attrs.get("lead_rows", whole)) - len(lead)
         if cut > 0:
             notes.insert(0, f"{cut} more rows: --details.")
-    return Screen(plain_sentences[:MAX_SENTENCES], lead, notes, others)
+    unsaid = max(len(plain_sentences) - MAX_SENTENCES, 0)
+    return Screen(plain_sentences[:MAX_SENTENCES], unsaid, lead, notes, others)
 
 
 def _more(answer: Answer, screen: Screen) -> str:
     """The last line: what else there is, and the next question."""
-    names = ", ".join(name for name, frame in screen.others.items() if len(frame))
+    names = [name for name, frame in screen.others.items() if len(frame)]
+    unsaid = number_of(screen.unsaid, "more sentence") if screen.unsaid else ""
+    behind = ", ".join(filter(None, [unsaid, *names]))
     following = f" Next: {answer.next}" if answer.next and answer.numbers.get("driven") else ""
-    return f"More: --details{f' ({names})' if names else ''}, --json.{following}"
+    return f"More: --details{f' ({behind})' if behind else ''}, --json.{following}"
 
 
 def print_answer(answer: Answer, console: Console, *, details: bool) -> None:

@@ -194,9 +194,9 @@ def _boxes(
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
         return _find_boxes(settings, is_unsafe, characteristics), ""
     remark = (
-        f" Regions are found in {len(settings):,} of these vehicles, of which"
-        f" {int(is_unsafe.sum()):,} are unsafe; at least {MIN_SETTINGS} unsafe and {MIN_SETTINGS}"
-        " safe ones are needed. Ask for more with --samples."
+        f" A region cannot be found: of the {len(settings):,} vehicles that are used for this,"
+        f" {int(is_unsafe.sum()):,} are unsafe, and at least {MIN_SETTINGS} unsafe and"
+        f" {MIN_SETTINGS} safe ones are necessary. Ask for more with --samples."
     )
     return [], remark
 

@@ -73,7 +73,6 @@ GENERAL_LIMITS = (
         " says how far the models agree with them."
     ),
 )
-NO_TABLE = "no table"
 CHARACTERISTICS = {
     "characteristic": Column("", "characteristic of the vehicle, or of its encounter"),
     "unit": Column("", "unit of its values"),
@@ -214,7 +213,7 @@ def tested(study: ReportedStudy) -> Answer:
             "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
             "remarks": _remarks(remarks),
         },
-        lead=NO_TABLE,
+        lead=None,
     )
 
 

@@ -133,6 +133,9 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
     assert output.startswith("About ")
     for word in ("nsga2, rs, safe_fuzzer", "900"):
         assert word in output
+    numbers = json_of("study", "small.toml", "--dry-run")["numbers"]
+    assert numbers["seconds"] > 0
+    assert numbers["evaluations_per_second"] > 0
     assert not Path("results").exists()
 
 

@@ -20,7 +20,7 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
-from safevar_sumo.questions.answer import Answer, Column, Wide, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, Column, Wide, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.words import change_texts
@@ -99,6 +99,25 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     assert f"{last} " in text
     assert f"│ {last + 1} " not in text
     assert "same" in answer.render("text", details=True)
+
+
+def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_valid() -> None:
+    sentences = [f"Sentence {number} is here." for number in range(5)]
+    valid = "Only vehicles that satisfy the study's constraints count: a below b."
+    tested = f"All corners. How they were chosen. {valid}"
+    text = replace(ANSWER, verdict=" ".join(sentences), tested=tested).render("text")
+    assert "More: --details (2 more sentences" in text
+    assert [one in text for one in sentences] == [True, True, True, False, False]
+    assert valid in text
+    assert "How they were chosen" not in text
+
+
+def test_a_lead_is_a_declared_table_or_none() -> None:
+    with pytest.raises(sv.InputError, match="did you mean 'parts'"):
+        contents("number", lead="part", parts=["name"])
+    assert "┏" in ANSWER.render("text")
+    assert "┏" not in replace(ANSWER, lead=None).render("text")
+    assert "┏" in replace(ANSWER, lead=None).render("text", details=True)
 
 
 def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:

@@ -44,6 +44,7 @@ def printed(typed: str) -> str:
 def test_an_answer_is_one_screen(typed: str) -> None:
     text = printed(typed)
     if not text:
+        assert typed not in OTHERS
         return
     lines = [part for line in text.splitlines() for part in textwrap.wrap(line, WIDTH) or [""]]
     assert len(lines) <= MAX_LINES, text

@@ -196,7 +196,7 @@ def answer_questions(
     return Answer(
         question="tables",
         study=cases[0].study,
-        verdict=" ".join(map(_verdict, cases)),
+        verdict=" ".join([*map(_verdict, cases), *_read_first(cases)]),
         numbers={
             "cases": len(cases),
             "solutions": sum(len(case.solutions) for case in cases),
@@ -205,6 +205,12 @@ def answer_questions(
         tables=frames,
         draw=lambda answer: draw_change_counts(cases),
     )
+
+
+def _read_first(cases: Sequence[Case]) -> Iterator[str]:
+    """Which runs and settings are in no table."""
+    for case in cases:
+        yield from (f"Remark: {remark}" for remark in case.remarks)
 
 
 def _verdict(case: Case) -> str:

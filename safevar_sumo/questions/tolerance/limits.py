@@ -55,7 +55,7 @@ from safevar_sumo.vehicles.region import REJECTIONS
 OWN_SET_STAGE = "joint limits with the study's own parameter set"
 OTHER_SETS_STAGE = "limits in each further parameter set"
 """Phases of progress; the first has a round for each box, the second one for each set."""
-LIMITS_TITLE = "Joint limits, and limits of each characteristic alone, rounded to the safe side"
+LIMITS_TITLE = "Limits, rounded to the safe side"
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",

@@ -32,7 +32,9 @@ USUAL_ATTACKS, NEW_SETTINGS = 5, 384
 each begins in a parameter set.
 """
 SLOWNESS = 2.5
-"""How much longer a simulation takes there: fewer of them are simulated at a time."""
+"""How much longer a simulation takes there, as benchmarks/progress.py showed for `wear`: fewer of
+them are simulated at a time.
+"""
 WIDER: Columns = {
     "study": "the wider study",
     "scope": Column("", "what it covers", is_shown=False),
