@@ -93,7 +93,9 @@ def trace_frame(
         }
     )
 
-    # What its driving system saw at the same times.
+    # What its driving system saw at the same times; one of a simulator of the user's own is inside.
+    if not observations:
+        return frame.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")
     observed = pd.DataFrame(
         [
             {

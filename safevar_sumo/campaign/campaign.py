@@ -282,6 +282,7 @@ def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     if name not in ENGINES:
         raise InputError("engine", repr(name), one_of(ENGINES))
     if name == Engine.LIBSUMO:
+        system.refuse_simulator("it takes no other engine")
         return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)
     return (

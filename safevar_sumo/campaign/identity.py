@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from safevar_sumo.errors import InputError
@@ -14,6 +15,7 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Files, code_files, digests, digests_by_name, files_in
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS, manifest_differences, manifest_of
+from safevar_sumo.scenarios import Simulator
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
 from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
@@ -30,7 +32,27 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     the inputs.
     """
     files = files_of(study, system, used)
-    return manifest_of(study, {"files": files, "results": RESULTS, "platform": PLATFORM})
+    identity = {"files": files, "results": RESULTS, "platform": PLATFORM}
+    return manifest_of(study, {**identity, "versions": _simulator_versions(study, system)})
+
+
+def _simulator_versions(study: Study, system: System) -> dict[str, str]:
+    """Versions of the user's simulators, and of the distributions that they name."""
+    versions = {}
+    for scenario in (point.scenario for point in system.points):
+        if not isinstance(scenario, Simulator):
+            continue
+        if scenario.version:
+            versions[f"version of {type(scenario).__name__}"] = str(scenario.version)
+        for name in scenario.LIBRARIES:
+            try:
+                versions[name] = version(name)
+            except PackageNotFoundError:
+                problem = f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}"
+                raise InputError(
+                    study.source, problem, "names of installed distributions"
+                ) from None
+    return versions
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:
@@ -49,7 +71,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     code and FMUs, the data files that it names, and those of the names `used` that exist.
     """
     places = study.origin.places
-    networks = {point.scenario.network for point in system.points}
+    networks = {point.scenario.network for point in system.points} - {""}
     opened = [open_network(network) for network in sorted(networks)]
     network_files = {network.path(name) for network in opened for name, _ in network.digests}
     fmus = {Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)}

@@ -29,6 +29,7 @@ from safevar_sumo.errors import (
 )
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins.contract import (
+    ABSTRACT,
     UserCode,
     checked_class,
     contract_of,
@@ -129,7 +130,8 @@ class Lookup:
         self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = ""
     ) -> Member:
         """A class by name; a user's class must meet the contract of the first base that it derives
-        from, else of that which it meets, else of the last one.
+        from, else of that which it meets, else of that of which it has an abstract method, else of
+        the last one.
 
         `otherwise` is what the study may give in place of a class, for the error.
         """
@@ -139,9 +141,8 @@ class Lookup:
         if member.code is None:
             return member
         base = next((base for base in bases if _derives(member.target, base)), None)
-        base = base or next(
-            (base for base in bases if not violation(member.target, base)), bases[-1]
-        )
+        base = base or next((base for base in bases if not violation(member.target, base)), None)
+        base = base or next((base for base in bases if _has_some(member.target, base)), bases[-1])
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(
@@ -207,6 +208,12 @@ class Lookup:
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             this_process.modules |= sys.modules.keys() - modules_before
+
+
+def _has_some(candidate: Any, base: type) -> bool:
+    """Whether a class has a method that is abstract in a base."""
+    abstract = (name for name, method in vars(base).items() if hasattr(method, ABSTRACT))
+    return any(hasattr(candidate, name) for name in abstract)
 
 
 def _derives(candidate: Any, base: type) -> bool:

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.tables import Column, Columns, with_interval
@@ -80,6 +81,13 @@ COLUMNS: Columns = {
 """The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for
 the finite population), the share itself if all collisions were simulated.
 """
+
+
+def has_reference_drivers(evaluator: Evaluator) -> bool:
+    """Whether reference drivers can drive instead: not in a simulator of the user's own, which
+    drives itself, nor in a rating, where every vehicle collides in some cell.
+    """
+    return not (is_rated(evaluator.study) or evaluator.system.has_simulator)
 
 
 def assess_sample(

@@ -118,6 +118,7 @@ def rating(
         further.
     """
     # The vehicles, in a study that is rated.
+    evaluator.system.refuse_simulator("SUMO drives the tests of a rating")
     study = evaluator.study
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}

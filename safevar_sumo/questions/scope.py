@@ -11,7 +11,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Scenario, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Scenario, Simulator, searchable_in
 from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
 from safevar_sumo.sumo.system import assemble
 
@@ -88,6 +88,8 @@ def scope_of(study: Study, *, between: bool = True) -> str:
         ]
         tests = f" ({join_phrases(names)})" if names else ""
         phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
+    if isinstance(points[0].scenario, Simulator):  # in a weather of its own
+        return "; ".join(phrases)
     weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
     return f"{'; '.join(phrases)}; {' or '.join(weathers)}"
 

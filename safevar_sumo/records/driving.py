@@ -4,7 +4,7 @@ encounters, contacts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cached_property
@@ -254,6 +254,8 @@ class SimulationRuns:
     time to collision at which the system first warned its driver, NaN if it never did [s].
     `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
     `allowed_impact_speed` is the relative speed up to which the test case allows an impact [m/s].
+    `stated` are metrics that a simulator of the user's own states or leaves undefined, by name: in
+    which runs, shape (N,), and their values there.
     """
 
     trace: Trace
@@ -266,6 +268,7 @@ class SimulationRuns:
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
     centre_to_centre: bool = False
     allowed_impact_speed: FloatArray = field(default_factory=lambda: ZERO)
+    stated: Mapping[str, tuple[BoolArray, FloatArray]] = field(default_factory=dict)
 
     @cached_property
     def is_approach(self) -> BoolArray:
@@ -303,6 +306,10 @@ class SimulationRuns:
             warning_ttc=select(self.warning_ttc),
             centre_to_centre=self.centre_to_centre,
             allowed_impact_speed=select(self.allowed_impact_speed),
+            stated={
+                name: (holds[vehicles], values[vehicles])
+                for name, (holds, values) in self.stated.items()
+            },
         )
 
     def nearest(self, vehicle: int) -> int | None:

@@ -59,6 +59,7 @@ def animate(comparison: Comparison, path: Path) -> None:
     InputError
         If the ending is unknown, or the file cannot be written.
     """
+    comparison.refuse_without_position()
     ending = path.suffix.lower()
     scene = lay_out_scene(comparison)
     if ending not in ENDINGS:

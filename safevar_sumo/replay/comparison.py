@@ -17,9 +17,9 @@ from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Measure
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts, collision_in_words
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, Trace
 from safevar_sumo.results import UNKNOWN
-from safevar_sumo.scenarios import Point
+from safevar_sumo.scenarios import VUT, Point
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import NetworkFiles, built_network, network_for
@@ -97,21 +97,38 @@ class Comparison:
         ]
 
     @property
+    def has_position(self) -> bool:
+        """Whether positions of the vehicles are known: a simulator of the user's own may have
+        none.
+        """
+        return not np.isnan(self.runs.trace.position).any()
+
+    def refuse_without_position(self) -> None:
+        """Refuse to draw runs without positions."""
+        if not self.has_position:
+            self.system.refuse_simulator("a picture needs the position in its trace")
+
+    @property
     def network(self) -> NetworkFiles:
         """The scenario's network, with the lanes that the scenario's parameters define."""
         return network_for(self.point.scenario)
 
     @cached_property
     def road(self) -> tuple[DrawnLane, ...]:
-        """The lanes of the network."""
+        """The lanes of the network; of a simulator of the user's own, a straight one."""
+        if self.system.has_simulator:
+            return (lane_below(self.runs.trace),)
         return read_road(self.network)
 
     @cached_property
     def tracks(self) -> dict[str, Film]:
         """How all actors move in SUMO, by name in alphabetical order, at the samples of `runs`.
 
-        Samples after the end of a run are meaningless: SUMO continues with the other run.
+        Samples after the end of a run are meaningless: SUMO continues with the other run. What a
+        simulator of the user's own moves is drawn along a straight line.
         """
+        if self.system.has_simulator:
+            return films_along(self.runs.trace)
         tracks = dict[str, Film]()
         samples = count()
         length = len(self.runs.trace.time)
@@ -145,7 +162,8 @@ class Comparison:
             return collision_in_words(runs.closing_speed[row], own, digits=1)
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
-            ending = f"{ending} with {runs.trace.gap[nearest, row]:.2f} m to spare"
+            distance = runs.encounter.separation if self.system.has_simulator else runs.trace.gap
+            ending = f"{ending} with {distance[nearest, row]:.2f} m to spare"
 
         # And the metrics that the search minimises.
         values = [
@@ -157,6 +175,31 @@ class Comparison:
             if np.isfinite(value)
         )
         return ", ".join([ending, *texts])
+
+
+BODY_LENGTH, BODY_WIDTH, LANE_WIDTH = 4.5, 1.8, 3.5
+"""What is drawn of a simulator of the user's own, which states no sizes [m]."""
+ROAD_BEHIND, ROAD_AHEAD = 20.0, 100.0
+"""How far the lane reaches that is drawn there [m]."""
+
+
+def films_along(trace: Trace) -> dict[str, Film]:
+    """The vehicle and who is ahead of it, along a straight line."""
+
+    def film(front: FloatArray, speed: FloatArray) -> Film:
+        nothing = np.zeros(front.shape)
+        motion = np.stack([front, nothing, nothing + 1, nothing, speed], axis=-1)
+        return Film(motion, False, BODY_LENGTH, BODY_WIDTH)
+
+    gap = np.where(np.isfinite(trace.gap), trace.gap, np.nan)
+    ahead = film(trace.position + gap + BODY_LENGTH, trace.obstacle_speed)
+    return {"obstacle": ahead, VUT: film(trace.position, trace.speed)}
+
+
+def lane_below(trace: Trace) -> DrawnLane:
+    """The lane on which they are drawn."""
+    ends = float(trace.position.min()) - ROAD_BEHIND, float(trace.position.max()) + ROAD_AHEAD
+    return DrawnLane("road", np.array([[ends[0], 0.0], [ends[1], 0.0]]), LANE_WIDTH)
 
 
 def comparison_of(simulation: Simulation) -> Comparison:

@@ -292,6 +292,7 @@ def export(
         raise InputError("out", f"{out} exists", "a new directory")
     target = load_target(directory, solution, as_it_is_now, point)
     system = assemble(target.study)
+    system.refuse_simulator("it has no road to export")
     setting = target.setting(system)
     vehicle = system.characteristics.vehicle
     of_vehicle = setting[system.characteristics.of_vehicle]

@@ -35,6 +35,8 @@ def draw_comparison(comparison: Comparison) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+    comparison.refuse_without_position()
+
     # Four panels over time.
     with matplotlib.style.context(
         ["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]

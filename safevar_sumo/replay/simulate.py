@@ -183,6 +183,8 @@ def show_simulation(
     # Files that cannot be written are refused first.
     if trace is not None:
         check_writable(trace, "trace", (".csv",), but=SOLUTIONS)
+    if gui:
+        system.refuse_simulator("it has no scene for sumo-gui")
     if animate is not None:
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 

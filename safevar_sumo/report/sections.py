@@ -190,6 +190,7 @@ def tested(study: ReportedStudy) -> Answer:
             ("Driving system", ADS, case.study.ads),
             ("Scenario", SCENARIOS, case.study.scenario),
         )
+        if table.model
     ]
 
     # Pre-crash types, domains and remarks.
@@ -232,6 +233,9 @@ def _conditions(study: ReportedStudy) -> str:
             f"only the test case {study.point} of its matrix, in which all solutions were simulated"
             " again"
         )
+    if study.system.has_simulator:
+        where = f", in {number_of(len(points), 'test case')}" if points else ""
+        return f"the simulator of the scenario moves and drives the vehicle{where}"
     if not points:
         no_effect = (
             " (it changes neither road nor sensors, but possibly parameters of the driving system)"
@@ -358,6 +362,8 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         comparison = comparison_of(
             simulate_with_original(study.case.study, study.system, setting, filtered=False)
         )
+        if not comparison.has_position:
+            return  # a simulator of the user's own that logs none: nothing can be shown
         last = comparison.rows[-1]
         differences = []
         if name in study.choices:

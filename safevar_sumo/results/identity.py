@@ -24,10 +24,10 @@ PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")
 """Packages that every study uses."""
 LIBRARIES = {"ad_rss": "ad-rss", "highway_idm": "highway-env", "fmu": "fmpy"}
 """Packages of extras by the driving system, or the kind of one, that needs them."""
-SIMULATORS = ("libsumo", *LIBRARIES.values())
-"""Packages on whose versions a single simulation depends."""
 PYMOO_PACKAGES = ("pymoo", "cma")
 """Packages on whose versions the searches of pymoo depend."""
+SEARCH_PACKAGES = ("safevar_sumo", "deap", "numpy", *PYMOO_PACKAGES)
+"""Packages on whose versions no single simulation depends."""
 IDENTITY = {
     "study": "the same study and options",
     "files": "the file as it was",
@@ -47,13 +47,15 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     ----------
     identity
         Inputs of the results besides the study file, by `IDENTITY`; see
-        `safevar_sumo.campaign.identity.manifest_now`.
+        `safevar_sumo.campaign.identity.manifest_now`. Its `versions` are those of a simulator of
+        the user's own.
     """
+    versions = {name: version(name) for name in packages_of(study)}
     return {
         "format": FORMAT,
         "study": tables_of(study),
         **identity,
-        "versions": {name: version(name) for name in packages_of(study)},
+        "versions": {**versions, **identity.get("versions", {})},
     }
 
 
@@ -114,7 +116,7 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
                 text = f"{name} was {before!r} and is {after!r} now"
             is_harmless = (
                 layer == "platform"
-                or (layer == "versions" and key not in SIMULATORS)
+                or (layer == "versions" and key in SEARCH_PACKAGES)
                 or (layer == "study" and before is None)
             )
             yield layer, text, not is_harmless

@@ -22,6 +22,7 @@ from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
+from safevar_sumo.scenarios.simulated import Simulator as Simulator
 from safevar_sumo.scenarios.stop import Stop
 from safevar_sumo.scenarios.tracks import (
     Track as Track,
@@ -31,6 +32,8 @@ from safevar_sumo.scenarios.tracks import (
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import FreeParameter, Weather, free_parameters
 
+SCENARIO_BASES: tuple[type, ...] = (Simulator, TrackScenario, WorldScenario)
+"""The contracts of a user's scenario."""
 SCENARIOS: Mapping[str, type[Scenario]] = {
     "pedestrian_crossing": PedestrianCrossing,
     "along": Along,
@@ -58,6 +61,8 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     """Parameters of a scenario and its weather that a study may search; none without an
     encounter.
     """
+    if isinstance(scenario, Simulator):
+        return scenario.free()
     return {} if scenario.brakes_fully else {**scenario.free(), **WEATHER_PARAMETERS}
 
 
@@ -71,6 +76,7 @@ def weather_of(choice: str | Weather) -> Weather:
     """
     if isinstance(choice, Weather):
         return choice
+    choice = choice or "clear"  # a simulator of the user's own has none
     fields = ", ".join(Weather.__struct_fields__)
     check_name("", f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]

@@ -12,7 +12,7 @@ import msgspec
 
 from safevar_sumo.errors import about, warn
 from safevar_sumo.plugins import Lookup
-from safevar_sumo.scenarios import SCENARIOS, TrackScenario, WorldScenario, weather_of
+from safevar_sumo.scenarios import SCENARIO_BASES, SCENARIOS, weather_of
 from safevar_sumo.study import (
     Domain,
     MatrixTable,
@@ -88,7 +88,7 @@ def _completed(
 def _models(tables: Parameters, places: Sequence[str]) -> Iterator[tuple[type, Parameters]]:
     """The weather's class with its values, and those of the scenarios with their defaults."""
     # The weather's parameters.
-    weather = tables.get("weather")
+    weather = tables.get("weather", "")
     table = weather_of(
         weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
     )
@@ -103,7 +103,7 @@ def _models(tables: Parameters, places: Sequence[str]) -> Iterator[tuple[type, P
         model = name or tables["scenario"].get("model")
         if not isinstance(model, str):
             return  # which the check of the whole study refuses
-        member = lookup.class_of(SCENARIOS, model, "scenario.model", TrackScenario, WorldScenario)
+        member = lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
         yield member.target, _defaults(member.target)
 
 

@@ -126,7 +126,7 @@ class VehicleTable(Table, frozen=True, kw_only=True):
     study's file.
     """
 
-    model: str
+    model: str = ""
     characteristics: Annotated[dict[str, CharacteristicTable], ORDERED]
     parameters: Parameters = {}
     files: list[str] = []
@@ -338,9 +338,9 @@ class Study(Table, frozen=True, kw_only=True):
     name: Name
     title: Annotated[str, WITHOUT_EFFECT, OF_SYSTEM]
     scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
-    weather: Annotated[str | Weather, PART_OF_SYSTEM]
+    weather: Annotated[str | Weather, PART_OF_SYSTEM] = ""
     vehicle: Annotated[VehicleTable, PART_OF_SYSTEM]
-    ads: Annotated[ModelTable, PART_OF_SYSTEM]
+    ads: Annotated[ModelTable, PART_OF_SYSTEM] = ModelTable(model="")
     metrics: MetricsTable
     search: SearchTable
     matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None

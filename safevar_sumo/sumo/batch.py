@@ -22,6 +22,7 @@ from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
+from safevar_sumo.sumo.simulators import simulate_each
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import LaneWorld, Traffic
@@ -41,9 +42,11 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
             if measure.of == "settings":
                 metrics[name] = measure.function(settings, system.characteristics)
             else:
-                metrics[name] = np.where(
-                    is_invalid, np.nan, measure.function(runs, system.metrics_table)
-                )
+                values = measure.function(runs, system.metrics_table)
+                if name in runs.stated:
+                    is_stated, own_values = runs.stated[name]
+                    values = np.where(is_stated, own_values, values)
+                metrics[name] = np.where(is_invalid, np.nan, values)
     return Evaluations(
         settings=settings,
         outcome=runs.outcome,
@@ -57,6 +60,8 @@ def reason_for_sumo(system: System) -> str:
     """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded
     scenes suffice.
     """
+    if system.has_simulator:
+        return "its own simulator moves the vehicle"
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
@@ -92,6 +97,8 @@ def drive_all(
     InputError
         If a user's ADS fails, or takes longer than the time limit.
     """
+    if system.has_simulator:
+        return simulate_each(system, settings)
     vehicles, encounters = system.cut(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario

@@ -21,6 +21,7 @@ from safevar_sumo.scenarios import (
     VUT,
     WEATHER_PARAMETERS,
     Point,
+    Simulator,
     TrackScenario,
     WorldScenario,
     searchable_in,
@@ -71,7 +72,8 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     for point in points:
         try:
             scenarios = [encounter(point, corner).scenario for corner in corners]
-            networks_for(scenarios)
+            if not isinstance(scenarios[0], Simulator):
+                networks_for(scenarios)
             for scenario in scenarios:
                 if isinstance(scenario, TrackScenario):
                     scenario.tracks(np.zeros((1, 1)))

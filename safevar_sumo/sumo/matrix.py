@@ -212,6 +212,8 @@ def evaluate_matrix(
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
+    if system.has_simulator:  # each result is journaled at once
+        return 1
     if not is_recorded(system, engine):
         return MAX_COPIES
     if len(
@@ -234,6 +236,8 @@ def batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
     network.
     """
+    if system.has_simulator:
+        return 1
     if is_recorded(system, engine):
         return largest_batch(system)
     lanes = max(

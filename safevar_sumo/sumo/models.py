@@ -20,19 +20,21 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import (
+    SCENARIO_BASES,
     SCENARIOS,
     Point,
     Scenario,
+    Simulator,
     TrackScenario,
-    WorldScenario,
     weather_of,
 )
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import MatrixTest, ModelTable, Study, VehicleTable, user_code_names
 from safevar_sumo.sumo.network import is_network, is_shipped
+from safevar_sumo.sumo.simulated_study import check_tables
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
-from safevar_sumo.vehicles import VEHICLES, Vehicle
+from safevar_sumo.vehicles import VEHICLES, SimulatedVehicle, Vehicle
 
 CONTROLLER_FORMS = (
     "a function step(traci, vehicle_id) with the body of a script's loop, or a class with that"
@@ -47,6 +49,8 @@ def create_shipped_models(study: Study) -> None:
     """
     with about(study.source):
         lookup = Lookup.of(study)
+        if study.scenario.model in SCENARIOS:
+            check_tables(study, SCENARIOS[study.scenario.model])
         for kind, shipped, table in (
             ("vehicle", VEHICLES, study.vehicle),
             ("ads", ADS, study.ads),
@@ -122,9 +126,9 @@ def _points_of(test: MatrixTest, study: Study, lookup: Lookup) -> Iterator[Point
         if not study.scenario.search:
             scenario.check()
         for weather in map(weather_of, test.weathers or [study.weather]):
-            name = ", ".join(
-                [test.name, *(f"{key} {value}" for key, value in over.items()), weather.name]
-            )
+            words = [test.name, *(f"{key} {value}" for key, value in over.items())]
+            words += [] if isinstance(scenario, Simulator) else [weather.name]
+            name = ", ".join(words)
             parameters = {"test": test.name, **over, "weather": weather.name}
             allowed = test.allowed_impact_speed / KMH_PER_MS
             yield Point(scenario, weather, name, tuple(parameters.items()), allowed)
@@ -178,14 +182,14 @@ def create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
 
 def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     """A scenario that a study names, with its parameters; raises an InputError."""
-    member, create = _class_and_creator(
-        "scenario", SCENARIOS, table, lookup, TrackScenario, WorldScenario
-    )
+    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, *SCENARIO_BASES)
     scenario: Scenario = create()
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
     scenario.read_files(lookup.folders)
+    if isinstance(scenario, Simulator):
+        return scenario
     return _locate_network(scenario, lookup.folders)
 
 
@@ -212,3 +216,20 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if not isinstance(ads, ScalarAds):
         return ads
     return PerVehicleAds(create, member.code or UserCode(f"ads.model = {table.model!r}"))
+
+
+def create_driven(study: Study, lookup: Lookup, scenario: Scenario) -> tuple[Vehicle, Ads]:
+    """The vehicle of a study and its driving system; in a simulator of the user's own, only the
+    vehicle's characteristics. Raises an InputError.
+    """
+    check_tables(study, type(scenario))
+    if not isinstance(scenario, Simulator):
+        vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
+        return vehicle, create_ads(study.ads, lookup)
+    units = getattr(scenario, "UNITS", None)
+    if not isinstance(units, Mapping):
+        code = UserCode(f"scenario.model = {study.scenario.model!r}", type(scenario))
+        legal = "UNITS: units of the vehicle's characteristics by name"
+        raise code.wrong("__init__", "an object without UNITS", legal)
+    # Neither moves nor drives anything.
+    return SimulatedVehicle(units, tuple(scenario.OPTIONAL)), Ads()  # type: ignore[abstract]

@@ -17,14 +17,22 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
+from safevar_sumo.scenarios import (
+    VUT,
+    Point,
+    Scenario,
+    Simulator,
+    WorldScenario,
+    equals_clear,
+    weather_of,
+)
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of
-from safevar_sumo.sumo.models import create_ads, create_scenario, create_vehicle, matrix_points
+from safevar_sumo.sumo.models import create_driven, create_scenario, matrix_points
 from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
@@ -99,8 +107,23 @@ class System:
         return self.matrix or (Point(self.scenario, self.weather, allowed_impact_speed=allowed),)
 
     @property
+    def has_simulator(self) -> bool:
+        """Whether a simulator of the user's own moves and drives the vehicle."""
+        return isinstance(self.points[0].scenario, Simulator)
+
+    def refuse_simulator(self, reason: str) -> None:
+        """Refuse what a simulator of the user's own cannot do, an `InputError` with the reason."""
+        if self.has_simulator:
+            problem = f"scenario.model is a simulator of the user's own: {reason}"
+            raise InputError(self.source, problem, "a study with a vehicle and a driving system")
+
+    @property
     def step(self) -> float:
-        """Time step of the simulations [s]."""
+        """Time step of the simulations [s]; 0 in a simulator of the user's own, which has its
+        own.
+        """
+        if self.has_simulator:
+            return 0.0
         return self.scenes.step_of(self.points[0].scenario)
 
     @cached_property
@@ -161,6 +184,8 @@ class System:
         """Remarks for the user on parts of networks and weathers that are not used or have no
         effect.
         """
+        if self.has_simulator:
+            return []
         # On networks, vehicles and drivers.
         uses_traci = isinstance(self.ads, TraciController)
         remarks = [
@@ -277,9 +302,8 @@ def _assemble(study: Study) -> System:
     # The models: each system has the code as it is now, and no state of another one.
     unload_user_modules()
     lookup = Lookup.of(study)
-    vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
-    ads = create_ads(study.ads, lookup)
     scenario = create_scenario(study.scenario, lookup)
+    vehicle, ads = create_driven(study, lookup, scenario)
     weather = weather_of(study.weather)
     check_units(study, vehicle)
     check_plausible(study, vehicle)
@@ -293,7 +317,8 @@ def _assemble(study: Study) -> System:
     measuring = measuring_of(study, lookup, has_stops=has_stops)
     _check_metrics(study, measuring)
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
-        check_network(network)
+        if network:
+            check_network(network)
     if not (matrix or study.scenario.search):
         scenario.check()
 
@@ -310,7 +335,7 @@ def _assemble(study: Study) -> System:
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
     for one in (scenario, *(point.scenario for point in matrix)):
         _check_speed(one, nominal)
-    if study.vehicle.model not in VEHICLES:
+    if study.vehicle.model not in {*VEHICLES, ""}:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(
         characteristics=region.characteristics,

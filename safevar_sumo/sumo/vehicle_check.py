@@ -47,7 +47,8 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
                 f"{key}: the name is a column of results",
                 f"none of {', '.join(RESULT_COLUMNS)}",
             )
-        check_name("", f"{key}: {study.vehicle.model} has no such characteristic", name, units)
+        model = study.vehicle.model or study.scenario.model
+        check_name("", f"{key}: {model} has no such characteristic", name, units)
         if entry.original == 0 and name not in vehicle.OPTIONAL:
             raise InputError(
                 "", f"{key}: original = 0", "a value other than 0: changes are relative to it"

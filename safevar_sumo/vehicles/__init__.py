@@ -26,6 +26,7 @@ from safevar_sumo.vehicles.characteristics import (
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
+from safevar_sumo.vehicles.simulated import SimulatedVehicle as SimulatedVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {
     "carla": Carla,

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Count, Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
@@ -49,6 +48,7 @@ from safevar_sumo.questions.preventability import (
     TITLES,
     assess_sample,
     avoided_shares,
+    has_reference_drivers,
 )
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import (
@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
+NO_COLLISION_NUMBERS: JsonObject = dict.fromkeys(COLLISION_NUMBERS)
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
@@ -147,8 +148,9 @@ def explain(
     needed = count_needed(evaluator.characteristics, changed, of_sample, len(population.rows))
     needed = needed if is_caused else needed.head(0)
 
-    # In a rating every vehicle collides in some cell, so that reference drivers are left out.
-    is_assessed = runs.collided & (not is_rated(study))
+    # What reference drivers avoid.
+    has_drivers = has_reference_drivers(evaluator)
+    is_assessed = runs.collided & has_drivers
     verdicts, collisions = assess_sample(evaluator, runs.take(is_assessed))
 
     # Tables, numbers and the verdict.
@@ -162,7 +164,7 @@ def explain(
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
-        **_collision_numbers(study, verdicts, collisions),
+        **(_collision_numbers(verdicts, collisions) if has_drivers else NO_COLLISION_NUMBERS),
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
     sentences = [
@@ -220,12 +222,10 @@ def _counts(
     }
 
 
-def _collision_numbers(study: Study, verdicts: pd.DataFrame, collisions: int) -> JsonObject:
+def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
     """The numbers of all collisions, of those assessed that some driver avoids, and that even full
-    braking does not; none in a rated study.
+    braking does not.
     """
-    if is_rated(study):
-        return dict.fromkeys(COLLISION_NUMBERS)
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
     return dict(

@@ -51,6 +51,8 @@ def robust_shares(
     """
     neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed)
     shares = []
+    if evaluator.system.has_simulator:  # which keeps its own time step
+        factors = (1.0,)
 
     # The share of neighbours that are unsafe, with each length of the time step.
     with evaluator.stage(NEIGHBOURS, len(neighbours) * len(factors)):

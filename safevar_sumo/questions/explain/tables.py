@@ -35,6 +35,7 @@ from safevar_sumo.questions.preventability import (
     assess_collisions,
     avoided_by,
     drivers_frame,
+    has_reference_drivers,
 )
 from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.words import EXACT, number_of
@@ -150,7 +151,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
     else:
         factors = STEP_FACTORS
         comparisons = compare_at_points(evaluator.system, settings, unsafe)
-    is_assessed = failures.collided & (not is_rated(study))
+    is_assessed = failures.collided & has_reference_drivers(evaluator)
     assessed = iter(assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     columns = {
         "solution": [population.names[row] for row in reasons],

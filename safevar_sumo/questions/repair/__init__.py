@@ -172,6 +172,7 @@ def repair(
         Not with `out`.
     """
     study = evaluator.study
+    evaluator.system.refuse_simulator("nothing of its driving system can be changed here")
     if is_rated(study):
         text = (
             f"{study.name!r} is rated, and its repair would take a whole test matrix for every"

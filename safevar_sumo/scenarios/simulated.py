@@ -1,0 +1,158 @@
+"""The contract of a scenario in a simulator of the user's own, which moves the vehicle under test
+and drives it, too.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
+from safevar_sumo.records import Outcome
+from safevar_sumo.scenarios.base import Scenario
+from safevar_sumo.study import SAFETY_DEGREE
+
+SPEED = Legal(0.0, 1000.0)
+TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = "time", "outcome", "impact_speed", "struck_speed"
+SAMPLED = {TIME: Legal(0.0), "speed": SPEED, "separation": Legal(0.0, infinite=True)}
+"""What a trace has at each sample."""
+ALSO_SAMPLED = {
+    "gap": Legal(infinite=True),
+    "obstacle_speed": Legal(),
+    "brake": SHARE,
+    "throttle": SHARE,
+    "position": Legal(),
+}
+"""What a trace may have at each sample."""
+OF_COLLISION = {IMPACT_SPEED: SPEED, STRUCK_SPEED: Legal()}
+"""What a collision has besides, and may have."""
+OUTCOMES = [outcome.value for outcome in [*Outcome][:6]]
+"""How a run may end: all but failures of the simulator and settings that are not simulated."""
+STEP_TOLERANCE = 1e-6
+"""Largest difference between two time steps of a trace [s]."""
+
+
+def check_result(code: UserCode, method: str, result: Any, setting: Any) -> Mapping[str, Any]:
+    """Refuse a result that lacks a quantity, has an unknown one, or has illegal numbers.
+
+    Arrays have float elements afterwards. A result without `time` is one of a rig that logs no
+    trace: names of its metrics are checked where the study's are known.
+    """
+    if not isinstance(result, Mapping):
+        raise code.wrong(method, quoted(result), f"a mapping with {', '.join(SAMPLED)}, {OUTCOME}")
+    needed = [*(SAMPLED if TIME in result else [SAFETY_DEGREE]), OUTCOME]
+    for name in needed:
+        if name not in result:
+            legal = (
+                f"{', '.join(SAMPLED)} of each sample, and {OUTCOME}; or, without a trace,"
+                f" {OUTCOME}, {SAFETY_DEGREE} and metrics by name"
+            )
+            raise code.wrong(method, f"a result without {name}", legal)
+    outcome = str(result[OUTCOME])
+    if outcome not in OUTCOMES:
+        raise code.wrong(method, f"{OUTCOME} = {quoted(result[OUTCOME])}", ", ".join(OUTCOMES))
+    checked = _checked_trace if TIME in result else _checked_metrics
+    return {**checked(code, method, result, outcome == Outcome.COLLISION), OUTCOME: outcome}
+
+
+def _checked_trace(
+    code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
+) -> Mapping[str, Any]:
+    """The columns of a trace, each of shape (T,), and what it says of a collision."""
+    known = {**SAMPLED, **ALSO_SAMPLED, **OF_COLLISION, OUTCOME: None}
+    for name in result:
+        if name not in known:
+            raise code.wrong(method, f"a trace with {name!r}", f"keys among {', '.join(known)}")
+
+    # Samples in equal steps.
+    shape = np.shape(result[TIME])
+    columns = {
+        name: code.check_numbers(method, name, result[name], shape, legal).astype(float)
+        for name, legal in {**SAMPLED, **ALSO_SAMPLED}.items()
+        if name in result
+    }
+    steps = np.diff(columns[TIME]) if len(shape) == 1 else np.zeros(0)
+    if not len(steps) or np.ptp(steps) > STEP_TOLERANCE or steps[0] <= 0:
+        raise code.wrong(
+            method, f"{TIME} = {quoted(result[TIME])}", "at least 2 times, equal steps"
+        )
+    if not has_collided and not np.isfinite(columns["separation"]).any():
+        raise code.wrong(method, "separation = inf", "a finite number at some time")
+
+    # How hard a collision was.
+    if has_collided and IMPACT_SPEED not in result:
+        raise code.wrong(method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]")
+    ends = OF_COLLISION if has_collided else {}
+    numbers = {name: result.get(name, 0.0) for name in ends}
+    return {**columns, **_numbers(code, method, numbers, ends)}
+
+
+def _checked_metrics(
+    code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
+) -> Mapping[str, float]:
+    """The metrics of a run without a trace; NaN is one that is undefined."""
+    degree = Legal(highest=0.0) if has_collided else Legal(0.0)
+    legal = {name: Legal(infinite=True, undefined=True) for name in result if name != OUTCOME} | {
+        SAFETY_DEGREE: degree
+    }
+    legal |= {name: OF_COLLISION[name] for name in OF_COLLISION if name in result and has_collided}
+    return _numbers(code, method, {name: result[name] for name in legal}, legal)
+
+
+def _numbers(
+    code: UserCode, method: str, values: Mapping[str, Any], legal: Mapping[str, Legal]
+) -> dict[str, float]:
+    return {
+        name: float(code.check_numbers(method, name, value, (), legal[name]))
+        for name, value in values.items()
+    }
+
+
+class Simulator(Scenario):
+    """A scenario in a simulator of the user's own. A class needs no base class: it has `simulate`
+    and `UNITS`. Its fields are the parameters of `scenario.parameters`; those marked by `searched`
+    may be searched.
+
+    Attributes
+    ----------
+    UNITS
+        Units of the vehicle's characteristics by name.
+    OPTIONAL
+        Characteristics that a study may leave out, and whose original value may be 0.
+    LIBRARIES
+        Distributions on whose versions results depend, such as `metadrive-simulator`.
+    version
+        The simulator's own version, if no distribution has it.
+    """
+
+    __slots__ = ()
+    RETURNS: ClassVar[Mapping[str, Returned]] = {"simulate": Returned(then=check_result)}
+    UNITS: ClassVar[Mapping[str, str]]
+    OPTIONAL: ClassVar[tuple[str, ...]] = ()
+    LIBRARIES: ClassVar[tuple[str, ...]] = ()
+    version: ClassVar[str] = ""
+    network: str = ""
+    duration: float = 60.0
+
+    @abstractmethod
+    def simulate(self, setting: Mapping[str, float]) -> Mapping[str, Any]:
+        """Simulate one vehicle in this scenario.
+
+        `setting` has the value of each characteristic in its unit. The result depends on it and on
+        the fields alone, bit for bit, unless the study says how often each run is repeated.
+
+        It has, at T samples in equal steps, `time` [s], `speed` [m/s] and `separation`, the least
+        distance of the vehicle's body from any other [m]; and `outcome`, a value of `Outcome`. It
+        may have `gap` along the path to who is ahead [m], infinite without anybody, and his
+        `obstacle_speed` along the path [m/s]; the pedals `brake` and `throttle` [-]; `position`
+        along the path [m]. On a collision it has `impact_speed`, the vehicle's own speed [m/s], and
+        may have `struck_speed`, that of what it struck along its path [m/s].
+
+        Without a trace it has `outcome`, `safety_degree` and any of the study's metrics by name.
+        """
+
+    def close(self) -> None:
+        """End the simulator; nothing by default."""

@@ -1,0 +1,51 @@
+"""What a study of a simulator of the user's own has, and what it has not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.scenarios import Simulator
+from safevar_sumo.study import Study
+
+IN_SIMULATOR = "nothing: the simulator moves and drives the vehicle, in a weather of its own"
+
+
+def check_tables(study: Study, scenario: type) -> None:
+    """Refuse tables that a simulator of the user's own would not use, or those that are missing
+    beside any other scenario.
+
+    Raises
+    ------
+    InputError
+        With the first such key.
+    """
+    tests = [] if study.matrix is None else study.matrix.tests
+    given: dict[str, Any] = {
+        "vehicle.model": study.vehicle.model,
+        "vehicle.parameters": study.vehicle.parameters,
+        "ads.model": study.ads.model,
+        "weather": study.weather,
+    }
+    if not issubclass(scenario, Simulator):
+        for key in ("vehicle.model", "ads.model", "weather"):
+            if not given[key]:
+                table = key.removesuffix(".model") if key.startswith("ads") else key
+                legal = "this key, or a scenario.model with simulate(setting), a simulator"
+                raise InputError("", f"{table} is missing", legal)
+        return
+
+    # What a simulator has of its own.
+    given |= {
+        "step_length": study.step_length,
+        "spread": study.spread,
+        "repair": study.repair.parameters,
+        "matrix.protocol": "" if study.matrix is None else study.matrix.protocol,
+        "matrix.tests.weathers": next((test.weathers for test in tests if test.weathers), []),
+    }
+    for key, value in given.items():
+        if value:
+            text = value if isinstance(value, str | float) else str(value)
+            raise InputError(
+                "", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR
+            )

@@ -1,0 +1,202 @@
+"""Runs in a simulator of the user's own, which drives one vehicle after another; a process keeps
+one simulator.
+"""
+
+from __future__ import annotations
+
+import atexit
+import inspect
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from copy import copy
+from typing import Any
+
+import numpy as np
+
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
+from safevar_sumo.plugins import UserCode, user_errors
+from safevar_sumo.plugins.time_limit import end_if_longer
+from safevar_sumo.records import (
+    LEAST_CLOSING_SPEED,
+    BoolArray,
+    Contact,
+    Encounter,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+    Trace,
+)
+from safevar_sumo.scenarios import Simulator
+from safevar_sumo.scenarios.simulated import IMPACT_SPEED, OUTCOME, STRUCK_SPEED, TIME
+from safevar_sumo.study import SAFETY_DEGREE
+from safevar_sumo.sumo.encounters import encounter
+from safevar_sumo.sumo.system import System
+
+NEEDS = {
+    "gap": ("tet", "tit", "ttc_min", "drac"),
+    "obstacle_speed": ("tet", "tit", "ttc_min", "drac"),
+    "brake": ("ave_dece", "reaction_time"),
+    "position": ("mfdd", "stopping_distance", "stop_from_pedal"),
+}
+"""Metrics that a trace without a quantity does not define."""
+NEVER_DEFINED = ("pet",)
+"""Metrics of which a trace of a simulator says nothing: it has no lateral distances."""
+NO_TRACE: Mapping[str, FloatArray] = {
+    TIME: np.array([0.0, 1.0]),
+    "speed": np.full(2, np.nan),
+    "separation": np.full(2, np.nan),
+}
+"""What stands in place of the trace of a run that has none."""
+
+
+class _Kept:
+    """The simulator of this process, kept between runs; its fields are set for each run."""
+
+    def __init__(self) -> None:
+        self._simulator: Simulator | None = None
+
+    def at(self, scenario: Simulator) -> Simulator:
+        """The simulator, with the fields of a scenario; a new one for another class."""
+        if type(self._simulator) is not type(scenario):
+            self.close()
+            self._simulator = copy(scenario)
+        for name in inspect.signature(type(scenario)).parameters:
+            if hasattr(scenario, name):
+                object.__setattr__(self._simulator, name, getattr(scenario, name))
+        assert self._simulator is not None
+        return self._simulator
+
+    def close(self) -> None:
+        """End the simulator, if there is one."""
+        simulator, self._simulator = self._simulator, None
+        if simulator is not None:
+            simulator.close()
+
+
+_kept = _Kept()
+
+
+@atexit.register
+def close_simulator() -> None:
+    """End the simulator of this process, also where it fails to end."""
+    with suppress(Exception):
+        _kept.close()
+
+
+def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
+    """Simulate N settings of n characteristics, shape (N, n), at the system's only point, one after
+    another, each within the time limit.
+    """
+    (point,) = system.points
+    vehicles, encounters = system.cut(settings)
+    names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
+    results = []
+    for vehicle, values in zip(vehicles.tolist(), encounters.tolist(), strict=True):
+        scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
+        assert isinstance(scenario, Simulator)
+        with user_errors(system.source), end_if_longer(system.time_limit):
+            result = _kept.at(scenario).simulate(dict(zip(names, vehicle, strict=True)))
+            if TIME not in result:
+                _check_names(scenario, result, system)
+        results.append(result)
+    return _runs_of(results, system, point.allowed_impact_speed)
+
+
+def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System) -> None:
+    """Refuse metrics that nobody knows, and objectives that are missing, in a result without a
+    trace.
+    """
+    code = UserCode(f"scenario.model = {type(scenario).__name__}", type(scenario))
+    measures = system.measuring.measures
+    known = {*METRICS, *OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
+    for name in result:
+        if name not in known:
+            legal = f"names of metrics: {', '.join(sorted(known))}"
+            raise code.wrong("simulate", f"a result without a trace, with {name!r}", legal)
+    for objective in system.measuring.scoring.objectives:
+        measure = measures.get(objective.name)
+        if measure is not None and measure.of == "runs" and objective.name not in result:
+            problem = f"a result without a trace and without {objective.name}"
+            raise code.wrong("simulate", problem, "each metric that is an objective of the study")
+
+
+def _runs_of(
+    results: Sequence[Mapping[str, Any]], system: System, allowed_impact_speed: float
+) -> SimulationRuns:
+    """The runs of N results, each with its own number of samples."""
+    traces = [{**NO_TRACE, **result} if TIME not in result else result for result in results]
+    steps = {float(np.diff(trace[TIME][:2])[0]) for trace in traces}
+    step = min(steps)
+    lengths = np.array([len(trace[TIME]) for trace in traces])
+    samples = np.arange(lengths.max())
+
+    def column(name: str) -> FloatArray:
+        """A quantity of all runs, shape (T, N), NaN where a run does not have it; after its end, a
+        run keeps its last value.
+        """
+        values = np.full((len(samples), len(traces)), np.nan)
+        for row, trace in enumerate(traces):
+            if name in trace:
+                values[:, row] = trace[name][np.minimum(samples, lengths[row] - 1)]
+        return values
+
+    # Metrics that a run states itself, and those that it leaves undefined.
+    stated = {name: _stated(name, results) for name in (*NEVER_DEFINED, *system.measuring.measures)}
+
+    # The collisions.
+    collided = np.array([result[OUTCOME] == Outcome.COLLISION for result in results])
+    struck = np.array([result.get(STRUCK_SPEED, 0.0) for result in results])
+    impact = np.array(
+        [result.get(IMPACT_SPEED, -result.get(SAFETY_DEGREE, np.nan)) for result in results]
+    )
+    closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
+    stated["impact_speed"] = collided, closing_speed
+    stated["impact_excess"] = collided, closing_speed - allowed_impact_speed
+
+    # One batch, as of SUMO.
+    speed, gap, obstacle_speed = map(column, ("speed", "gap", "obstacle_speed"))
+    separation = column("separation")
+    nothing = np.zeros(speed.shape)
+    return SimulationRuns(
+        trace=Trace(
+            step=step,
+            vehicle_length=0.0,
+            time=samples * step,
+            position=column("position"),
+            speed=speed,
+            gap=gap,
+            lateral=nothing,
+            lateral_speed=nothing,
+            throttle=column("throttle"),
+            brake=column("brake"),
+            gear=nothing,
+            active=samples[:, np.newaxis] < lengths,
+            obstacle_speed=obstacle_speed,
+        ),
+        encounter=Encounter(separation, gap, speed - obstacle_speed, np.isfinite(separation)),
+        outcome=np.array([result[OUTCOME] for result in results], dtype="U16"),
+        collision_speed=np.where(collided, impact, np.nan),
+        contact=Contact(
+            np.full(len(results), "", dtype="U5"), np.full(len(results), np.nan), struck
+        ),
+        allowed_impact_speed=np.full(len(results), allowed_impact_speed),
+        stated=stated,
+    )
+
+
+def _stated(name: str, results: Sequence[Mapping[str, Any]]) -> tuple[BoolArray, FloatArray]:
+    """Which of N results state a metric, shape (N,), and its values: all without a trace, and those
+    whose trace does not define it.
+    """
+    has_trace = np.array([TIME in result for result in results])
+    is_defined = np.array(
+        [
+            name not in NEVER_DEFINED
+            and all(quantity in result for quantity in NEEDS if name in NEEDS[quantity])
+            for result in results
+        ]
+    )
+    values = np.array(
+        [np.nan if TIME in result else result.get(name, np.nan) for result in results]
+    )
+    return ~(has_trace & is_defined), values

@@ -1,0 +1,284 @@
+"""A simulator of the user's own: what it returns is checked, its runs are measured as SUMO's are,
+and what it cannot do is refused.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.study import tables_of
+from safevar_sumo.sumo import simulators
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import json_of, refused, run
+
+MODELS = """
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from safevar_sumo.study import searched
+
+CLOSED, OPENED = [], []
+
+
+@dataclass(frozen=True)
+class Wall:
+    '''Brakes in front of a wall after half a second.'''
+
+    UNITS = {"decel": "m/s^2", "delay": "s"}
+    OPTIONAL = ("delay",)
+    LIBRARIES = ("numpy",)
+    version = "1.2"
+    speed: Annotated[float, searched(5.0, 30.0, "m/s", "speed at the start")] = 15.0
+    gap: Annotated[float, searched(20.0, 80.0, "m", "distance of the wall")] = 40.0
+
+    def simulate(self, setting):
+        if not hasattr(self, "engine"):
+            object.__setattr__(self, "engine", OPENED.append(1))
+        time, speed, x, rows = 0.0, self.speed, 0.0, []
+        while True:
+            brakes = time >= 0.5 + setting["delay"]
+            rows.append((time, speed, max(self.gap - x, 0.0), self.gap - x, 0.0, brakes, x))
+            if x >= self.gap or speed <= 0:
+                break
+            speed = max(speed - brakes * setting["decel"] * 0.05, 0.0)
+            x, time = x + speed * 0.05, time + 0.05
+        names = ("time", "speed", "separation", "gap", "obstacle_speed", "brake", "position")
+        trace = dict(zip(names, np.array(rows, dtype=float).T))
+        ends = {"outcome": "collision", "impact_speed": speed} if x >= self.gap else {}
+        return {**trace, "outcome": "stopped", **ends}
+
+    def close(self):
+        CLOSED.append(1)
+
+
+class Rig:
+    UNITS = {"decel": "m/s^2", "delay": "s"}
+    OPTIONAL = ("delay",)
+
+    def simulate(self, setting):
+        rest = 40 - 15 * (0.5 + setting["delay"]) - 15**2 / 2 / setting["decel"]
+        if rest < 0:
+            impact = (-2 * setting["decel"] * rest) ** 0.5
+            return {"outcome": "collision", "safety_degree": -impact}
+        return {"outcome": "stopped", "safety_degree": rest, "ave_dece": setting["decel"]}
+
+
+class Wrong(Wall):
+    def simulate(self, setting):
+        result = Wall.simulate(self, setting)
+        change = CHANGE
+        return change(result)
+"""
+STUDY = """
+name = "wall"
+title = "Brakes in front of a wall"
+
+[scenario]
+model = "models:Wall"
+
+[vehicle.characteristics]
+decel = { unit = "m/s^2", original = 8, lower = 3, upper = 9 }
+delay = { unit = "s", original = 0, lower = 0, upper = 1 }
+
+[metrics]
+ttc_threshold = 1.5
+
+[search]
+algorithms = ["nsga2", "rs"]
+population = 10
+evaluations = 40
+runs = 2
+seed = 1
+"""
+
+
+@pytest.fixture
+def wall(in_tmp: Path) -> Path:
+    (in_tmp / "models.py").write_text(MODELS)
+    (in_tmp / "wall.toml").write_text(STUDY)
+    return in_tmp / "wall.toml"
+
+
+def system_of(study: Path, **changes: object) -> System:
+    return assemble(sv.load_study(str(study), **changes))
+
+
+def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
+    system = system_of(wall)
+    found = drive_and_score(system, np.array([[8.0, 0.0], [3.0, 1.0]]))
+    braking = 15 / 8
+    assert found.outcome.tolist() == ["stopped", "collision"]
+    assert found.f_safe[0] == pytest.approx(40 - 15 * (0.5 + braking / 2), abs=0.55)
+    assert found.f_safe[1] == -found.collision_speed[1]
+    assert found.collision_speed[1] == pytest.approx((15**2 - 2 * 3 * 17.5) ** 0.5, abs=0.2)
+    assert found.metrics["ave_dece"][0] == pytest.approx(8, abs=0.3)
+    runs = simulators.simulate_each(system, np.array([[4.0, 0.0]]))
+    ttc = runs.trace.gap[:, 0] / np.maximum(runs.trace.speed[:, 0], 1e-9)
+    exposed = np.count_nonzero(ttc[runs.trace.speed[:, 0] > 0] <= 1.5) * 0.05
+    measured = drive_and_score(system, np.array([[4.0, 0.0]])).metrics["tet"][0]
+    assert measured == pytest.approx(exposed, abs=0.05)
+
+
+def test_metrics_that_a_trace_does_not_define_are_undefined(wall: Path) -> None:
+    change = "lambda r: {k: r[k] for k in ('time', 'speed', 'separation', 'outcome')}"
+    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
+    system = system_of(wall, scenario={"model": "models:Wrong"})
+    found = drive_and_score(system, np.array([[8.0, 0.0]]))
+    assert np.isnan([found.metrics[name][0] for name in METRICS if name != "safety_degree"]).all()
+    assert found.f_safe[0] > 0
+
+
+def test_a_rig_states_its_metrics_itself(wall: Path) -> None:
+    system = system_of(wall, scenario={"model": "models:Rig"})
+    found = drive_and_score(system, np.array([[5.0, 0.0], [3.0, 0.5]]))
+    assert found.f_safe.tolist() == pytest.approx([10.0, -(75**0.5)])
+    assert found.collision_speed[1] == pytest.approx(75**0.5)
+    assert found.metrics["ave_dece"][0] == 5
+    assert np.isnan(found.metrics["ave_dece"][1])
+    assert np.isnan(found.metrics["tet"]).all()
+
+
+def test_each_setting_alone_gives_the_bytes_of_a_batch(wall: Path) -> None:
+    system = system_of(wall)
+    rows = np.random.default_rng(1).uniform([3, 0], [9, 1], (8, 2))
+    together = drive_and_score(system, rows).results
+    for i, row in enumerate(rows):
+        alone = drive_and_score(system, row[np.newaxis]).results
+        for name, values in alone.items():
+            assert values[0].tobytes() == together[name][i].tobytes()
+
+
+def test_one_simulator_is_kept_its_fields_are_set_and_it_is_closed(wall: Path) -> None:
+    search = {"speed": {"lower": 10.0, "upper": 20.0}, "gap": {}}
+    system = system_of(wall, scenario={"search": search})
+    module = __import__("sys").modules["models"]
+    rows = np.array([[8.0, 0.0, 10.0, 40.0], [8.0, 0.0, 20.0, 60.0]])
+    found = drive_and_score(system, rows)
+    stops = [gap - v * 0.5 - v**2 / 16 for _, _, v, gap in rows]
+    assert found.f_safe.tolist() == pytest.approx(stops, abs=0.55)
+    assert len(module.OPENED) == 1
+    simulators.close_simulator()
+    assert len(module.CLOSED) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("lambda r: 3", "a mapping with time, speed, separation, outcome"),
+        ("lambda r: {**r, 'gap_to_lead': 1}", "'gap_to_lead'"),
+        ("lambda r: {**r, 'speed': r['speed'][:-1]}", "speed of shape"),
+        ("lambda r: {**r, 'speed': -r['speed']}", "speed = -15.0"),
+        ("lambda r: {**r, 'separation': r['separation'] * np.nan}", "separation = nan"),
+        ("lambda r: {**r, 'separation': r['separation'] + np.inf}", "separation = inf"),
+        ("lambda r: {**r, 'time': r['time'] ** 2}", "equal steps"),
+        ("lambda r: {**r, 'outcome': 'crash'}", "outcome = 'crash'"),
+        ("lambda r: {**r, 'outcome': 'collision'}", "a collision without impact_speed"),
+        ("lambda r: {k: r[k] for k in r if k != 'separation'}", "a result without separation"),
+        ("lambda r: {'outcome': 'stopped'}", "a result without safety_degree"),
+        ("lambda r: {'outcome': 'stopped', 'safety_degree': -1.0}", "safety_degree = -1.0"),
+        ("lambda r: {'outcome': 'stopped', 'safety_degree': 1.0, 'ttx': 1.0}", "'ttx'"),
+        ("lambda r: 1 / 0", "division by zero"),
+        ("lambda r: __import__('time').sleep(9)", "time limit of 0.5 s"),
+    ],
+)
+def test_a_wrong_result_is_refused_with_its_reason(wall: Path, change: str, told: str) -> None:
+    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
+    changes = {"scenario": {"model": "models:Wrong"}, "search": {"time_limit": 0.5}}
+    system = system_of(wall, **changes)
+    with pytest.raises(UserCodeError) as error:
+        drive_and_score(system, np.array([[8.0, 0.0]]))
+    assert told in f"{error.value}"
+
+
+@pytest.mark.parametrize(
+    ("tables", "told"),
+    [
+        ({"ads": {"model": "idm"}}, "ads.model = 'idm'"),
+        ({"weather": "fog"}, "weather = 'fog'"),
+        ({"vehicle": {"model": "worn"}}, "vehicle.model = 'worn'"),
+        ({"step_length": 0.1}, "step_length = 0.1"),
+        ({"spread": {"scenario.parameters.speed": [1.0, 2.0]}}, "spread"),
+        (
+            {"vehicle": {"characteristics": {"mass": {"original": 1, "lower": 1, "upper": 2}}}},
+            "mass",
+        ),
+    ],
+)
+def test_what_a_simulator_does_not_use_is_refused(
+    wall: Path, tables: dict[str, object], told: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        system_of(wall, **tables)
+    assert told in f"{error.value}"
+
+
+@pytest.mark.parametrize("key", ["ads", "weather"])
+def test_a_study_without_a_simulator_needs_a_driving_system(key: str) -> None:
+    tables = tables_of(sv.load_study("smoke"))
+    del tables[key], tables["spread"]
+    with pytest.raises(InputError) as error:
+        sv.load_study(tables)
+    assert f"{key} is missing" in f"{error.value}"
+    assert "simulate(setting)" in f"{error.value}"
+
+
+def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
+    study = sv.load_study(str(wall))
+    versions = manifest_now(study, assemble(study))["versions"]
+    assert versions["version of Wall"] == "1.2"
+    assert versions["numpy"] == np.__version__
+    (wall.parent / "models.py").write_text(MODELS.replace('("numpy",)', '("no_such_simulator",)'))
+    with pytest.raises(InputError, match="no_such_simulator"):
+        manifest_now(study, assemble(study))
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("rating wall.toml", "SUMO drives the tests of a rating"),
+        ("repair wall.toml --promise all", "nothing of its driving system"),
+        ("study wall.toml --engine sumo --out results", "no other engine"),
+        ("simulate wall.toml --gui", "no scene for sumo-gui"),
+    ],
+)
+def test_what_needs_sumo_is_refused_in_a_line(wall: Path, typed: str, told: str) -> None:
+    refused(*typed.split(), message=(told,))
+
+
+def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
+    run("simulate", "wall.toml", "--set", "decel=4", "--plot", "a.png", "--animate", "a.html")
+    assert Path("a.png").stat().st_size
+    assert "wall" in Path("a.html").read_text()
+    wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
+    refused("simulate", "wall.toml", "--animate", "b.html", message=("needs the position",))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["Wall", "Rig"])
+def test_questions_answer_about_a_simulator(wall: Path, model: str) -> None:
+    """Failures are explained without reference drivers, and limits are those of the formula."""
+    wall.write_text(STUDY.replace("models:Wall", f"models:{model}"))
+    run("study", "wall.toml", "--out", "results")
+    found = json_of("explain", "wall.toml", "--limit", "500")
+    assert found["numbers"]["collisions"] is None
+    assert not found["tables"]["drivers"]["rows"]
+    causes = [row["boundary"] for row in found["tables"]["causes"]["rows"]]
+    alone = [row["decel"] for row in causes if [*row] == ["decel"]]
+    assert alone == pytest.approx([225 / 2 / 32.5], abs=0.1)
+    limits = json_of("tolerance", "wall.toml", "--quick")
+    assert limits["tables"]["limits"]["rows"]
+    assert "weather" not in run("tolerance", "wall.toml", "--quick").stdout
+    for question in ("explain", "tables", "risk", "rules"):
+        assert run(question, "results").stdout
+    run("report", "results", "--quick", "--out", "page.html")
+    assert Path("page.html").stat().st_size
