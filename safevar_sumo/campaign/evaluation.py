@@ -6,8 +6,8 @@ SUMO.
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -19,13 +19,13 @@ from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
 from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, IntArray, Outcome, differences
-from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score, evaluate_matrix
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System, assemble, simulate_command
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -37,7 +37,6 @@ them.
 """
 _first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
 """The first batch of each study with user code that this process has simulated, by packed study."""
-COMMAND_PREFIX = "; to reproduce it: "
 
 
 class Selection(msgspec.Struct, frozen=True):
@@ -178,7 +177,7 @@ def _failed_evaluation(
     if isinstance(failure, UserCodeError):
         command = reproduction_command(study, setting[0])
         raise UserCodeError(
-            failure.source, f"{failure.problem}{COMMAND_PREFIX}{command}", failure.legal
+            failure.source, f"{failure.problem}{REPRODUCED_BY}{command}", failure.legal
         ) from None
     reasons = {row[0].tobytes(): " ".join(str(failure).split())}
     changes = characteristics.change_objectives(setting)
@@ -191,12 +190,14 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     """
     system = system_of(task.study)
     system.vehicle.compile()  # outside the time limit
-    with end_if_longer(task.study.search.time_limit):
+    # Each run in a simulator of the user's own has the time limit.
+    limit = end_if_longer(task.study.search.time_limit)
+    with nullcontext() if system.has_simulator else limit:
         if task.selection != EVERYTHING:
             evaluations = _evaluate_parameters(task.selection.of(system), task, rows)
         else:
             evaluations = drive_and_score(system, rows, task.engine)
-    if user_code_names(task.study):
+    if user_code_names(task.study) and system.repeats == 1:
         _first_batches.setdefault(msgspec.msgpack.encode(task.study), (task, rows, evaluations))
     return evaluations
 
@@ -220,7 +221,7 @@ def repeat_first_batch(study: Study) -> None:
         raise UserCodeError(
             f"study {study.name!r}",
             f"{difference} when a worker simulated its first batch again at the end, with"
-            f" {' or '.join(user_code_names(study))}{COMMAND_PREFIX}{command}",
+            f" {' or '.join(user_code_names(study))}{REPRODUCED_BY}{command}",
             "user code that keeps nothing in a class or a module: this result depends on what was"
             " simulated before, so no result counts",
         )
@@ -273,21 +274,7 @@ def reproduction_command(study: Study, setting: FloatArray) -> str:
     """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the
     only point to which the study was reduced.
     """
-    characteristics = CharacteristicSet.of(study)
-    origin = study.origin
-    words = [f"{PROGRAM_COMMAND} simulate", shlex.quote(origin.called or study.name)]
-    words += ["--point", shlex.quote(origin.point)] if origin.point else []
-    words += [
-        f"--set {characteristic.name}={value!r}"
-        for characteristic, value in zip(characteristics, setting.tolist(), strict=True)
-        if value != characteristic.original
-    ]
-    words += (
-        ["--beyond"]
-        if ((setting < characteristics.lower) | (setting > characteristics.upper)).any()
-        else []
-    )
-    return " ".join(words)
+    return f"{simulate_command(study)} {CharacteristicSet.of(study).options(setting)}".rstrip()
 
 
 def verify_settings(task: Task, settings: FloatArray, worst: IntArray) -> str:

@@ -21,9 +21,14 @@ from typing import Any
 from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import this_process
+from safevar_sumo.plugins.process import REPRODUCED_BY, this_process
 from safevar_sumo.plugins.time_limit import TIMEOUT_MARK
 from safevar_sumo.shipped import PACKAGE
+
+CLOSING_SIGNAL = getattr(signal, "SIGUSR1", None)
+"""The signal upon which a worker ends its simulator, and itself; None on Windows."""
+CLOSING_TIME = 5.0
+"""Time that it has for this [s]; then it is killed."""
 
 
 class ProcessWorker:
@@ -67,6 +72,8 @@ class ProcessWorker:
             if is_user_file(file)
         ]
         place = f" in {frames[0][0]}, line {frames[0][1]}" if frames else ""
+        first_line = words.partition("\n")[0]
+        place += first_line if first_line.startswith(REPRODUCED_BY) else ""
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
         self._process.join()
@@ -79,6 +86,9 @@ class ProcessWorker:
         return f"the worker process died (exit code {self._process.exitcode}){place}"
 
     def end(self) -> None:
+        if CLOSING_SIGNAL is not None and self._process.pid and self._process.is_alive():
+            os.kill(self._process.pid, CLOSING_SIGNAL)
+            self._process.join(CLOSING_TIME)
         self._process.kill()
         self._executor.shutdown(cancel_futures=True)
 
@@ -87,11 +97,20 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
     path.inherit()
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)
+    if CLOSING_SIGNAL is not None:
+        signal.signal(CLOSING_SIGNAL, _end_in_order)
     tempfile.tempdir = str(last_words.parent)  # which ends with the pool; a worker is killed
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     this_process.last_words = file
     threading.Thread(target=_end_with_caller, daemon=True).start()
+
+
+def _end_in_order(*_: object) -> None:
+    """End the simulator of this process, and the process."""
+    if simulators := sys.modules.get("safevar_sumo.sumo.simulators"):
+        simulators.close_simulator()
+    os._exit(1)
 
 
 def _end_with_caller() -> None:
@@ -101,6 +120,9 @@ def _end_with_caller() -> None:
     caller = multiprocessing.parent_process()
     assert caller is not None
     caller.join()
+    if CLOSING_SIGNAL is not None:
+        os.kill(os.getpid(), CLOSING_SIGNAL)
+        time.sleep(CLOSING_TIME)
     os._exit(1)
 
 

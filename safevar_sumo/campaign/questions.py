@@ -8,7 +8,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -24,19 +24,24 @@ from safevar_sumo.campaign.evaluation import (
     carry_out,
     evaluate_settings,
     repeat_first_batch,
+    reproduction_command,
     system_of,
     verify_settings,
 )
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, differences
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle
+
+if TYPE_CHECKING:
+    from safevar_sumo.check import Finding
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
@@ -261,6 +266,28 @@ def check_code(study: Study, pool: Pool) -> Use:
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_bytes(msgspec.json.encode(use))
     return use
+
+
+def find_in_new_process(study: Study) -> list[Finding]:
+    """What a simulator of the user's own returns otherwise in a new process, for the original and
+    for both ends of the domains; nothing if the study says that it is not deterministic.
+    """
+    system = system_of(study)
+    if not system.has_simulator or system.repeats > 1:
+        return []
+    members = system.characteristics
+    settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
+    with open_pool(1) as pool:  # first, as a simulator may end its process
+        (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
+    here = drive_and_score(system, settings)
+    for row, difference in differences(here.results, there.results):
+        from safevar_sumo.check import Finding  # slow to import, and rarely needed
+
+        words = f"{difference} in a new process"
+        expected = "the same, to the bit; or repeats = N in [scenario]"
+        command = reproduction_command(study, settings[row])
+        return [Finding("repetition", words, study.source, command, expected)]
+    return []
 
 
 def _refuse_defects(task: Task) -> Use:

@@ -51,14 +51,15 @@ class FailedCheck(NamedTuple):
 
 
 class Extent(NamedTuple):
-    """How many vehicles are simulated, of how many if time allows, and at how many points of the
-    study.
+    """How many vehicles are simulated, of how many if time allows, at how many points of the study,
+    and how long that takes [s].
     """
 
     vehicles: int
     all_vehicles: int
     points: int
     all_points: int
+    seconds: float
 
 
 def try_simulations(
@@ -75,16 +76,25 @@ def try_simulations(
     many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(many))
     system = _system(study)
-    number = vehicles or _affordable(system, settings)
+    number, seconds = _affordable(system, settings)
+    if vehicles is not None:
+        number, seconds = vehicles, seconds * vehicles / number
     settings = settings[:number]
     all_points = len(assemble(study).points)
-    tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points))
+    tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points, seconds))
+
+    if system.repeats > 1:  # the study says that its simulator is not deterministic
+        drive_and_score(system, settings[:LEAST_SIMULATED])
+        return
 
     def load() -> Callable[[_Rows], ResultColumns]:
         system = _system(study)
         return lambda rows: drive_and_score(system, settings[rows]).results
 
-    yield from _try(load, region.characteristics, settings, progress)
+    expected = "the same, to the bit"
+    if system.has_simulator:
+        expected += "; or repeats = N in [scenario], where the mean of N runs counts"
+    yield from _try(load, region.characteristics, settings, progress, expected)
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
@@ -97,13 +107,17 @@ def try_simulations(
             yield FailedCheck("contract", found, reacts, setting)
 
 
-def _affordable(system: System, settings: FloatArray) -> int:
-    """The number of settings whose simulations take at most `LONGEST`, by the time of a few."""
-    drive_and_score(system, settings[:TIMED])  # loads what any first simulation loads
+def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
+    """The number of settings whose simulations take at most `LONGEST`, by the time of a few, or of
+    one in a simulator of the user's own; and the time that they take [s].
+    """
+    timed = settings[: 1 if system.has_simulator else TIMED]
+    drive_and_score(system, timed)  # loads what any first simulation loads
     start = time.perf_counter()
-    drive_and_score(system, settings[:TIMED])
-    seconds = RUNS_OF_ALL * (time.perf_counter() - start) / TIMED
-    return min(max(int(LONGEST / seconds), LEAST_SIMULATED), SIMULATED)
+    drive_and_score(system, timed)
+    seconds = RUNS_OF_ALL * (time.perf_counter() - start) / len(timed)
+    number = min(max(int(LONGEST / seconds), LEAST_SIMULATED), SIMULATED)
+    return number, number * seconds
 
 
 def try_algorithm(study: Study, name: str) -> Iterator[FailedCheck]:
@@ -128,6 +142,7 @@ def _try(
     characteristics: CharacteristicSet,
     settings: FloatArray,
     progress: Progress,
+    expected: str,
 ) -> Iterator[FailedCheck]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     # All settings at once, with code that is loaded anew for the other runs.
@@ -154,9 +169,7 @@ def _try(
             {name: values[rows] for name, values in outputs.items()}, other_outputs
         ):
             changes = _changes(characteristics, settings[rows[row]])
-            yield FailedCheck(
-                check, f"{difference} {circumstance}", "the same, to the bit", changes
-            )
+            yield FailedCheck(check, f"{difference} {circumstance}", expected, changes)
 
 
 def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:

@@ -140,9 +140,15 @@ class Lookup:
         member = self.find(shipped, name, key)
         if member.code is None:
             return member
-        base = next((base for base in bases if _derives(member.target, base)), None)
-        base = base or next((base for base in bases if not violation(member.target, base)), None)
-        base = base or next((base for base in bases if _has_some(member.target, base)), bases[-1])
+        target = member.target
+        near = [base for base in bases if _has_some(target, base)]
+        base = next(
+            (base for base in bases if _derives(target, base)),
+            next(
+                (base for base in bases if not violation(target, base)),
+                near[0] if len(near) == 1 else bases[-1],
+            ),
+        )
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(

@@ -61,6 +61,17 @@ class _Process:
 
 
 this_process = _Process()
+REPRODUCED_BY = "; to reproduce it: "
+"""What stands before a command that simulates a setting again."""
+
+
+def note_work(text: str) -> None:
+    """Note what this process, if it is a worker, works on, in case that it dies of it."""
+    if (words := this_process.last_words) is not None:
+        words.seek(0)
+        words.truncate()
+        words.write(f"{text}\n")
+        words.flush()
 
 
 class Interrupt(KeyboardInterrupt):

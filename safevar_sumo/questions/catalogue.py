@@ -12,7 +12,7 @@ import msgspec
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.errors import InputError, check_name, warn
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -271,6 +271,10 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
         yield name, description, "; ".join(domains)
 
 
+LONG = 10.0
+"""Time from which on `check` says first how long it takes [s]."""
+
+
 @contents("passed", "vehicles", "points", findings=FINDINGS, **TABLES)
 def check(
     name: str, *, ego: str | None = None, vehicles: Annotated[int | None, Range(1, 10_000)] = None
@@ -294,15 +298,25 @@ def check(
         return check_scenario(name, ego or "Ego", FINDINGS)
     # What loads SUMO is imported where it is needed.
     from safevar_sumo.campaign import check_algorithms
+    from safevar_sumo.campaign.questions import find_in_new_process
     from safevar_sumo.check import CHECKS, check_study, study_to_check
     from safevar_sumo.sumo.system import assemble
 
     study = study_to_check(name)
     extents: list[Extent] = []
+
+    def tell(extent: Extent) -> None:
+        """How long it takes, if it takes long."""
+        extents.append(extent)
+        if extent.seconds > LONG:
+            warn(f"{number_of(extent.vehicles, 'vehicle')}, about {extent.seconds:.0f} s")
+
+    in_new_process = find_in_new_process(study)  # first, as a simulator may end its process
     with open_progress(True) as progress:
-        findings = check_study(study, vehicles=vehicles, progress=progress, tell=extents.append)
+        findings = check_study(study, vehicles=vehicles, progress=progress, tell=tell)
     if not findings:
         check_algorithms(study, assemble(study))  # what the command `study` would refuse
+        findings = in_new_process
     rows = [
         (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
         for item in findings

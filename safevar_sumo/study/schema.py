@@ -104,11 +104,13 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
 
     The original vehicle drives in the same encounter as each variant, and must keep at least
     `margin` [m] between bodies there: otherwise the encounter does not count, as it shows nothing
-    of the variant.
+    of the variant. A simulator of the user's own that is not deterministic simulates each setting
+    `repeats` times: the mean of each metric counts, and the worst outcome.
     """
 
     search: Annotated[dict[str, Domain], ORDERED] = {}
     margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
+    repeats: Annotated[int, Meta(ge=1, le=1000)] = 1
 
     def __post_init__(self) -> None:
         if self.margin != ORIGINAL_MARGIN and not self.search:

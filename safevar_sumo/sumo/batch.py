@@ -22,7 +22,7 @@ from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
-from safevar_sumo.sumo.simulators import simulate_each
+from safevar_sumo.sumo.simulators import joined, simulate_each
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import LaneWorld, Traffic
@@ -34,6 +34,7 @@ from safevar_sumo.sumo.world import Api, SumoWorld
 def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluations:
     """The metrics and objectives of settings that have been simulated in `runs`."""
     is_invalid = runs.outcome == Outcome.INVALID_TEST
+    settings = np.tile(settings, (system.repeats, 1))
 
     # Metrics of runs are undefined in an invalid test.
     metrics = dict[str, FloatArray]()
@@ -47,13 +48,14 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
                     is_stated, own_values = runs.stated[name]
                     values = np.where(is_stated, own_values, values)
                 metrics[name] = np.where(is_invalid, np.nan, values)
-    return Evaluations(
+    found = Evaluations(
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
         metrics=metrics,
         **system.characteristics.change_objectives(settings),
     )
+    return found if system.repeats == 1 else joined(found, system.repeats)
 
 
 def reason_for_sumo(system: System) -> str:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.scenarios import Simulator
+from safevar_sumo.scenarios import Point, Simulator
 from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
 
+NOISE = ("noise", "noisy", "dropout", "jitter")
+"""Words of characteristics that are noise."""
+SEED = "seed"
+"""The parameter of a simulator that its noise is drawn from."""
 IN_SIMULATOR = "nothing: the simulator moves and drives the vehicle, in a weather of its own"
 
 
@@ -28,6 +34,9 @@ def check_tables(study: Study, scenario: type) -> None:
         "weather": study.weather,
     }
     if not issubclass(scenario, Simulator):
+        if study.scenario.repeats > 1:
+            problem = f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit"
+            raise InputError("", problem, "no repeats, or a simulator of the user's own")
         for key in ("vehicle.model", "ads.model", "weather"):
             if not given[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key
@@ -49,3 +58,22 @@ def check_tables(study: Study, scenario: type) -> None:
             raise InputError(
                 "", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR
             )
+
+
+def noise_remarks(characteristics: CharacteristicSet, points: Sequence[Point]) -> list[str]:
+    """A remark on characteristics that are noise, by their words, if all runs draw it from one
+    seed.
+    """
+    noisy = [
+        item.name
+        for item in characteristics
+        if any(word in f"{item.name} {item.meaning}".lower() for word in NOISE)
+    ]
+    seeds = {getattr(point.scenario, SEED, None) for point in points}
+    if not noisy or len(seeds) > 1:
+        return []
+    which = f"{SEED} = {seeds.pop()}" if None not in seeds else "one seed"
+    return [
+        f"{' and '.join(noisy)}: noise of {which}, and a limit may be that of this seed alone;"
+        f" several seeds are an axis of the matrix, such as over = {{ {SEED} = [1, 2, 3] }}"
+    ]

@@ -6,21 +6,25 @@ from __future__ import annotations
 
 import atexit
 import inspect
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from copy import copy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.plugins import UserCode, user_errors
+from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
     BoolArray,
     Contact,
     Encounter,
+    Evaluations,
     FloatArray,
     Outcome,
     SimulationRuns,
@@ -41,6 +45,15 @@ NEEDS = {
 """Metrics that a trace without a quantity does not define."""
 NEVER_DEFINED = ("pet",)
 """Metrics of which a trace of a simulator says nothing: it has no lateral distances."""
+SEVERITY = [
+    Outcome.COLLISION,
+    Outcome.INVALID_TEST,
+    Outcome.TIMEOUT,
+    Outcome.NEVER_MOVED,
+    Outcome.PASSED,
+    Outcome.STOPPED,
+]
+"""Outcomes of the rounds of a setting, the worst first."""
 NO_TRACE: Mapping[str, FloatArray] = {
     TIME: np.array([0.0, 1.0]),
     "speed": np.full(2, np.nan),
@@ -85,21 +98,66 @@ def close_simulator() -> None:
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at the system's only point, one after
-    another, each within the time limit.
+    another, each within the time limit; and as often as the study repeats each, one round after
+    another.
     """
     (point,) = system.points
-    vehicles, encounters = system.cut(settings)
+    rows = np.tile(settings, (system.repeats, 1))
+    vehicles, encounters = system.cut(rows)
     names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
     results = []
-    for vehicle, values in zip(vehicles.tolist(), encounters.tolist(), strict=True):
+    for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), rows, strict=True):
+        note_work(f"{REPRODUCED_BY}{system.command} {system.characteristics.options(row)}")
         scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
         assert isinstance(scenario, Simulator)
         with user_errors(system.source), end_if_longer(system.time_limit):
-            result = _kept.at(scenario).simulate(dict(zip(names, vehicle, strict=True)))
+            simulator = _kept.at(scenario)
+            with _end_worker():
+                result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
             if TIME not in result:
                 _check_names(scenario, result, system)
         results.append(result)
     return _runs_of(results, system, point.allowed_impact_speed)
+
+
+@contextmanager
+def _end_worker() -> Iterator[None]:
+    """Let a simulator that ends the program end this process, if it is a worker: a new one
+    simulates the setting again.
+    """
+    try:
+        yield
+    except SystemExit as end:
+        if this_process.last_words is not None:
+            os._exit(end.code if isinstance(end.code, int) else 1)
+        raise
+
+
+def joined(evaluations: Evaluations, repeats: int) -> Evaluations:
+    """Of N settings that were simulated in several rounds, in their order, the mean of each metric,
+    where it is defined, and the worst outcome. The safety degree of each round is kept beside.
+    """
+
+    def mean(values: FloatArray) -> FloatArray:
+        rounds = values.reshape(repeats, -1)
+        number = np.count_nonzero(~np.isnan(rounds), axis=0)
+        total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
+        return np.where(number, total / np.maximum(number, 1), np.nan)
+
+    n = len(evaluations) // repeats
+    outcomes = evaluations.outcome.reshape(repeats, n)
+    rank = {str(name): number for number, name in enumerate(SEVERITY)}
+    severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
+    rounds = evaluations.f_safe.reshape(repeats, n)
+    return replace(
+        evaluations.take(np.arange(n)),
+        outcome=outcomes[np.argmin(severity, axis=0), np.arange(n)],
+        collision_speed=mean(evaluations.collision_speed),
+        metrics={
+            **{name: mean(values) for name, values in evaluations.metrics.items()},
+            **{f"{SAFETY_DEGREE}_{k + 1}": values for k, values in enumerate(rounds)},
+        },
+    )
 
 
 def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System) -> None:

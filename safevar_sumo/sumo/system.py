@@ -4,6 +4,7 @@ other.
 
 from __future__ import annotations
 
+import shlex
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -27,6 +28,7 @@ from safevar_sumo.scenarios import (
     weather_of,
 )
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
@@ -37,6 +39,7 @@ from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
+from safevar_sumo.sumo.simulated_study import noise_remarks
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import (
@@ -77,6 +80,8 @@ class System:
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
     - `allowed_impact_speed` [m/s] is that of the only point; see `Point`.
+    - A simulator of the user's own simulates each setting `repeats` times.
+    - `command` simulates the original vehicle of the study.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
@@ -97,6 +102,8 @@ class System:
     sees_nobody: bool = False
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
+    repeats: int = 1
+    command: str = ""
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -185,7 +192,7 @@ class System:
         effect.
         """
         if self.has_simulator:
-            return []
+            return noise_remarks(self.characteristics, self.points)
         # On networks, vehicles and drivers.
         uses_traci = isinstance(self.ads, TraciController)
         remarks = [
@@ -277,6 +284,15 @@ class System:
         return self.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
 
 
+def simulate_command(study: Study) -> str:
+    """The command that simulates the original vehicle of a study, at the only point to which it was
+    reduced.
+    """
+    origin = study.origin
+    point = f" --point {shlex.quote(origin.point)}" if origin.point else ""
+    return f"{PROGRAM_COMMAND} simulate {shlex.quote(origin.called or study.name)}{point}"
+
+
 def assemble(study: Study) -> System:
     """Load the study's models and create them with their parameters.
 
@@ -353,6 +369,8 @@ def _assemble(study: Study) -> System:
         rater=rater,
         time_limit=study.search.time_limit,
         aggregate=WORST if study.matrix is None else study.matrix.aggregate,
+        repeats=study.scenario.repeats,
+        command=simulate_command(study),
     )
     if not study.scenario.search:
         return system

@@ -206,6 +206,16 @@ class CharacteristicSet:
     def __len__(self) -> int:
         return len(self.members)
 
+    def options(self, setting: FloatArray) -> str:
+        """The options of `simulate` that give a setting, shape (n,)."""
+        words = [
+            f"--set {item.name}={value!r}"
+            for item, value in zip(self.members, setting.tolist(), strict=True)
+            if value != item.original
+        ]
+        is_beyond = ((setting < self.lower) | (setting > self.upper)).any()
+        return " ".join([*words, *(["--beyond"] if is_beyond else [])])
+
     def __iter__(self) -> Iterator[Characteristic]:
         return iter(self.members)
 

@@ -4,6 +4,7 @@ and what it cannot do is refused.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import safevar_sumo as sv
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.records import Evaluations
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -282,3 +284,104 @@ def test_questions_answer_about_a_simulator(wall: Path, model: str) -> None:
         assert run(question, "results").stdout
     run("report", "results", "--quick", "--out", "page.html")
     assert Path("page.html").stat().st_size
+
+
+NOISY = """
+import random
+
+from models import Wall
+
+
+class Drifts(Wall):
+    def simulate(self, setting):
+        result = super().simulate(setting)
+        return {**result, "separation": result["separation"] + random.random()}
+
+
+class Ends(Wall):
+    def simulate(self, setting):
+        if setting["decel"] < 4 and END:
+            __import__("os")._exit(7)
+        return super().simulate(setting)
+"""
+
+
+def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wall: Path) -> None:
+    """The mean counts, each run is in the journal, and without repeats the study is refused."""
+    (wall.parent / "noisy.py").write_text(NOISY)
+    wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
+    assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
+    wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
+    assert json_of("check", "wall.toml")["numbers"]["passed"]
+    system = system_of(wall)
+    found = drive_and_score(system, np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
+    rounds = np.stack([found.metrics[f"safety_degree_{k}"] for k in range(1, 5)])
+    assert found.f_safe == pytest.approx(rounds.mean(axis=0))
+    assert len({*rounds[:, 0]}) == 4
+    assert found.outcome.tolist() == ["stopped", "collision", "stopped"]
+    run("study", "wall.toml", "--out", "results")
+    assert '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
+
+
+def test_the_worst_outcome_of_all_runs_counts() -> None:
+    names = np.array(["stopped", "passed", "passed", "collision", "stopped", "timeout"])
+    evaluations = Evaluations.undefined(np.zeros((6, 1)), "", METRICS, f_diff=0, f_num_diff=0)
+    nothing = np.zeros(6)
+    found = simulators.joined(
+        replace(
+            evaluations,
+            outcome=names,
+            collision_speed=np.array([np.nan, np.nan, np.nan, 4.0, np.nan, np.nan]),
+            f_diff=nothing,
+            f_num_diff=nothing,
+        ),
+        3,
+    )
+    assert found.outcome.tolist() == ["passed", "collision"]
+    assert found.collision_speed[1] == 4
+    assert np.isnan(found.collision_speed[0])
+
+
+def test_repeats_are_for_simulators_of_the_users_own() -> None:
+    with pytest.raises(InputError, match="repeats"):
+        sv.load_study("rain", scenario={"repeats": 2})
+
+
+def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:
+    noisy = STUDY.replace("delay = {", 'delay = { meaning = "noise of the brake",')
+    wall.write_text(noisy)
+    assert any("noise of one seed" in remark for remark in system_of(wall).remarks)
+    (wall.parent / "models.py").write_text(
+        MODELS.replace("    speed:", "    seed: int = 1\n    speed:")
+    )
+    wall.write_text(f'{noisy}\n[[matrix.tests]]\nname = "a"\nover = {{ seed = [1, 2, 3] }}\n')
+    system = system_of(wall)
+    assert not system.remarks
+    assert [point.name for point in system.points] == ["a, seed 1", "a, seed 2", "a, seed 3"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize("often", [1, 2])
+def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, often: int) -> None:
+    """What was simulated before is kept; the error names the setting and the command."""
+    end = f"len(open('ended', 'a+').write('x') and open('ended').read()) <= {often}"
+    (wall.parent / "noisy.py").write_text(NOISY.replace("END", end))
+    wall.write_text(STUDY.replace("models:Wall", "noisy:Ends"))
+    if often == 1:
+        run("study", "wall.toml", "--out", "results")
+        return
+    told = (
+        "exit code 7",
+        "to reproduce it: python -m safevar_sumo simulate wall.toml --set decel=3",
+    )
+    refused("study", "wall.toml", "--out", "results", message=told)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_simulators_are_closed_with_their_workers(wall: Path) -> None:
+    text = MODELS.replace("CLOSED.append(1)", "open('closed', 'a').write('x')")
+    (wall.parent / "models.py").write_text(text)
+    run("study", "wall.toml", "--out", "results")
+    assert len(Path("closed").read_text()) >= 2
