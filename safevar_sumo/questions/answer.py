@@ -95,6 +95,10 @@ class Contents(NamedTuple):
         return [*(name for name in self.numbers if name != ...), *columns]
 
 
+OF_ALL = ("driven", "rough", "simulations")
+"""Numbers that any answer may have."""
+
+
 def contents(
     *numbers: str | EllipsisType,
     lead: Any = "",
@@ -103,7 +107,7 @@ def contents(
 ) -> Callable[[AnswerFunction], AnswerFunction]:
     """Decorator: declares the names of all numbers that a function's answers may hold, and of the
     columns of their tables, so that its command refuses others before anything is computed; the
-    table that leads them, and the question that comes next. `driven` is among the numbers.
+    table that leads them, and the question that comes next. `OF_ALL` are among the numbers.
     """
     if lead:
         check_name("contents", f"lead = {lead!r} is no table that it declares", lead, tables)
@@ -114,7 +118,8 @@ def contents(
             answer = function(*arguments, **options)
             return replace(answer, lead=answer.lead or lead)
 
-        vars(with_lead)["contents"] = Contents(("driven", *numbers), tables, lead, next)
+        names = tuple(dict.fromkeys((*OF_ALL, *numbers)))
+        vars(with_lead)["contents"] = Contents(names, tables, lead, next)
         return cast("AnswerFunction", with_lead)
 
     return declare

@@ -90,6 +90,13 @@ OWN_SET = "the study's own parameter set alone, and "
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
+    (
+        *("simulations", Annotated[int | None, Range(1, 1_000_000_000)], None),
+        (
+            "At most so many simulations: a rough answer where more are usual. By default, as many"
+            " as take 15 minutes where a simulation takes long."
+        ),
+    ),
     ("pool", Any, None, "Pool that simulates; by default new worker processes."),
     (
         "progress",
@@ -221,6 +228,7 @@ class Question:
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
+        simulations: int | None = None,
         pool: Pool | None = None,
         progress: bool | Progress = False,
         as_it_is_now: bool = False,
@@ -249,17 +257,20 @@ class Question:
 
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
+        command += "" if simulations is None else f" --simulations {simulations}"
+        how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
         with keep_simulations(command, fresh=fresh):
-            if self._is_long(values) and progress is True and sys.stderr.isatty():
+            is_long = self._is_long(values) and simulations is None
+            if is_long and progress is True and sys.stderr.isatty():
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
                     rough = {**values, "quick": True}
-                    first = self.answer(subjects, rough, pool=pool, jobs=jobs, progress=part)
+                    first = self.answer(subjects, rough, **how, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
-            answer = self.answer(subjects, values, pool=pool, jobs=jobs, progress=progress)
+            answer = self.answer(subjects, values, **how, progress=progress)
         declared = contents_of(self.compute)
         if declared is None or not declared.next:
             return replace(answer, command=command)
@@ -277,6 +288,7 @@ class Question:
         *,
         pool: Pool | None = None,
         jobs: int | None = None,
+        simulations: int | None = None,
         progress: bool | Progress = False,
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
@@ -289,6 +301,9 @@ class Question:
         # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
+            account = evaluator.account
+            account.asked = account.most = simulations
+            account.is_question = True
             option = next((one.name for one in self.options if one.metavar == CRITERION), "")
             criterion = values.get(option)
             cites = ""
@@ -318,11 +333,15 @@ class Question:
             reason = about.no_verdict
             evaluator.end()
         numbers = {"driven": not reason, **answer.numbers}
-        rough = ""
+        rough = limited = ""
+        if account.most is not None:
+            numbers |= {"rough": True, "simulations": account.spent}
+            limited = f"Rough answer (--simulations {account.most}):"
         if self.has_rough_answer:
             is_of_own_set = numbers.get("fits", 1) in (None, 1)
             rough = ROUGH.format(OWN_SET if is_of_own_set else "") if values.get(QUICK) else ""
             numbers["rough"] = bool(rough or numbers.get("rough"))
+        rough = limited or rough
         verdict = " ".join(
             filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )

@@ -261,6 +261,15 @@ setting. The search finds every unsafe stretch of the line that is as long as th
 """
 
 
+COARSE_PARTS = (8, 4, 4)
+"""The same where few simulations are allowed."""
+
+
+def settings_of_line(parts: Sequence[int]) -> int:
+    """How many settings of a line are simulated."""
+    return sum(parts) - len(parts) + 1
+
+
 class BoundaryState(StrEnum):
     """What lies on a line from the original just below the smallest share of the line that is
     unsafe.
@@ -322,9 +331,12 @@ def find_cause_limits(
         out=np.zeros(ends.shape),
         where=is_scaled,
     )
-    with evaluator.stage(BOUNDARIES, len(starts) * (sum(PARTS) - len(PARTS) + 1)):
+    number = len(starts) * settings_of_line(PARTS)
+    is_coarse = evaluator.left is not None and evaluator.left < 2 * number
+    parts = COARSE_PARTS if is_coarse else PARTS
+    with evaluator.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
         shares, limits, states = _first_unsafe_shares(
-            evaluator, starts, ends, unsafe, thresholds.max(axis=1)
+            evaluator, starts, ends, unsafe, thresholds.max(axis=1), parts
         )
 
     # The limits of each cause, from its lines.
@@ -360,19 +372,24 @@ def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> 
 
 
 def _first_unsafe_shares(
-    evaluator: Evaluator, starts: FloatArray, ends: FloatArray, unsafe: Unsafe, lowest: FloatArray
+    evaluator: Evaluator,
+    starts: FloatArray,
+    ends: FloatArray,
+    unsafe: Unsafe,
+    lowest: FloatArray,
+    parts: Sequence[int],
 ) -> tuple[FloatArray, FloatArray, list[BoundaryState]]:
     """The first unsafe share of each of M lines, shape (M,), the setting there, shape (M, n), and
     what lies just below it.
 
     A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`,
-    shape (M,), on, and its end must be unsafe. The error is at most 1 / 16,384 of the line above
-    `lowest`. A setting that cannot be simulated is neither safe nor unsafe; just below the share,
-    it gives the state `NOT_SIMULATED`.
+    shape (M,), on, and its end must be unsafe. Rounds divide it into `parts`, whose product is
+    16,384 by default. A setting that cannot be simulated is neither safe nor unsafe; just below the
+    share, it gives the state `NOT_SIMULATED`.
     """
     # The first unsafe share of each line.
     found = find_boundaries(
-        starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), PARTS, lowest
+        starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), parts, lowest
     )
 
     # What ends the line on the safe side.

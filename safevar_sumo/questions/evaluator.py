@@ -23,6 +23,7 @@ from safevar_sumo.campaign.questions import (
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.price import Account, seconds_of_simulation, simulations_of_setting
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
@@ -52,6 +53,8 @@ class Evaluator:
     ----------
     simulated
         Number of settings simulated so far; of equal settings in one call only one is simulated.
+    account
+        The simulations that the question may do.
     measure, undefined
         The metric of the question's criterion, if it has one; for each call, also of evaluators of
         other studies, the number of settings without a collision that have no such value, and of
@@ -73,6 +76,7 @@ class Evaluator:
         self.phases = Phases(progress)
         self._verified = verified
         self.simulated = 0
+        self.account = Account()
         self.measure = ""
         self.undefined = list[tuple[int, int]]()
 
@@ -105,7 +109,23 @@ class Evaluator:
         """Plan the phases of a question, each with the number of settings that it is expected to
         simulate.
         """
-        self.phases.plan(settings, len(self.system.points))
+        expected = sum(settings.values())
+        if self.account.is_question:
+            seconds = seconds_of_simulation(self.study, self._pool)
+            self.account.open(expected * self._each, seconds)
+        share = 1.0 if self.left is None else self.left / expected
+        planned = {name: share * number for name, number in settings.items()}
+        self.phases.plan(planned, len(self.system.points))
+
+    @property
+    def left(self) -> int | None:
+        """The number of settings that may follow; None without a limit."""
+        account = self.account
+        return None if account.most is None else int(account.left) // self._each
+
+    @property
+    def _each(self) -> int:
+        return simulations_of_setting(self.study)
 
     def stage(
         self, name: str, total: float | None = None
@@ -131,6 +151,7 @@ class Evaluator:
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         total = len(np.unique(settings, axis=0))
+        self.account.spend(total * self._each)
         points = len(selection.of(system_of(self.study)).points)
         self.phases.begin_part(stage, points * total)
         evaluations = evaluate_all(
@@ -313,8 +334,9 @@ class Evaluator:
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        evaluations = self.evaluate(settings[:FIRST_SETTINGS], stage)
-        if not evaluations.collided.any():
+        first = FIRST_SETTINGS if self.left is None else min(FIRST_SETTINGS, self.left // 8 + 1)
+        evaluations = self.evaluate(settings[:first], stage)
+        if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 
@@ -344,6 +366,7 @@ class Evaluator:
         other.phases = self.phases
         other.measure = self.measure
         other.undefined = self.undefined
+        other.account = self.account
         return other
 
 

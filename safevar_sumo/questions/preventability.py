@@ -84,10 +84,12 @@ the finite population), the share itself if all collisions were simulated.
 
 
 def has_reference_drivers(evaluator: Evaluator) -> bool:
-    """Whether reference drivers can drive instead: not in a simulator of the user's own, which
-    drives itself, nor in a rating, where every vehicle collides in some cell.
+    """Whether reference drivers drive instead: not in a simulator of the user's own, which drives
+    itself, nor in a rating, where every vehicle collides in some cell, nor where few simulations
+    are allowed.
     """
-    return not (is_rated(evaluator.study) or evaluator.system.has_simulator)
+    drives_itself = is_rated(evaluator.study) or evaluator.system.has_simulator
+    return not drives_itself and evaluator.left is None
 
 
 def assess_sample(

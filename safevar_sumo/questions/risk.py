@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
+from scipy.stats import norm
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import F_SAFE, Unsafe
@@ -37,7 +38,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, percentage, with_scope
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, IntArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
 
@@ -48,6 +49,12 @@ SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
 """Phases of progress."""
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
+LEAST_BASE_POINTS = 20
+"""Least number of base points, where few simulations are allowed; with fewer, a linear regression
+says what decides.
+"""
+TINY = 1e-300
+"""In place of a variance that is 0."""
 RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
@@ -118,17 +125,32 @@ def risk(
     study = evaluator.study
     model = VariationModel(evaluator.study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
-    design = BASE_POINTS * (len(evaluator.characteristics) + 2) if has_design else 0
-    evaluator.plan({SAMPLING: samples, SENSITIVITY: design})
+    block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
+    evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
     criterion = evaluator.choose_criterion(unsafe, subject)
+    base = BASE_POINTS if has_design else 0
+    if (left := evaluator.left) is not None:
+        has_design &= left >= LEAST_BASE_POINTS * block
+        base = min(BASE_POINTS, max(LEAST_BASE_POINTS, left // (2 * block))) if has_design else 0
+        samples = min(samples, left - base * block)
     rng = np.random.default_rng(study.search.seed)
     batches = []
     for start in range(0, samples, VEHICLES_PER_CALL):
         vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
         batches.append(evaluator.evaluate(vehicles, SAMPLING))
 
+    # Where few simulations are allowed, the design's own vehicles count, too: of each block the
+    # first and the last.
+    design = None
+    if has_design:
+        design = _design(evaluator, model, base)
+        if left is not None:
+            is_drawn = np.arange(len(design)) % block % (block - 1) == 0
+            batches.append(design.take(is_drawn))
+
     # How many are unsafe.
     drawn = Evaluations.concatenate(batches)
+    samples = len(drawn)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures = int(criterion.of(simulated).sum())
     total = len(simulated)
@@ -139,8 +161,10 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
-    if has_design:
-        table = sobol_indices(evaluator, model, criterion, confidence)
+    if design is not None:
+        table = sobol_indices(evaluator, design, criterion, confidence)
+    elif left is not None and not model.is_correlated:
+        table = regression_indices(evaluator, simulated, criterion, confidence)
     else:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
     numbers = {
@@ -162,6 +186,8 @@ def risk(
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
+    if left is not None and base < BASE_POINTS:
+        verdict += _in_place_of_design(base, block)
     verdict += "" if failures else _bound_in_words(high, total, confidence)
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
@@ -243,23 +269,77 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"
 
 
-def sobol_indices(
-    evaluator: Evaluator, model: VariationModel, criterion: Unsafe, confidence: float
-) -> pd.DataFrame:
-    """Sobol indices, first order and total, of independent characteristics; undefined where nothing
-    varies, or too few settings are unsafe or safe. Base points with a setting that could not be
-    simulated do not count.
+def _in_place_of_design(base: int, block: int) -> str:
+    """How the shares were found with few simulations."""
+    if base:
+        points = f"{base} base points in place of {BASE_POINTS}"
+        return f" The shares are rough: they come from Saltelli's design with {points}."
+    return (
+        " The shares are those that a linear regression explains, without interactions: Sobol"
+        f" indices need {LEAST_BASE_POINTS * block:,} settings."
+    )
+
+
+def _problem(evaluator: Evaluator) -> JsonObject:
+    """SALib's problem: each characteristic by its quantile."""
+    names = list(evaluator.characteristics.names)
+    return {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
+
+
+def _design(evaluator: Evaluator, model: VariationModel, base: int) -> Evaluations:
+    """Saltelli's design of `base` points, in which each characteristic varies alone and with all
+    others.
     """
-    from SALib.analyze import sobol as analysis
     from SALib.sample import sobol as design
 
-    # A design in which each characteristic varies alone and with all others.
-    names = list(evaluator.characteristics.names)
     seed = evaluator.study.search.seed % 2**32
-    problem = {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
-    points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
-    evaluations = evaluator.evaluate(model.settings(points), SENSITIVITY)
-    is_complete = np.repeat(evaluations.valid.reshape(BASE_POINTS, -1).all(axis=1), len(names) + 2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its properties hold for powers of 2
+        points = design.sample(_problem(evaluator), base, calc_second_order=False, seed=seed)
+    return evaluator.evaluate(model.settings(points), SENSITIVITY)
+
+
+def regression_indices(
+    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
+) -> pd.DataFrame:
+    """The share of the variance that each of the independent characteristics has in a linear
+    regression: the square of its standardised coefficient (Saltelli et al. 2008, Global Sensitivity
+    Analysis, 1.2.5), with its bootstrap interval.
+    """
+    names = list(evaluator.characteristics.names)
+    spread = np.std(drawn.settings, axis=0)
+    inputs = (drawn.settings - drawn.settings.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+
+    def shares(rows: IntArray, output: FloatArray) -> FloatArray:
+        design = np.column_stack([np.ones(len(rows)), inputs[rows]])
+        slopes, *_ = np.linalg.lstsq(design, output[rows], rcond=None)
+        return np.asarray(slopes[1:] ** 2 / max(float(np.var(output[rows])), TINY))
+
+    def indices_of(output: FloatArray) -> Indices:
+        rng = np.random.default_rng(evaluator.study.search.seed)
+        n = len(output)
+        resampled = [shares(rng.integers(0, n, n), output) for _ in range(RESAMPLES)]
+        half = norm.ppf(0.5 + confidence / 2) * np.std(resampled, axis=0, ddof=1)
+        return {"S1": shares(np.arange(n), output), "S1_conf": half}
+
+    kinds = {"first": ("S1", "linear, of a regression"), "total": UNDEFINED}
+    return _table(names, drawn, criterion, indices_of, kinds)
+
+
+def sobol_indices(
+    evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
+) -> pd.DataFrame:
+    """Sobol indices, first order and total, of independent characteristics, from Saltelli's design;
+    undefined where nothing varies, or too few settings are unsafe or safe. Base points with a
+    setting that could not be simulated do not count.
+    """
+    from SALib.analyze import sobol as analysis
+
+    problem = _problem(evaluator)
+    names = problem["names"]
+    seed = evaluator.study.search.seed % 2**32
+    block = len(names) + 2
+    is_complete = np.repeat(evaluations.valid.reshape(-1, block).all(axis=1), block)
 
     indices_of = partial(
         analysis.analyze,

@@ -56,8 +56,8 @@ SEVERITY = [
 """Outcomes of the rounds of a setting, the worst first."""
 NO_TRACE: Mapping[str, FloatArray] = {
     TIME: np.array([0.0, 1.0]),
-    "speed": np.full(2, np.nan),
-    "separation": np.full(2, np.nan),
+    "speed": np.zeros(2),
+    "separation": np.full(2, np.inf),
 }
 """What stands in place of the trace of a run that has none."""
 

@@ -144,6 +144,7 @@ def compare(
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
     evaluator.plan({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
+    samples = samples if evaluator.left is None else max(min(samples, evaluator.left // 6), 1)
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):

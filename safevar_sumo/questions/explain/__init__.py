@@ -70,6 +70,8 @@ COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 NO_COLLISION_NUMBERS: JsonObject = dict.fromkeys(COLLISION_NUMBERS)
 QUICK_LIMIT = 4_000
 """Approximate number of simulations for minimal causes in a rough answer."""
+FOR_ONE = 800
+"""Settings for each failure that is explained, where few simulations are allowed."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
 """The last phases of progress, with their usual numbers of settings."""
 SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
@@ -136,7 +138,11 @@ def explain(
     settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
     evaluator.plan({TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)} | LATER)
 
-    # The failures, and the minimal causes of a sample of them.
+    # The failures, and the minimal causes of a sample of them; of one where few simulations are
+    # allowed.
+    if evaluator.left is not None:
+        fits, limit = 0, evaluator.left // 4
+        top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
     reasons, sample, causes = choose_failures(population, evaluator, limit, top)

@@ -141,6 +141,8 @@ class _Candidates(NamedTuple):
 def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     """Settings drawn from a study's whole domain."""
     number = RATED_SAMPLED_SETTINGS if is_rated(study) else SAMPLED_SETTINGS
+    if evaluator.left is not None:
+        number = min(number, max(evaluator.left // 8, 1))
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
     return _Candidates(
@@ -191,11 +193,10 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
     # Causes of a sample, and of failures that matter.
     limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
-    reasons = _failures_that_matter(population)
+    reasons = dict(list(_failures_that_matter(population).items())[:top])
     analysed = sorted({*sample, *reasons})
     found = find_minimal_causes(evaluator, settings[analysed], population.unsafe)
     causes = dict(zip(analysed, found, strict=True))
-    reasons = dict(list(reasons.items())[:top])
     runs = population.evaluations
 
     # For each distinct cause that is missing, the simplest failure that has it.

@@ -15,6 +15,8 @@ NEIGHBOURS = "neighbours"
 """The stage of progress."""
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
+LEAST_NEIGHBOURS = 8
+"""With fewer, where few simulations are allowed, the share is unknown."""
 STEP_FACTORS: Sequence[float] = (1.0, 0.5, 2.0)
 """Factors by which the study's time step is multiplied; the step itself comes first."""
 MIN_ROBUST_SHARE = 0.8
@@ -22,16 +24,18 @@ MIN_ROBUST_SHARE = 0.8
 
 
 def draw_neighbours(
-    characteristics: CharacteristicSet, settings: FloatArray, seed: int
+    characteristics: CharacteristicSet,
+    settings: FloatArray,
+    seed: int,
+    count: int = NEIGHBOUR_COUNT,
 ) -> FloatArray:
-    """The neighbours of M settings, shape (M, n), those of one setting after those of another.
+    """The neighbours of M settings, shape (M, n), `count` of each, those of one setting after those
+    of another.
 
     A neighbour differs from its setting by at most the filter's threshold.
     """
     n = len(characteristics)
-    offsets = (
-        np.random.default_rng(seed).uniform(-1, 1, (NEIGHBOUR_COUNT, n)) * characteristics.threshold
-    )
+    offsets = np.random.default_rng(seed).uniform(-1, 1, (count, n)) * characteristics.threshold
     return np.clip(
         settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper
     ).reshape(-1, n)
@@ -49,7 +53,14 @@ def robust_shares(
 
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
-    neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.study.search.seed)
+    count = NEIGHBOUR_COUNT
+    if evaluator.left is not None:
+        count = min(count, evaluator.left // (6 * max(len(settings), 1)))
+        factors = factors[:1]
+    if count < LEAST_NEIGHBOURS:
+        return np.full((len(settings), len(factors)), np.nan)
+    seed = evaluator.study.search.seed
+    neighbours = draw_neighbours(evaluator.characteristics, settings, seed, count)
     shares = []
     if evaluator.system.has_simulator:  # which keeps its own time step
         factors = (1.0,)
@@ -60,7 +71,7 @@ def robust_shares(
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
             is_unsafe, is_valid = (
-                flags.reshape(len(settings), NEIGHBOUR_COUNT)
+                flags.reshape(len(settings), count)
                 for flags in (unsafe.of(evaluations), evaluations.valid)
             )
             shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))

@@ -206,7 +206,8 @@ def causes_table(
     # How many failures have a cause with the same directions; robust causes come first.
     share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
     kinds = [directions(evaluator.characteristics, cause.changes) for cause in causes]
-    shares = [share_of.get(kind, 0.0) for kind in kinds]
+    none = 0.0 if share_of else np.nan  # without a sample, no share is known
+    shares = [share_of.get(kind, none) for kind in kinds]
     is_robust = robust >= MIN_ROBUST_SHARE
     order = np.lexsort([-robust, -np.where(is_robust, shares, 0.0), ~is_robust])
     solution_of = np.repeat(range(len(solutions)), [len(group) for group in causes_of])

@@ -8,12 +8,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
+from safevar_sumo.questions.tolerance.frugal import answer_roughly
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
     INTERVALS,
@@ -137,4 +139,10 @@ def tolerance(
         left_out=names_left_out(whole.study, study),
         smaller=smaller,
     )
-    return answer_limits(asked)
+    is_safe = not asked.unsafe.of(original)[0]
+    if evaluator.left is None or not is_safe:
+        return answer_limits(asked)
+    if specified or up_to is not None or is_rated(study):
+        problem = "few simulations find limits, and keep none that is given, nor up to a value"
+        raise InputError("simulations", problem, "no --simulations, or no limits and no --up-to")
+    return answer_roughly(asked)

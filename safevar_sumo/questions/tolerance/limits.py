@@ -27,6 +27,7 @@ from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.rows import (
     CHARACTERISTIC,
     LIMITS,
+    LIMITS_TITLE,
     UNCERTAINTY,
     limit_rows,
     uncertainty_rows,
@@ -55,7 +56,6 @@ from safevar_sumo.vehicles.region import REJECTIONS
 OWN_SET_STAGE = "joint limits with the study's own parameter set"
 OTHER_SETS_STAGE = "limits in each further parameter set"
 """Phases of progress; the first has a round for each box, the second one for each set."""
-LIMITS_TITLE = "Limits, rounded to the safe side"
 INTERVALS: Columns = {
     **CHARACTERISTIC,
     "state": "safe, unsafe, not_simulated, or infeasible: a constraint is violated",

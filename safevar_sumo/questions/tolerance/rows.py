@@ -26,6 +26,7 @@ CHARACTERISTIC: Columns = {
     "characteristic": "characteristic of the vehicle",
     "unit": "unit of its values",
 }
+LIMITS_TITLE = "Limits, rounded to the safe side"
 LIMITS: Columns = {
     **CHARACTERISTIC,
     "original": Column("", "value of the original vehicle", ".6g"),

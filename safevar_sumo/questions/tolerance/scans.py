@@ -102,6 +102,8 @@ def scan(
         (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
     )
     number = number or usual
+    if evaluator.left is not None:
+        number = max(min(number, evaluator.left // (6 * len(scanned))), 2)
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [
         np.union1d(np.linspace(*end, number), item.original)

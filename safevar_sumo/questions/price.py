@@ -1,0 +1,115 @@
+"""What a question costs where a simulation takes long: how many simulations it takes, how long that
+is, and how many it may do.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+
+from rich.console import Console
+
+from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.errors import InputError
+from safevar_sumo.study import Study
+from safevar_sumo.terminal import print_text
+from safevar_sumo.vehicles import CharacteristicSet
+
+LONGEST = 900.0
+"""Time up to which a question does by default all that it is made for [s]."""
+DIGITS = 2
+"""Digits of a number of simulations that is derived from a time."""
+
+
+@dataclass
+class Account:
+    """The simulations of a question, also of its evaluators of other studies.
+
+    Attributes
+    ----------
+    asked
+        The largest number that the user allows; None if he says nothing.
+    is_question
+        Whether a question asks, which says first what it costs.
+    most
+        The largest number of simulations; None if there is none.
+    spent
+        Simulations so far.
+    """
+
+    asked: int | None = None
+    is_question: bool = False
+    most: int | None = None
+    spent: int = 0
+
+    @property
+    def left(self) -> float:
+        """Simulations that may follow."""
+        return float("inf") if self.most is None else self.most - self.spent
+
+    def spend(self, simulations: int) -> None:
+        """Count simulations that begin.
+
+        Raises
+        ------
+        InputError
+            If they are more than may follow.
+        """
+        self.spent += simulations
+        if self.left < 0:
+            problem = f"{self.most:,} do not suffice: {self.spent:,} are needed to go on"
+            raise InputError("simulations", problem, "a larger number")
+
+    def open(self, expected: float, seconds: float | None) -> None:
+        """Allow what the user allows, or all if that does not take too long; `expected` simulations
+        are planned, one of which takes so many seconds, None for an unknown time that is short.
+        """
+        self.most = self.asked
+        if self.asked is not None and self.asked >= expected:
+            self.most = None
+        if seconds is None:
+            return
+        if self.asked is None and expected * seconds > LONGEST:
+            self.most = round_down(LONGEST / seconds)
+        number = min(expected, float("inf") if self.most is None else self.most)
+        words = f"about {number:,.0f} simulations, about {_duration(number * seconds)}"
+        if self.most is not None:
+            words = f"at most {words.removeprefix('about ')}, of about {expected:,.0f} in full"
+        print_text(Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s)")
+
+
+def round_down(number: float) -> int:
+    """A number of simulations with `DIGITS` digits, at least 1."""
+    whole = max(int(number), 1)
+    unit = 10 ** max(len(str(whole)) - DIGITS, 0)
+    return int(whole // unit * unit)
+
+
+def seconds_of_simulation(study: Study, pool: Pool) -> float | None:
+    """How long a simulation takes, by all workers together [s]; None where it takes milliseconds,
+    as in SUMO.
+    """
+    system = system_of(study)
+    if not system.has_simulator:
+        return None
+    original = CharacteristicSet.of(study).original_settings
+    jobs = [(Task(study=study), original)] * pool.workers
+    carry_out(evaluate_settings, jobs, pool)  # workers start, and so do their simulators
+    start = time.perf_counter()
+    carry_out(evaluate_settings, jobs, pool)
+    return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(study))
+
+
+def simulations_of_setting(study: Study) -> int:
+    """How many simulations a setting takes: at each point, as often as it is repeated, and beside
+    the original vehicle in a study that searches its scenario.
+    """
+    return len(system_of(study).points) * study.scenario.repeats * (1 + bool(study.scenario.search))
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}"

@@ -1,0 +1,125 @@
+"""Questions with few simulations: they keep to the number, say that they are rough, and agree with
+the closed form.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.errors import InputError
+from safevar_sumo.questions import price
+from safevar_sumo.questions.price import Account, round_down
+from tests.in_process import InlinePool, run
+from tests.scenarios.test_simulated import MODELS, STUDY
+
+CLEARANCE = 40 - 15 * 0.5
+"""What is left for braking [m]."""
+
+
+@pytest.fixture
+def rig(in_tmp: Path) -> str:
+    (in_tmp / "models.py").write_text(MODELS)
+    (in_tmp / "rig.toml").write_text(STUDY.replace("models:Wall", "models:Rig"))
+    return "rig.toml"
+
+
+def keeps(decel: float, delay: float, clearance: float = 0.0) -> bool:
+    return CLEARANCE - 15 * delay - 15**2 / 2 / decel >= clearance
+
+
+@pytest.mark.parametrize("question", ["risk", "rules", "explain", "tolerance", "compare"])
+@pytest.mark.parametrize("number", [150, 700])
+def test_a_question_keeps_to_the_number_of_simulations(
+    rig: str, question: str, number: int
+) -> None:
+    others = [rig] if question == "compare" else []
+    pool = InlinePool()
+    answer = getattr(sv, question)(rig, *others, simulations=number, pool=pool, fresh=True)
+    assert answer.numbers["rough"]
+    assert answer.numbers["simulations"] <= number
+    assert f"--simulations {number}" in answer.verdict
+    assert f"--simulations {number}" in answer.command
+
+
+def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> None:
+    answer = sv.tolerance(rig, simulations=400, pool=InlinePool())
+    limits = answer.tables["limits"].set_index("characteristic")
+    decel = limits.loc["decel", "together_low"]
+    delay = limits.loc["delay", "together_high"]
+    assert keeps(decel, delay, 0.3)
+    assert not keeps(decel - 1.5, delay, 0.3)
+    alone = limits.loc["decel", "alone_low"]
+    assert keeps(alone, 0.0, 0.3)
+    assert not keeps(alone - 0.5, 0.0, 0.3)
+    assert answer.numbers["kept"] is None
+
+
+def test_no_joint_limits_are_stated_that_nothing_was_tried_in(rig: str) -> None:
+    answer = sv.tolerance(rig, simulations=20, pool=InlinePool())
+    assert "did not suffice" in answer.verdict
+    assert answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+
+
+def test_the_regression_names_the_shares_of_a_linear_function(rig: str) -> None:
+    """Shares add up to what a regression explains, and the steeper characteristic has more."""
+    answer = sv.risk(rig, simulations=70, pool=InlinePool())
+    shares = answer.tables["sensitivity"].set_index("characteristic")["degree_first"]
+    assert "linear regression" in answer.verdict
+    assert 0.6 < shares.sum() <= 1.2
+    rng = np.random.default_rng(0)
+    decel, delay = rng.uniform([3, 0], [9, 1], (100_000, 2)).T
+    rest = CLEARANCE - 15 * delay - 15**2 / 2 / decel
+    degree = np.where(rest < 0, -np.sqrt(np.maximum(-2 * decel * rest, 0)), rest)
+    expected = {
+        name: np.corrcoef(values, degree)[0, 1] ** 2
+        for name, values in (("decel", decel), ("delay", delay))
+    }
+    assert shares.to_dict() == pytest.approx(expected, abs=0.2)
+
+
+def test_indices_of_few_simulations_come_from_a_smaller_design(rig: str) -> None:
+    answer = sv.risk(rig, simulations=600, pool=InlinePool())
+    usual = sv.risk(rig, pool=InlinePool())
+    few, many = (
+        one.tables["sensitivity"].set_index("characteristic")["degree_total"]
+        for one in (answer, usual)
+    )
+    assert few.to_dict() == pytest.approx(many.to_dict(), abs=0.2)
+    assert answer.numbers["probability"] == pytest.approx(usual.numbers["probability"], abs=0.1)
+    assert "simulations" not in usual.numbers
+
+
+def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
+    with pytest.raises(InputError, match="few simulations"):
+        sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=InlinePool())
+
+
+def test_too_few_simulations_are_refused(rig: str) -> None:
+    with pytest.raises(InputError, match="1 do not suffice"):
+        sv.explain(rig, simulations=1, pool=InlinePool())
+
+
+def test_what_takes_long_by_default_is_limited_and_said_first(
+    rig: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    account = Account(is_question=True)
+    account.open(10_000, 0.4)
+    assert account.most == 2200
+    assert "at most 2,200 simulations, about 0:14:40, of about 10,000" in capsys.readouterr().err
+    other = Account(is_question=True)
+    other.open(1000, 0.4)
+    assert other.most is None
+    assert "about 1,000 simulations, about 0:06:40" in capsys.readouterr().err
+    assert round_down(0.2) == 1
+
+
+def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(price, "LONGEST", 0.5)
+    monkeypatch.setattr("safevar_sumo.questions.evaluator.seconds_of_simulation", lambda *_: 0.001)
+    output = run("rules", rig)
+    assert "at most 500 simulations" in output.stderr
+    assert output.stdout.startswith("Rough answer (--simulations 500)")
