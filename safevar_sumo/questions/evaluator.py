@@ -111,7 +111,7 @@ class Evaluator:
         """
         expected = sum(settings.values())
         if self.account.is_question:
-            seconds = seconds_of_simulation(self.study, self._pool)
+            seconds = seconds_of_simulation(self.study, self.system, self._pool)
             self.account.open(expected * self._each, seconds)
         share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
@@ -123,9 +123,15 @@ class Evaluator:
         account = self.account
         return None if account.most is None else int(account.left) // self._each
 
+    def at_most(self, number: int, part: int = 1) -> int:
+        """A number of settings; where few simulations are allowed, at most this part of those that
+        may follow, and at least 1.
+        """
+        return number if self.left is None else max(min(number, self.left // part), 1)
+
     @property
     def _each(self) -> int:
-        return simulations_of_setting(self.study)
+        return simulations_of_setting(self.system)
 
     def stage(
         self, name: str, total: float | None = None
@@ -334,7 +340,7 @@ class Evaluator:
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        first = FIRST_SETTINGS if self.left is None else min(FIRST_SETTINGS, self.left // 8 + 1)
+        first = self.at_most(FIRST_SETTINGS, 8)
         evaluations = self.evaluate(settings[:first], stage)
         if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, system_of
+from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -87,11 +88,10 @@ def round_down(number: float) -> int:
     return int(whole // unit * unit)
 
 
-def seconds_of_simulation(study: Study, pool: Pool) -> float | None:
+def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
     """How long a simulation takes, by all workers together [s]; None where it takes milliseconds,
     as in SUMO.
     """
-    system = system_of(study)
     if not system.has_simulator:
         return None
     original = CharacteristicSet.of(study).original_settings
@@ -99,14 +99,15 @@ def seconds_of_simulation(study: Study, pool: Pool) -> float | None:
     carry_out(evaluate_settings, jobs, pool)  # workers start, and so do their simulators
     start = time.perf_counter()
     carry_out(evaluate_settings, jobs, pool)
-    return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(study))
+    return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(system))
 
 
-def simulations_of_setting(study: Study) -> int:
+def simulations_of_setting(system: System) -> int:
     """How many simulations a setting takes: at each point, as often as it is repeated, and beside
     the original vehicle in a study that searches its scenario.
     """
-    return len(system_of(study).points) * study.scenario.repeats * (1 + bool(study.scenario.search))
+    has_pairs = len(system.characteristics.scenario) > 0
+    return len(system.points) * system.repeats * (1 + has_pairs)
 
 
 def _duration(seconds: float) -> str:

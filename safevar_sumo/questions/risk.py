@@ -128,28 +128,10 @@ def risk(
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
     evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
     criterion = evaluator.choose_criterion(unsafe, subject)
-    base = BASE_POINTS if has_design else 0
-    if (left := evaluator.left) is not None:
-        has_design &= left >= LEAST_BASE_POINTS * block
-        base = min(BASE_POINTS, max(LEAST_BASE_POINTS, left // (2 * block))) if has_design else 0
-        samples = min(samples, left - base * block)
-    rng = np.random.default_rng(study.search.seed)
-    batches = []
-    for start in range(0, samples, VEHICLES_PER_CALL):
-        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
-        batches.append(evaluator.evaluate(vehicles, SAMPLING))
-
-    # Where few simulations are allowed, the design's own vehicles count, too: of each block the
-    # first and the last.
-    design = None
-    if has_design:
-        design = _design(evaluator, model, base)
-        if left is not None:
-            is_drawn = np.arange(len(design)) % block % (block - 1) == 0
-            batches.append(design.take(is_drawn))
+    is_limited = evaluator.left is not None
+    drawn, design = _sampled(evaluator, model, samples, block if has_design else 0)
 
     # How many are unsafe.
-    drawn = Evaluations.concatenate(batches)
     samples = len(drawn)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures = int(criterion.of(simulated).sum())
@@ -163,7 +145,7 @@ def risk(
     low, high = clopper_pearson(failures, total, confidence)
     if design is not None:
         table = sobol_indices(evaluator, design, criterion, confidence)
-    elif left is not None and not model.is_correlated:
+    elif is_limited and not model.is_correlated:
         table = regression_indices(evaluator, simulated, criterion, confidence)
     else:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
@@ -186,8 +168,8 @@ def risk(
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     verdict += deciding_in_words(table, failures)
-    if left is not None and base < BASE_POINTS:
-        verdict += _in_place_of_design(base, block)
+    base = 0 if design is None else len(design) // block
+    verdict += _in_place_of_design(base, block) if is_limited and base < BASE_POINTS else ""
     verdict += "" if failures else _bound_in_words(high, total, confidence)
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
@@ -199,6 +181,30 @@ def risk(
         tables={"sensitivity": table},
         folded=() if has_shares else ("sensitivity",),
     )
+
+
+def _sampled(
+    evaluator: Evaluator, model: VariationModel, samples: int, block: int
+) -> tuple[Evaluations, Evaluations | None]:
+    """Sampled vehicles, and Saltelli's design with blocks of this size, None without one.
+
+    Where few simulations are allowed, half of them are those of the design, whose own vehicles
+    count, too: of each block the first and the last.
+    """
+    base = BASE_POINTS if block else 0
+    if (left := evaluator.left) is not None:
+        is_enough = base and left >= LEAST_BASE_POINTS * block
+        base = min(base, max(LEAST_BASE_POINTS, left // (2 * block))) if is_enough else 0
+        samples = min(samples, left - base * block)
+    rng = np.random.default_rng(evaluator.study.search.seed)
+    batches = []
+    for start in range(0, samples, VEHICLES_PER_CALL):
+        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
+        batches.append(evaluator.evaluate(vehicles, SAMPLING))
+    design = _design(evaluator, model, base) if base else None
+    if design is not None and left is not None:
+        batches.append(design.take(np.arange(len(design)) % block % (block - 1) == 0))
+    return Evaluations.concatenate(batches), design
 
 
 def _bound_in_words(high: float, total: int, confidence: float) -> str:

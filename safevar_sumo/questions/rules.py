@@ -95,7 +95,7 @@ def rules(
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
-    samples = samples if evaluator.left is None else min(samples, evaluator.left)
+    samples = evaluator.at_most(samples)
     vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
     evaluations = evaluator.evaluate(vehicles, SAMPLED_STAGE)
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2

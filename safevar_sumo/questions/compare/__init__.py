@@ -144,7 +144,6 @@ def compare(
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
     evaluator.plan({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
-    samples = samples if evaluator.left is None else max(min(samples, evaluator.left // 6), 1)
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):
@@ -154,7 +153,7 @@ def compare(
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
-    pairs, outside = pairs_of((subject, other), common, criteria, samples)
+    pairs, outside = pairs_of((subject, other), common, criteria, evaluator.at_most(samples, 6))
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)

@@ -141,8 +141,7 @@ class _Candidates(NamedTuple):
 def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     """Settings drawn from a study's whole domain."""
     number = RATED_SAMPLED_SETTINGS if is_rated(study) else SAMPLED_SETTINGS
-    if evaluator.left is not None:
-        number = min(number, max(evaluator.left // 8, 1))
+    number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
     return _Candidates(

@@ -101,9 +101,7 @@ def scan(
     usual, rounds = (
         (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
     )
-    number = number or usual
-    if evaluator.left is not None:
-        number = max(min(number, evaluator.left // (6 * len(scanned))), 2)
+    number = evaluator.at_most(number or usual, 6 * len(scanned))
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [
         np.union1d(np.linspace(*end, number), item.original)
