@@ -143,20 +143,14 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
+    indices = given_data_indices
     if design is not None:
-        table = sobol_indices(evaluator, design, criterion, confidence)
+        indices = sobol_indices
     elif is_limited and not model.is_correlated:
-        table = regression_indices(evaluator, simulated, criterion, confidence)
-    else:
-        table = given_data_indices(evaluator, simulated, criterion, confidence)
-    numbers = {
-        "unsafe": str(criterion),
-        "samples": total,
-        "failures": failures,
-        "probability": failures / total,
-        "interval": [low, high],
-        "confidence": confidence,
-    }
+        indices = regression_indices
+    table = indices(evaluator, simulated if design is None else design, criterion, confidence)
+    numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
+    numbers |= {"probability": failures / total, "interval": [low, high], "confidence": confidence}
 
     # In words.
     verdict = (
