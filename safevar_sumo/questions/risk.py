@@ -300,15 +300,17 @@ def _design(evaluator: Evaluator, model: VariationModel, base: int) -> Evaluatio
 
 
 def regression_indices(
-    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
+    evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
     """The share of the variance that each of the independent characteristics has in a linear
     regression: the square of its standardised coefficient (Saltelli et al. 2008, Global Sensitivity
     Analysis, 1.2.5), with its bootstrap interval.
     """
     names = list(evaluator.characteristics.names)
-    spread = np.std(drawn.settings, axis=0)
-    inputs = (drawn.settings - drawn.settings.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    spread = np.std(evaluations.settings, axis=0)
+    inputs = (evaluations.settings - evaluations.settings.mean(axis=0)) / np.where(
+        spread > 0, spread, 1.0
+    )
 
     def shares(rows: IntArray, output: FloatArray) -> FloatArray:
         design = np.column_stack([np.ones(len(rows)), inputs[rows]])
@@ -323,7 +325,7 @@ def regression_indices(
         return {"S1": shares(np.arange(n), output), "S1_conf": half}
 
     kinds = {"first": ("S1", "linear, of a regression"), "total": UNDEFINED}
-    return _table(names, drawn, criterion, indices_of, kinds)
+    return _table(names, evaluations, criterion, indices_of, kinds)
 
 
 def sobol_indices(
@@ -354,16 +356,16 @@ def sobol_indices(
 
 
 def given_data_indices(
-    evaluator: Evaluator, drawn: Evaluations, criterion: Unsafe, confidence: float
+    evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
     """The first-order index of correlated or constrained characteristics, from the vehicles as they
-    were drawn: the share of the variance that knowing a characteristic removes, with what is
+    were evaluations: the share of the variance that knowing a characteristic removes, with what is
     correlated with it.
     """
     from SALib.analyze import delta as analysis
 
     # Characteristics that vary in the sample.
-    varies = np.ptp(drawn.settings, axis=0) > 0
+    varies = np.ptp(evaluations.settings, axis=0) > 0
     names = [*compress(evaluator.characteristics.names, varies)]
     problem = {
         "num_vars": len(names),
@@ -378,12 +380,12 @@ def given_data_indices(
             patch.object(warnings, "formatwarning"),
         ):  # SALib sets both for the process
             indices: Indices = analysis.analyze(
-                problem, drawn.settings[:, varies], output, seed=seed, **options
+                problem, evaluations.settings[:, varies], output, seed=seed, **options
             )
         return indices
 
     first = "S1", "first order, with everything that is correlated with it"
-    return _table(names, drawn, criterion, indices_of, {"first": first, "total": UNDEFINED})
+    return _table(names, evaluations, criterion, indices_of, {"first": first, "total": UNDEFINED})
 
 
 def _table(
