@@ -104,7 +104,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         # Only the answer goes to standard output.
         form = "json" if as_json else form
         with nullcontext() if form == "text" else prints_to_standard_error():
-            answer: Answer = call(**values)
+            answer: Answer = call(table=table, **values)
         if form != "text" or table or not values.get("quiet"):
             _print(answer, form, table, details=details)
         if plot is not None:
@@ -123,7 +123,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         name,
         params=[
             *map(_argument, positional),
-            *map(_flag, options),
+            *(_flag(option) for option in options if option.name != "table"),
             *(_output_options() if gives_answer else []),
         ],
         callback=print_answer if gives_answer else print_text,

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
 from safevar_sumo.questions.boundary import find_boundaries
@@ -24,6 +25,7 @@ from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 SUBSETS = "subsets of the changes"
@@ -224,35 +226,55 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe
     solutions: those with the fewest, then the smallest changes.
 
+    Of solutions within budgets, as `within_budgets` gives them, budgets stand in place of runs, and
+    the first failures in the order of `draw` count.
+
     Returns
     -------
     pandas.DataFrame
-        Columns algorithm, run, failures (different unsafe solutions), examined, causes.
+        Columns algorithm, run, failures (different unsafe solutions), examined, causes; alone,
+        those that no other algorithm found in the run of the same number; and cost, the settings
+        that all this took to simulate.
     """
-    # The failures of each run with the fewest changes.
-    names = list(evaluator.characteristics.names)
+    # The first failures of each run.
     keys = ["algorithm", "run"]
+    order = [F_NUM_DIFF.name, F_DIFF.name]
+    if "simulations" in case.solutions:
+        keys, order = ["algorithm", "simulations"], ["draw"]
+    names = [*evaluator.characteristics.names]
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
-    failures = failures.sort_values([F_NUM_DIFF.name, F_DIFF.name], kind="stable")
-    examined = failures.groupby(keys).head(limit)
+    examined = failures.sort_values(order, kind="stable").groupby(keys).head(limit)
+    settings = examined[[*names, F_NUM_DIFF.name]].drop_duplicates()
+    price = sum(_subset_counts(settings.pop(F_NUM_DIFF.name)))
+    print_text(
+        Console(stderr=True), f"{case.name}: the minimal causes take about {price:,} simulations."
+    )
 
     # Kinds of causes: which characteristics change, and in which direction.
-    causes = find_minimal_causes(evaluator, examined[names].to_numpy(dtype=float), case.unsafe)
-    by_run: dict[tuple[str, int], set[tuple[str, ...]]] = {run: set() for run in case.finished_runs}
-    kinds = [
-        {directions(evaluator.characteristics, cause.changes) for cause in group}
-        for group in causes
-    ]
-    for run, group in zip(examined[keys].itertuples(index=False, name=None), kinds, strict=True):
-        by_run[run].update(group)
+    causes = find_minimal_causes(evaluator, settings.to_numpy(dtype=float), case.unsafe)
+    kinds = pd.Series(
+        [
+            {directions(evaluator.characteristics, cause.changes) for cause in group}
+            for group in causes
+        ],
+        settings.index,
+        name="kind",
+    )
+    found = examined.merge(settings.join(kinds.explode()))[[*keys, "kind"]]
+    found = found.dropna().drop_duplicates()
 
     # How many of each run.
-    counts = [frame.groupby(keys).size().to_dict() for frame in (failures, examined)]
-    rows = [
-        (*run, *(count.get(run, 0) for count in counts), len(kinds_of_run))
-        for run, kinds_of_run in by_run.items()
-    ]
-    return pd.DataFrame(rows, columns=[*keys, "failures", "examined", "causes"])
+    counted = {
+        "failures": failures,
+        "examined": examined,
+        "causes": found,
+        "alone": found.drop_duplicates([keys[1], "kind"], keep=False),
+    }
+    frame = pd.DataFrame(
+        {name: rows.groupby(keys).size() for name, rows in counted.items()},
+        pd.MultiIndex.from_tuples(case.finished_runs, names=keys),
+    )
+    return frame.fillna(0).astype(int).reset_index().assign(cost=evaluator.simulated)
 
 
 PARTS = (32, 8, 8, 8)

@@ -125,6 +125,9 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     assert "rs 1 of 2 runs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
     records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
+    for name in ("budget", "diversity"):
+        assert name not in output["tables"]
+        assert {*json_of("tables", "part", "--table", name)["tables"]} == {name, "remarks"}
     against = json_of("tables", "part", "--algorithm", "rs")["tables"]["rq2"]["rows"]
     assert {(one["algorithm"], one["baseline"]) for one in against} == {("rs", "nsga2")}
     assert "did you mean 'nsga2'?" in run("tables", "part", "--algorithm", "nsga3", expect=2).stderr
@@ -138,6 +141,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     )
     Path("part/runs/rs-00.jsonl").unlink()
     assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
+    refused("tables", "part", "--table", "budget", message=("only nsga2",))
     refused("tables", "part", "--table", "rq9", message=("no table 'rq9'", "rq3.3-safety"))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])

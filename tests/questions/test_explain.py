@@ -34,6 +34,7 @@ from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, MAX_DISTINCT, printed_limits
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.research_questions.budgets import within_budgets
 from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
@@ -240,13 +241,19 @@ def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once
     )
     found = evaluator.evaluate(settings, "solutions")
     frame = solutions_frame(
-        evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([4]))]
+        evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([0, 4]))]
     )
     finished = [("rs", 0), ("nsga2", 1), ("nsga2", 0)]
     case = build_case(evaluator.study, {"safety_degree": 2.0}, frame, frame, finished)
-    counts = [causes_of_runs(case, evaluator, limit).to_numpy().tolist() for limit in (1, 9)]
-    assert counts[0] == [["rs", 0, 3, 1, 1], ["nsga2", 1, 0, 0, 0], ["nsga2", 0, 0, 0, 0]]
-    assert counts[1][0] == ["rs", 0, 3, 3, 2], "a up, b down"
+    counts = [
+        causes_of_runs(each, evaluator, limit).iloc[:, :6].to_numpy().tolist()
+        for each in (case, within_budgets(case))
+        for limit in (1, 9)
+    ]
+    assert counts[0] == [["rs", 0, 3, 1, 1, 1], ["nsga2", 1, 1, 1, 1, 1], ["nsga2", *[0] * 5]]
+    assert counts[1][0] == ["rs", 0, 3, 3, 2, 2], "a up, b down"
+    assert [one[:4] for one in counts[2]] == [["nsga2", 100, 1, 1], ["rs", 100, 3, 1]]
+    assert counts[3] == [["nsga2", 100, 1, 1, 1, 0], ["rs", 100, 3, 3, 2, 1]], "both find a up"
 
 
 def limits(evaluator: Evaluator, *setting: float) -> Limits:

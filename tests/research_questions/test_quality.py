@@ -165,7 +165,8 @@ def test_holms_correction_of_a_worked_example() -> None:
 @pytest.mark.parametrize("count", [0, 3, 10])
 def test_the_interval_against_one_value_is_wilsons_of_a_share(count: int) -> None:
     expected = scipy.stats.binomtest(count, 10).proportion_ci(0.95, "wilson")
-    assert effect_interval(count / 10, 10, None, 0.05) == pytest.approx(tuple(expected), abs=1e-9)
+    found = effect_interval(count / 10, 10, math.nan, 0.05)
+    assert found == pytest.approx(tuple(expected), abs=1e-9)
 
 
 def test_the_interval_of_samples_apart_has_a_width() -> None:

@@ -17,6 +17,7 @@ import pytest
 import scipy
 
 from safevar_sumo.questions.case import UnanswerableError
+from safevar_sumo.questions.research_questions import budgets
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.changes import (
     count_collisions,
@@ -225,6 +226,38 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
     assert (median["median"], median["median_low"], median["median_high"]) == (
         means.median(),
         *means.iloc[[2, 9]],  # the third and the tenth of twelve
+    )
+
+
+def test_algorithms_are_compared_after_equal_numbers_of_simulations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run finds (1, 0) in the square of the two objectives that differ, with the reference point
+    (1.1, 1.1): worth 0.11. Then it finds the collision (0, 1): both are worth 0.21. The third
+    objective adds a length of 1.1. By Noether, 7.849 / (6 * 0.25^2) = 20.9 runs show 0.75.
+    """
+    monkeypatch.setattr(budgets, "BUDGETS", (10, 20))
+    points = {"a": row(sd=1.0, f_diff=0.1), "b": row(sd=-1.0, f_diff=0.5), "-": row(sd=9.0)}
+    journals = {"nsga2": ["-----a--------b", "a----"], "rs": [f"{'-' * 30}a", "a"]}
+    seen = [
+        {**points[point], "algorithm": name, "run": run, "evaluation": 2 * number}
+        for name in journals
+        for run, journal in enumerate(journals[name])
+        for number, point in enumerate(journal)
+    ]
+    case = made_up(
+        points["a"], points["b"], evaluations=seen, finished=[*product(journals, (0, 1))]
+    )
+    table = answer_questions([case], names=["budget"]).tables["budget"]
+    names = ["simulations", "effect_size", "runs_needed", "hypervolume", "hypervolume_baseline"]
+    assert table[[*names, "unsafe"]].to_numpy() == pytest.approx(
+        np.array(
+            [
+                (10, 0.75, 21, 0.121, 0.0605, 0),
+                (20, 0.875, 10, 0.176, 0.0605, 0.5),
+                (100, 0.75, 21, 0.176, 0.121, 0.5),
+            ]
+        )
     )
 
 

@@ -23,6 +23,7 @@ from safevar_sumo.questions.case import (
     solutions_for_metric,
 )
 from safevar_sumo.questions.research_questions import changes
+from safevar_sumo.questions.research_questions.budgets import DRAWN, within_budgets
 from safevar_sumo.questions.research_questions.comparisons import (
     DEFAULT,
     Choices,
@@ -44,6 +45,9 @@ from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_r
 from safevar_sumo.questions.research_questions.tables import (
     CAUSES,
     CHOSEN,
+    DIVERSITY,
+    FUNCTIONS,
+    ON_REQUEST,
     OVER_RUNS,
     POOLED,
     TABLES,
@@ -51,6 +55,7 @@ from safevar_sumo.questions.research_questions.tables import (
 from safevar_sumo.questions.words import demanded_in_words, join_phrases, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
+from safevar_sumo.terminal import open_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -74,11 +79,14 @@ def tables(
     causes: Annotated[int, Range(0, 100_000)] = 0,
     figures: Path | None = None,
     jobs: Jobs = None,
+    table: str | None = None,
 ) -> Answer:
     """Answer the research questions of the paper from results, one for each case, as tables and
     figures.
 
-    RQ1 over runs leads; `--details` and JSON have every table, and `--table` prints any.
+    RQ1 over runs leads; `--details` and JSON have every table, and `--table` prints any. Two tables
+    are computed only by `--table NAME`: `budget` compares the algorithms after equal numbers of
+    simulations, and `diversity` simulates the distinct minimal causes of their failures.
 
     Parameters
     ----------
@@ -94,6 +102,8 @@ def tables(
         Draw every figure into this directory, as png and pdf.
     jobs
         Number of worker processes that simulate causes, by default one for each core.
+    table
+        `budget` or `diversity`: compute this table alone.
     """
     # The cases, and the algorithm that is compared.
     cases = _cases_of(results)
@@ -101,18 +111,25 @@ def tables(
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
         check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
     causes_of_cases = {
-        case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs
+        case.name: _causes_of_runs(
+            within_budgets(case) if table == DIVERSITY else case, causes or DRAWN, jobs
+        )
+        for case in cases
+        if (causes or table == DIVERSITY) and case.has_runs
     }
 
     # Tables, figures, and the command that gives them.
-    answer = answer_questions(cases, Choices(label_of(algorithm), alpha, causes_of_cases))
+    asked = table if table in ON_REQUEST else ""
+    answer = answer_questions(
+        cases, Choices(label_of(algorithm), alpha, causes_of_cases), [asked] if asked else FUNCTIONS
+    )
     if figures is not None:
         save_figures(cases, figures)
     words = [PROGRAM_COMMAND, "tables"]
     words += [quote(str(getattr(source, "directory", source))) for source in results]
-    words += ["--algorithm", quote(algorithm)] if algorithm else []
-    words += ["--alpha", str(alpha)] if alpha != ALPHA else []
-    words += ["--causes", str(causes)] if causes else []
+    options = {"algorithm": algorithm, "alpha": alpha, "causes": causes, "table": asked}
+    for name, value in options.items():
+        words += [f"--{name}", quote(str(value))] if value not in ("", ALPHA, 0) else []
     main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
     lead = next((name for name in main_tables if name in answer.tables), "")
     return replace(answer, command=" ".join(words), lead=lead)
@@ -140,12 +157,12 @@ def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
     from safevar_sumo.questions.causes import causes_of_runs
     from safevar_sumo.questions.evaluator import open_evaluator
 
-    with open_evaluator(case.study, jobs=jobs) as evaluator:
+    with open_progress(True) as show, open_evaluator(case.study, None, jobs, show) as evaluator:
         return causes_of_runs(case, evaluator, limit)
 
 
 def answer_questions(
-    cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = TABLES
+    cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = FUNCTIONS
 ) -> Answer:
     """Every named table of the cases; a table that no case answers has no row, and a remark says
     why.
@@ -193,10 +210,12 @@ def answer_questions(
     ]
     different = dict.fromkeys([*of_all, *remarks])
     frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
+    # Which runs and settings are in no table.
+    remarks_of_cases = [f"Remark: {remark}" for case in cases for remark in case.remarks]
     return Answer(
         question="tables",
         study=cases[0].study,
-        verdict=" ".join([*map(_verdict, cases), *_read_first(cases)]),
+        verdict=" ".join([*map(_verdict, cases), *remarks_of_cases]),
         numbers={
             "cases": len(cases),
             "solutions": sum(len(case.solutions) for case in cases),
@@ -205,12 +224,6 @@ def answer_questions(
         tables=frames,
         draw=lambda answer: draw_change_counts(cases),
     )
-
-
-def _read_first(cases: Sequence[Case]) -> Iterator[str]:
-    """Which runs and settings are in no table."""
-    for case in cases:
-        yield from (f"Remark: {remark}" for remark in case.remarks)
 
 
 def _verdict(case: Case) -> str:
@@ -256,11 +269,13 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     if table in ("rq1", "rq2"):
         remarks += _on_pooled_tests(table, case, frame, alpha)
     if table in POOLED:
-        remarks += filter(None, [_equal_solutions(case)])
+        remarks.append(_equal_solutions(case))
     if table in ("rq1-runs", "rq2-runs", "rq2-common"):
         remarks += remarks_on_runs(table, frame, alpha)
     if table == "rq2-runs":
-        remarks += filter(None, [describe_rules(case)])
+        remarks.append(describe_rules(case))
+    if table in ON_REQUEST:
+        remarks.append(f"Unsafe means: {case.unsafe.description}.")
     if table == "a12" and len(frame):
         remarks.append(
             "An asterisk means that the p-value is significant after Holm's correction for the"
@@ -268,7 +283,7 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
         )
     if table == "combinations" and frame.empty:
         remarks.append("No critical solution changes exactly four characteristics.")
-    return (remark[:1].upper() + remark[1:] for remark in remarks)
+    return (remark[:1].upper() + remark[1:] for remark in remarks if remark)
 
 
 def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:

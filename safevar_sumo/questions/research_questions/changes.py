@@ -215,14 +215,13 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     ]
 
     # The most frequent ones, with equal ranks for equal numbers.
-    rows = []
-    for indices, number in most_frequent:
-        rank = 1 + sum(other > number for other in counts.values())
-        rows.append(
-            (
-                rank,
-                [case.characteristics.vehicle.names[i] for i in indices],
-                100 * number / len(masks),
-            )
+    names = case.characteristics.vehicle.names
+    rows = [
+        (
+            1 + sum(other > number for other in counts.values()),
+            [names[index] for index in indices],
+            100 * number / len(masks),
         )
+        for indices, number in most_frequent
+    ]
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])

@@ -197,11 +197,16 @@ def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
     tests = tests.assign(significant=is_significant.where(p_values.notna()))
     if "p_holm" not in tests:
         return tests
-    sizes = tests["n2"].where(tests.index == "RQ2")
-    ends = [
-        effect_interval(effect, m, None if np.isnan(n) else n, choices.alpha)
-        for effect, m, n in zip(tests["effect_size"], tests["n1"], sizes, strict=True)
-    ]
+    return with_intervals(tests, choices.alpha)
+
+
+def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
+    """Tests with the intervals of their effect sizes, of `n1` runs against `n2` runs, or of RQ1, by
+    the index, against one value.
+    """
+    sizes = tests["n2"].where(tests.index != "RQ1")
+    rows = zip(tests["effect_size"], tests["n1"], sizes, strict=True)
+    ends = [effect_interval(*row, alpha) for row in rows]
     low, high = zip(*ends, strict=True)
     return tests.assign(effect_size_low=low, effect_size_high=high)
 
@@ -225,8 +230,9 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     Raises
     ------
     UnanswerableError
-        If they were not counted.
+        If they were not counted, or the solutions belong to no run.
     """
+    case.runs_of(NSGA2)  # raises if the solutions are imported
     if case.name not in choices.causes:
         raise UnanswerableError(
             case.name, "minimal causes are simulated only if they are asked for", "causes"

@@ -94,7 +94,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     scaled_reference = normalised(reference, reference)
     coordinate = case.study.search.reference_point
     rows = {}
-    for run, group in _frames_of_runs(case, case.solutions):
+    for run, group in frames_of_runs(case, case.solutions):
         rows[run] = NO_FRONT
         if len(points := points_of(case, group)):
             scaled = normalised(points, reference)
@@ -105,7 +105,7 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
 
-def _frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
+def frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
     """The finished runs, each with its rows, in the study's order of algorithms; raises
     UnanswerableError if none of them has rows.
     """
@@ -135,7 +135,7 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no evaluations.
     """
-    runs = [valid_evaluations(case, rows) for _, rows in _frames_of_runs(case, case.evaluations)]
+    runs = [valid_evaluations(case, rows) for _, rows in frames_of_runs(case, case.evaluations)]
     fronts: list[pd.DataFrame] = [
         rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)]
         for rows in runs
@@ -179,7 +179,7 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     """
     search = case.study.search
     rows = []
-    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+    for (algorithm, run), group in frames_of_runs(case, case.evaluations):
         last = int(group["evaluation"].max()) + 1
         requested = search.evaluations if last > search.evaluations - search.population else last
         rows.append((algorithm, run, requested, len(group), search.evaluations))
@@ -218,11 +218,10 @@ def few_evaluations(case: Case) -> str:
     )
     if not is_few.any():
         return ""
-    share = f"{USUAL_SHARE:.0%}"
     texts = describe_evaluations(case, counts[is_few])
     return (
-        f"{case.name}: less than {share} of a run's evaluations are simulated: {texts}. Are the"
-        " options as meant?"
+        f"{case.name}: less than {USUAL_SHARE:.0%} of a run's evaluations are simulated: {texts}."
+        " Are the options as meant?"
     )
 
 
@@ -243,7 +242,7 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     frames = []
     counts = np.linspace(0, case.study.search.evaluations, CURVE_POINTS + 1, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["requested"].max()
-    for (algorithm, run), group in _frames_of_runs(case, case.evaluations):
+    for (algorithm, run), group in frames_of_runs(case, case.evaluations):
         # The front grows by what each stretch adds.
         valid = valid_evaluations(case, group)
         points = normalised(minimised_values(case, valid), reference)
@@ -255,13 +254,8 @@ def compute_convergence(case: Case) -> pd.DataFrame:
             new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
             volumes.append(hypervolume(front, case.study.search.reference_point))
-        columns = {
-            "algorithm": algorithm,
-            "run": run,
-            "evaluations": counts_of_run[1:],
-            "hypervolume": volumes,
-        }
-        frames.append(pd.DataFrame(columns))
+        columns = {"evaluations": counts_of_run[1:], "hypervolume": volumes}
+        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, **columns}))
     return pd.concat(frames, ignore_index=True)
 
 

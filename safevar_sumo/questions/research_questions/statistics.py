@@ -157,8 +157,8 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
     return np.asarray(corrected.reindex(values.index), dtype=float)
 
 
-def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) -> Interval:
-    """The interval of an effect size of m against n values, or without n against one, at the
+def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> Interval:
+    """The interval of an effect size of m against n values, or if n is NaN against one, at the
     confidence 1 - alpha.
 
     It holds the values that differ from the effect by at most as many standard errors, as these
@@ -170,7 +170,7 @@ def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) 
 
     def excess(value: float) -> float:
         variance = value * (1 - value) / m
-        if n is not None:
+        if not math.isnan(n):
             variance *= (
                 1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))
             ) / n
@@ -179,10 +179,9 @@ def effect_interval(effect: float, m: int, n: int | None, alpha: float = ALPHA) 
     if math.isnan(effect):
         return math.nan, math.nan
     # From beside the effect, where the excess is below 0, whatever the effect.
-    starts = {end: effect + 1e-9 * (end - effect) for end in (0.0, 1.0)}
     low, high = (
-        end if effect == end else scipy.optimize.brentq(excess, start, end)
-        for end, start in starts.items()
+        end if effect == end else scipy.optimize.brentq(excess, effect + 1e-9 * (end - effect), end)
+        for end in (0.0, 1.0)
     )
     return low, high
 

@@ -10,15 +10,26 @@ from typing import NamedTuple
 import pandas as pd
 
 from safevar_sumo.questions.answer import Column, Wide, with_interval
-from safevar_sumo.questions.research_questions import changes, comparisons
+from safevar_sumo.questions.research_questions import budgets, changes, comparisons
 from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     summarise_convergence,
 )
 from safevar_sumo.shipped import shipped_table
 
-CAUSES = "causes"
-CHOSEN = ("rq1-runs", "rq2-runs", "rq2-common", "medians", CAUSES, "rq1", "rq2", "a12")
+CAUSES, DIVERSITY = "causes", "diversity"
+CHOSEN = (
+    "rq1-runs",
+    "rq2-runs",
+    "rq2-common",
+    "medians",
+    "budget",
+    CAUSES,
+    DIVERSITY,
+    "rq1",
+    "rq2",
+    "a12",
+)
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
@@ -48,7 +59,7 @@ class PaperTable(NamedTuple):
 
 
 DATA = shipped_table("questions/research_questions/tables.toml")
-FUNCTIONS: Mapping[str, Compute] = {
+FUNCTIONS: dict[str, Compute] = {
     "rq1-runs": comparisons.rq1_runs,
     "rq2-runs": comparisons.rq2_runs,
     "rq2-common": comparisons.rq2_common,
@@ -66,9 +77,11 @@ FUNCTIONS: Mapping[str, Compute] = {
     "collisions": changes.count_collisions,
     "combinations": changes.frequent_combinations,
 }
+ON_REQUEST = {"budget": budgets.compare_budgets, DIVERSITY: comparisons.minimal_causes}
+"""The tables that are computed only if they are named, and then alone."""
 OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 POOLED = ("rq1", "rq2", "collisions")
 """The tables that answer the questions about results with runs, and about imported solutions, which
 have none.
 """
-TABLES = {name: PaperTable.of(name, compute) for name, compute in FUNCTIONS.items()}
+TABLES = {name: PaperTable.of(name, compute) for name, compute in (FUNCTIONS | ON_REQUEST).items()}

@@ -1,0 +1,125 @@
+"""Algorithms after equal numbers of simulations, from the journals of their runs: the hypervolume
+and the unsafe settings of all settings so far, and how many runs would show a difference.
+
+A simulation is a setting of a journal, as a run simulates equal settings once. A run that simulates
+fewer settings than a budget counts with all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.research_questions.comparisons import (
+    Choices,
+    opponents_of,
+    with_intervals,
+)
+from safevar_sumo.questions.research_questions.fronts import (
+    frames_of_runs,
+    hypervolume,
+    minimised_values,
+    normalised,
+    reference_front,
+    valid_evaluations,
+)
+
+BUDGETS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000, 200_000, 500_000)
+"""Numbers of simulations of a run after which algorithms are compared, besides its whole budget."""
+PLANNED_QUANTILES = 2.801585
+"""Sum of the quantiles of the normal distribution at 0.975, for a two-sided test at 0.05, and at
+0.8, for a power of 80 %.
+"""
+DRAWN = 20
+"""Usual number of failures of an algorithm whose minimal causes are simulated, at each budget."""
+
+
+def within_budgets(case: Case) -> Case:
+    """A case whose solutions are all settings that its finished runs might return, once for each
+    budget that has them: one of `BUDGETS`, or the whole budget of a run, in the column
+    `simulations`. The column `draw` has a random order of all settings, and in place of runs are
+    budgets finished.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no evaluations.
+    """
+    rows = pd.concat([rows for _, rows in frames_of_runs(case, case.evaluations)])
+    rows = rows.assign(
+        draw=np.random.default_rng(case.study.search.seed).permutation(len(rows)),
+        evaluation=rows.groupby(["algorithm", "run"]).cumcount(),
+    )
+    rows = valid_evaluations(case, rows)
+    whole = case.study.search.evaluations
+    budgets = np.union1d(np.minimum(BUDGETS, whole), whole)
+    return replace(
+        case,
+        solutions=pd.concat(
+            [rows.query("evaluation < @budget").assign(simulations=budget) for budget in budgets]
+        ),
+        finished_runs=tuple(product(case.algorithms, budgets)),
+        stated=case.unsafe,
+    )
+
+
+def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
+    """Every pair of algorithms within each budget.
+
+    `effect_size` is A12 of the hypervolume of the runs, above 0.5 where the algorithm is better.
+    `hypervolume` is the median, `unsafe` the mean number of unsafe settings over the runs that have
+    settings within the budget. The reference front is the same for all budgets.
+
+    With `runs_needed` runs of each algorithm, N / 2, a Mann-Whitney test shows the effect: N =
+    (z_{1 - alpha / 2} + z_{power})^2 / (12 c (1 - c) (A12 - 0.5)^2) with c = 1 / 2, for many runs
+    without ties (Noether 1987: Sample size determination for some common nonparametric tests.
+    Journal of the American Statistical Association 82, 645-647). It is infinite for 0.5.
+
+    Raises
+    ------
+    UnanswerableError
+        If there are no evaluations or no solutions, or a single algorithm.
+    """
+    # Every run within each budget.
+    opponents_of(case)  # raises if there is a single algorithm
+    reference = reference_front(case)
+    within = within_budgets(case)
+    runs = [
+        (
+            *key,
+            hypervolume(
+                normalised(minimised_values(case, rows), reference),
+                case.study.search.reference_point,
+            ),
+            within.unsafe.rows(rows).sum(),
+        )
+        for key, rows in within.solutions.groupby(["algorithm", "simulations", "run"])
+    ]
+    growth = pd.DataFrame(runs, columns=["algorithm", "simulations", "n1", "hypervolume", "unsafe"])
+
+    # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
+    others = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
+    pairs = growth.merge(others, on="simulations", suffixes=("", "_baseline"))
+    pairs["effect_size"] = np.heaviside(
+        (pairs["hypervolume"] - pairs["hypervolume_baseline"]).round(12), 0.5
+    )
+    groups = pairs.query("algorithm < baseline").groupby(
+        ["algorithm", "baseline", "simulations"], as_index=False
+    )
+    frame = groups.agg(
+        {
+            "effect_size": "mean",
+            "n1": "nunique",
+            "n2": "nunique",
+            "hypervolume": "median",
+            "hypervolume_baseline": "median",
+            "unsafe": "mean",
+            "unsafe_baseline": "mean",
+        }
+    )
+    frame["runs_needed"] = np.ceil((PLANNED_QUANTILES / (frame["effect_size"] - 0.5)) ** 2 / 6)
+    return with_intervals(frame, choices.alpha)
