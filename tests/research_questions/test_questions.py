@@ -238,7 +238,7 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
     """
     monkeypatch.setattr(budgets, "BUDGETS", (10, 20))
     points = {"a": row(sd=1.0, f_diff=0.1), "b": row(sd=-1.0, f_diff=0.5), "-": row(sd=9.0)}
-    journals = {"nsga2": ["-----a--------b", "a----"], "rs": [f"{'-' * 30}a", "a"]}
+    journals = {"nsga2": ["-----a--------b", "a----"], "rs": [f"{'-' * 20}a", "a"]}
     seen = [
         {**points[point], "algorithm": name, "run": run, "evaluation": 2 * number}
         for name in journals
