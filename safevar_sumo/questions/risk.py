@@ -359,7 +359,7 @@ def given_data_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
     """The first-order index of correlated or constrained characteristics, from the vehicles as they
-    were evaluations: the share of the variance that knowing a characteristic removes, with what is
+    were drawn: the share of the variance that knowing a characteristic removes, with what is
     correlated with it.
     """
     from SALib.analyze import delta as analysis
