@@ -129,12 +129,14 @@ SLOW_STUDIES = ("wear_idm", "wear_rss")
     params=[
         pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
         for name in study_names()
-        if not is_rated(load_study(name)) and (name != "wear_rss" or HAS_AD_RSS)
+        if not is_rated(load_study(name))
+        and (name != "wear_rss" or HAS_AD_RSS)
+        and name != "metadrive_expert"
     ]
 )
 def any_system(request: pytest.FixtureRequest) -> System:
     """The system of each shipped study in turn, except a study that is rated in thousands of
-    cells.
+    cells, and that in another simulator.
     """
     system = assemble(load_study(request.param))
     return replace(system, matrix=system.matrix[::30])  # only some points of a long matrix

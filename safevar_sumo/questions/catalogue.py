@@ -24,6 +24,7 @@ from safevar_sumo.scenarios import (
     WEATHER_PARAMETERS,
     WEATHERS,
     Scenario,
+    Simulator,
     TrackScenario,
     WorldScenario,
     equals_clear,
@@ -242,7 +243,10 @@ def _studies() -> Iterator[tuple[str, ...]]:
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
-    studies = {study.vehicle.model: study for study in reversed([*map(read_study, study_names())])}
+    studies = {
+        study.vehicle.model or study.scenario.model: study
+        for study in reversed([*map(read_study, study_names())])
+    }
     for vehicle, study in sorted(studies.items()):
         for row in CharacteristicSet.of(study).vehicle:
             yield vehicle, *(getattr(row, name) for name in list(VEHICLES)[1:])
@@ -262,7 +266,10 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
         own = (
             {}
             if models[name].brakes_fully
-            else {**free_parameters(models[name]), **WEATHER_PARAMETERS}
+            else {
+                **free_parameters(models[name]),
+                **({} if issubclass(models[name], Simulator) else WEATHER_PARAMETERS),
+            }
         )
         domains = (
             f"{key} {parameter.lower:g} to {parameter.upper:g}{unit_text(parameter.unit)}"

@@ -20,6 +20,7 @@ from safevar_sumo.scenarios.base import (
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
+from safevar_sumo.scenarios.metadrive import LearnedDriver
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
 from safevar_sumo.scenarios.simulated import Simulator as Simulator
@@ -41,6 +42,7 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "crossing": Crossing,
     "cut_in": CutIn,
     "cut_out": CutOut,
+    "learned_driver": LearnedDriver,
     "lead_vehicle_stopped": LeadVehicleStopped,
     "openscenario": OpenScenario,
     "stop": Stop,
