@@ -325,7 +325,9 @@ def regression_indices(
         return {"S1": shares(np.arange(n), output), "S1_conf": half}
 
     kinds = {"first": ("S1", "linear, of a regression"), "total": UNDEFINED}
-    return _table(names, evaluations, criterion, indices_of, kinds)
+    table = _table(names, evaluations, criterion, indices_of, kinds)
+    table.attrs["title"] = "What decides: shares of the variance (linear regression)"
+    return table
 
 
 def sobol_indices(

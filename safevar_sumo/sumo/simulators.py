@@ -1,5 +1,5 @@
 """Runs in a simulator of the user's own, which drives one vehicle after another; a process keeps
-one simulator.
+it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from copy import copy
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
@@ -63,26 +64,37 @@ NO_TRACE: Mapping[str, FloatArray] = {
 
 
 class _Kept:
-    """The simulator of this process, kept between runs; its fields are set for each run."""
+    """The simulators of this process, one of each class, kept between runs; their fields are set
+    for each run.
+    """
 
     def __init__(self) -> None:
-        self._simulator: Simulator | None = None
+        self._simulators = dict[str, Simulator]()
 
     def at(self, scenario: Simulator) -> Simulator:
-        """The simulator, with the fields of a scenario; a new one for another class."""
-        if type(self._simulator) is not type(scenario):
-            self.close()
-            self._simulator = copy(scenario)
-        for name in inspect.signature(type(scenario)).parameters:
-            if hasattr(scenario, name):
-                object.__setattr__(self._simulator, name, getattr(scenario, name))
-        assert self._simulator is not None
-        return self._simulator
+        """The simulator of a scenario's class, with its fields; a new one if the code was loaded
+        anew.
+        """
+        kind = type(scenario)
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        if type(self._simulators.get(name)) is not kind:
+            self._close(name)
+            self._simulators[name] = copy(scenario)
+        simulator = self._simulators[name]
+        is_struct = isinstance(simulator, msgspec.Struct)
+        set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
+        for field in inspect.signature(kind).parameters:
+            if hasattr(scenario, field):
+                set_field(simulator, field, getattr(scenario, field))
+        return simulator
 
     def close(self) -> None:
-        """End the simulator, if there is one."""
-        simulator, self._simulator = self._simulator, None
-        if simulator is not None:
+        """End all simulators."""
+        for name in [*self._simulators]:
+            self._close(name)
+
+    def _close(self, name: str) -> None:
+        if simulator := self._simulators.pop(name, None):
             simulator.close()
 
 
@@ -91,7 +103,7 @@ _kept = _Kept()
 
 @atexit.register
 def close_simulator() -> None:
-    """End the simulator of this process, also where it fails to end."""
+    """End the simulators of this process, also where one fails to end."""
     with suppress(Exception):
         _kept.close()
 
