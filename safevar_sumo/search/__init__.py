@@ -9,12 +9,14 @@ from safevar_sumo.search.pymoo import (
     PYMOO_ALGORITHMS as PYMOO_ALGORITHMS,
     pymoo_algorithm as pymoo_algorithm,
 )
+from safevar_sumo.search.surrogate import Surrogate
 from safevar_sumo.study import PYMOO
 
 ALGORITHMS: Mapping[str, type[Algorithm]] = {
     "nsga2": Nsga2,
     "rs": RandomSearch,
     "safe_fuzzer": SafeFuzzer,
+    "surrogate": Surrogate,
 }
 _PYMOO_NAMES = ", ".join(name.removeprefix(PYMOO) for name in PYMOO_ALGORITHMS)
 DESCRIPTIONS = {

@@ -9,6 +9,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import moocore
 import numpy as np
 
 from safevar_sumo.errors import subject
@@ -66,6 +67,11 @@ class Problem:
         n).
         """
         return self.region.repaired(settings) if self.region else settings
+
+    def nondominated(self, evaluations: Evaluations) -> Evaluations:
+        """The valid evaluations that no other one of them dominates."""
+        valid = evaluations.take(self.scoring.valid(evaluations))
+        return valid.take(moocore.is_nondominated(self.scoring.values(valid), keep_weakly=True))
 
 
 def check_search(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-import moocore
 import numpy as np
 from msgspec import Meta, Struct
 
@@ -27,12 +26,7 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
         archive = problem.original.take([])
         for start in range(0, len(settings), problem.population):
             evaluated = yield settings[start : start + problem.population]
-            archive = Evaluations.concatenate([archive, evaluated])
-            archive = archive.take(problem.scoring.valid(archive))
-            if len(archive):
-                archive = archive.take(
-                    moocore.is_nondominated(problem.scoring.values(archive), keep_weakly=True)
-                )
+            archive = problem.nondominated(Evaluations.concatenate([archive, evaluated]))
         return archive
 
 
@@ -73,7 +67,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
         # Random settings, generation by generation.
-        ranges = _Ranges(problem)
+        ranges = Ranges(problem)
         generations = []
         scores = []
         lowest_score = np.inf
@@ -101,7 +95,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return solutions.take(problem.scoring.valid(solutions))
 
 
-class _Ranges:
+class Ranges:
     """Ranges from which values are drawn, and the largest number of characteristics changed."""
 
     def __init__(self, problem: Problem) -> None:
@@ -220,5 +214,4 @@ def _normalise(values: FloatArray) -> FloatArray:
     if np.all(np.isnan(values)):
         return values
     minimum = np.nanmin(values)
-    value_range = np.nanmax(values) - np.nanmin(values)
-    return (values - minimum) / value_range if value_range > 0 else values - minimum
+    return (values - minimum) / (np.nanmax(values) - minimum or 1.0)

@@ -82,11 +82,14 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mutation_index: DistributionIndex = 20.0
     tournament_size: TournamentSize = 2
 
-    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+    def search(
+        self, problem: Problem, rng: np.random.Generator, first: FloatArray | None = None
+    ) -> Search:
         reproduction = Reproduction(self, problem, rng)
 
-        # The first generation is random.
-        first = problem.uniform(min(problem.population, problem.evaluations), rng)
+        # The first generation is random, unless it is given.
+        if first is None:
+            first = problem.uniform(min(problem.population, problem.evaluations), rng)
         offspring = [*map(Individual, first.tolist())]
         survivors = list[Individual]()
         used = 0

@@ -21,14 +21,20 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import read_only
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
-from safevar_sumo.search.baselines import _Ranges
+from safevar_sumo.search.baselines import Ranges
 from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
+from safevar_sumo.search.surrogate import _learn
+from safevar_sumo.study import ORIGINAL_DEGREE
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
+OURS = [
+    pytest.param(name, marks=pytest.mark.slow if name == "surrogate" else ()) for name in ALGORITHMS
+]
+"""Our algorithms; fitting models takes seconds."""
 REQUIRED = {
     "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
     "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
@@ -114,7 +120,7 @@ def searched(
 
 
 @pytest.mark.parametrize(
-    "name", [*ALGORITHMS, "pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"]
+    "name", [*OURS, "pymoo:NSGA3", "pymoo:CMAES", "pymoo:DE", "pymoo:NelderMead"]
 )
 @pytest.mark.parametrize("evaluations", [1, 7, POPULATION, 3 * POPULATION + 1, 500])
 def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> None:
@@ -127,8 +133,8 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
     "name",
     [
         pytest.param(
-            name, marks=pytest.mark.slow if "AGEMOEA" in name else ()
-        )  # compiled by numba at their first call
+            name, marks=pytest.mark.slow if "AGEMOEA" in name or name == "surrogate" else ()
+        )  # those of pymoo are compiled by numba at their first call
         for name in (*ALGORITHMS, *PYMOO_ALGORITHMS)
     ],
 )
@@ -197,6 +203,27 @@ def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result
     assert len(asked) == max(last_improvement + 1, 500 // 50) + 5 < 5000 // 50, (
         "the best score is five generations old"
     )
+
+
+@pytest.mark.slow
+def test_the_surrogate_finds_more_than_nsga2_with_four_times_as_many_simulations() -> None:
+    few, many = (
+        PUBLISHED_SCORING.values(searched(name, 1, count)[0])
+        for name, count in (("surrogate", 100), ("nsga2", 400))
+    )
+    volume = moocore.Hypervolume(ref=[12.0, 1.0, 12.0])
+    assert volume(few) > volume(many)
+
+
+def test_the_surrogate_uses_its_budget_where_no_original_vehicle_is_safe() -> None:
+    def never_safe(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
+        found = sphere(characteristics, settings)
+        degrees = np.full(len(settings), -1.0)
+        return dataclasses.replace(found, metrics={**found.metrics, ORIGINAL_DEGREE: degrees})
+
+    scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.0)
+    _, asked = searched("surrogate", 1, 45, evaluate=never_safe, scoring=scoring)
+    assert len(np.unique(np.concatenate(asked), axis=0)) == 45
 
 
 TWO = CharacteristicSet(
@@ -270,8 +297,16 @@ def window(settings: list[list[float]], safety: list[float]) -> Evaluations:
     return evaluated(TWO, np.array(settings), np.array(safety))
 
 
+def test_models_predict_beyond_what_is_known_and_changes_are_computed() -> None:
+    known = np.random.default_rng(0).uniform(55, 80, (50, 2))
+    predict = _learn(evaluated(TWO, known, -known[:, 0] - known[:, 1]), problem(), 0)
+    predicted = predict(np.array([[100.0, 50.0]]))
+    assert predicted.f_safe[0] == pytest.approx(-150, abs=1)
+    assert predicted.f_diff[0] == predicted.f_num_diff[0] == 1
+
+
 def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_original() -> None:
-    ranges = _Ranges(problem())
+    ranges = Ranges(problem())
     ranges.narrow(window([[60, 50], [80, 40], [90, 10], [0, 0]], [4.0, 4.9, 5.0, 6.0]))
     assert ranges.upper.tolist() == [70, 100]
     assert ranges.lower.tolist() == [0, 40]
@@ -282,7 +317,7 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
     [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)],
 )
 def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
-    ranges = _Ranges(problem())
+    ranges = Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
     assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 

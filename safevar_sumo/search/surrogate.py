@@ -1,0 +1,91 @@
+"""NSGA-II on the prediction of models, which learn from all simulations so far.
+
+After the global search of SAMOTA (Haq, Shin and Briand, "Efficient online testing for DNN-enabled
+systems using surrogate-assisted and many-objective optimization", ICSE 2022), which simulates those
+settings that are best and those whose prediction is the most uncertain. The models here are bagged
+ridge regressions (Breiman, "Bagging predictors", Machine Learning 24, 1996). Only metrics are
+predicted; the measures of change are computed from the setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.search.base import Problem, Search
+from safevar_sumo.search.baselines import Ranges
+from safevar_sumo.search.genetic import Nsga2
+
+
+class Surrogate(Nsga2, frozen=True, kw_only=True):
+    """NSGA-II on the prediction of models; simulates its best and its most uncertain settings.
+
+    The first settings, as many as a population, change from one to all characteristics. In each
+    round, models learn from all settings that were simulated, and NSGA-II, with the parameters of
+    `nsga2`, searches their prediction: 1,500 settings in generations of 100. Of the new settings
+    that it finds, 10 and a tenth of the number of known ones are simulated: four in five are the
+    best by crowding distance, the others those whose prediction is the most uncertain. The result
+    is the non-dominated archive over all evaluations.
+    """
+
+    def search(self, problem: Problem, rng: np.random.Generator, _: object = None) -> Search:
+        draw = Ranges(problem).draw
+        predicted = replace(problem, population=100, evaluations=1500)
+        known = yield draw(min(problem.population, problem.evaluations), rng)
+        while left := problem.evaluations - len(known):
+            # NSGA-II on the prediction, from the best known settings and random ones.
+            predict = _learn(known, problem, int(rng.integers(2**31)))
+            first = np.concatenate([problem.nondominated(known).settings, draw(100, rng)])
+            search = super().search(predicted, rng, first)
+            settings = next(search)
+            try:
+                while True:
+                    settings = search.send(predict(settings))
+            except StopIteration as stop:
+                found = stop.value
+
+            # Its new settings: the best ones, then the most uncertain ones.
+            new = {bytes(setting): row for row, setting in enumerate(found.settings)}
+            for setting in known.settings:
+                new.pop(bytes(setting), None)
+            rows = [*new.values()]
+            number = min(10 + len(known) // 10, left)
+            promising = number * 4 // 5
+            rows[promising:] = sorted(rows[promising:], key=found.column("certainty").__getitem__)
+
+            # Random settings if they are too few.
+            chosen = np.concatenate([found.settings[rows], draw(number, rng)])[:number]
+            known = Evaluations.concatenate([known, (yield chosen)])
+        return problem.nondominated(known)
+
+
+def _learn(known: Evaluations, problem: Problem, seed: int) -> Callable[[FloatArray], Evaluations]:
+    """Fit models of all metrics; the result predicts the evaluations of settings, shape (k, n).
+
+    Its metric `certainty` says how little the predictions of the safety degree differ. The models
+    are linear: unlike trees, they predict settings that are less safe than all known ones. An
+    undefined value counts as that of the original vehicle.
+    """
+    from sklearn.ensemble import BaggingRegressor  # takes a second to load
+    from sklearn.linear_model import Ridge
+
+    # Each model predicts all metrics, and the first one twice: one column has another shape.
+    targets = [
+        np.where(np.isnan(values), np.nan_to_num(problem.original.column(name)), values)
+        for name, values in known.metrics.items()
+    ]
+    columns = np.stack([*targets, targets[0]], axis=1)
+    bag = BaggingRegressor(Ridge(0.1), 20, random_state=seed).fit(known.settings, columns)
+
+    # Further decimals differ between libraries of linear algebra, and so would searches.
+    def predict(settings: FloatArray) -> Evaluations:
+        values = np.array([model.predict(settings).T for model in bag.estimators_]).round(6)
+        metrics = dict(zip(known.metrics, values.mean(axis=0), strict=False))
+        metrics["certainty"] = -values.std(axis=0)[0]
+        exact = problem.characteristics.change_objectives(settings)
+        return replace(Evaluations.undefined(settings, "", (), **exact), metrics=metrics)
+
+    return predict
