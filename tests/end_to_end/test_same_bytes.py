@@ -45,7 +45,7 @@ def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> Non
 
 
 OURS = [*ALGORITHMS]
-MIXED = ["nsga2", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
+MIXED = ["nsga2", "surrogate", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
 
 
 @pytest.mark.parametrize(

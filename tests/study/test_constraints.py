@@ -23,7 +23,7 @@ from tests.search.test_algorithms import SUN
 BOUND = """
 extends = "smoke"
 [search]
-algorithms = ["nsga2", "rs", "safe_fuzzer"]
+algorithms = ["nsga2", "rs", "safe_fuzzer", "surrogate"]
 runs = 1
 evaluations = 60
 population = 10
