@@ -60,6 +60,8 @@ VERDICT_COST = 80_000
 """Number of simulations of a search that take as long as the verdict on it, roughly; the search
 states its own number.
 """
+FEW = 60
+"""Number of simulations that the verdict takes in a simulator of the user's own, roughly."""
 ALGORITHMS: Columns = {
     "algorithm": "algorithm",
     "finished": Column("", "finished runs", is_detail=True),
@@ -186,7 +188,7 @@ def study(
             return _measured(loaded, system, len(keys), engine, batch, pool)
     try:
         with open_progress(not quiet) as show:
-            parts = Parts(show, [0, VERDICT_COST])
+            parts = Parts(show, [0, FEW if system.has_simulator else VERDICT_COST])
             results = run(
                 loaded,
                 directory,

@@ -28,7 +28,12 @@ OTHERS = (
     "study smoke --runs 1 --evaluations 60 --out results",
     "check smoke",
 )
-TYPED = [*(f"{name} {study}" for study in study_names() for name in FEW), *OTHERS]
+SLOW = "metadrive_expert"
+TYPED = [
+    *(f"{name} {study}" for study in study_names() if study != SLOW for name in FEW),
+    *(f"simulate {SLOW}", f"rules {SLOW} --simulations 60"),
+    *OTHERS,
+]
 
 
 def printed(typed: str) -> str:
