@@ -8,6 +8,7 @@ import random
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from threading import Lock
 from typing import Annotated
 
 import moocore
@@ -25,6 +26,9 @@ MAX_MISSES = 50
 """Maximum number of consecutive draws without a feasible child; if the next draw has none either,
 its children are repaired.
 """
+
+_ONE_AT_A_TIME = Lock()
+"""Held while DEAP draws from the global `random`."""
 
 
 @cache
@@ -132,13 +136,14 @@ class Reproduction:
         """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's
         state afterwards.
         """
-        state_of_caller = random.getstate()
-        random.setstate(self._random_state)
-        try:
-            yield
-        finally:
-            self._random_state = random.getstate()
-            random.setstate(state_of_caller)
+        with _ONE_AT_A_TIME:  # another thread would draw from this state
+            state_of_caller = random.getstate()
+            random.setstate(self._random_state)
+            try:
+                yield
+            finally:
+                self._random_state = random.getstate()
+                random.setstate(state_of_caller)
 
     def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
