@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -86,9 +86,10 @@ class ProcessWorker:
         return f"the worker process died (exit code {self._process.exitcode}){place}"
 
     def end(self) -> None:
-        if CLOSING_SIGNAL is not None and self._process.pid and self._process.is_alive():
-            os.kill(self._process.pid, CLOSING_SIGNAL)
-            self._process.join(CLOSING_TIME)
+        if CLOSING_SIGNAL is not None and self._process.pid:
+            with suppress(ProcessLookupError):  # it has died
+                os.kill(self._process.pid, CLOSING_SIGNAL)
+                self._process.join(CLOSING_TIME)
         self._process.kill()
         self._executor.shutdown(cancel_futures=True)
 

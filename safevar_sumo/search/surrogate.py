@@ -52,12 +52,12 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
             for setting in known.settings:
                 new.pop(bytes(setting), None)
             rows = [*new.values()]
-            number = min(10 + len(known) // 10, left)
+            number = 10 + len(known) // 10
             promising = number * 4 // 5
             rows[promising:] = sorted(rows[promising:], key=found.column("certainty").__getitem__)
 
-            # Random settings if they are too few.
-            chosen = np.concatenate([found.settings[rows], draw(number, rng)])[:number]
+            # Random settings if they are too few; a smaller budget begins as a larger one does.
+            chosen = np.concatenate([found.settings[rows], draw(number, rng)])[: min(number, left)]
             known = Evaluations.concatenate([known, (yield chosen)])
         return problem.nondominated(known)
 

@@ -410,7 +410,8 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, oft
 @pytest.mark.slow
 @pytest.mark.usefixtures("worker_processes")
 def test_simulators_are_closed_with_their_workers(wall: Path) -> None:
-    text = MODELS.replace("CLOSED.append(1)", "open('closed', 'a').write('x')")
+    place = str(wall.parent / "closed")  # also at the end of this process
+    text = MODELS.replace("CLOSED.append(1)", f"open({place!r}, 'a').write('x')")
     (wall.parent / "models.py").write_text(text)
     run("study", "wall.toml", "--out", "results")
     assert len(Path("closed").read_text()) >= 2
