@@ -23,7 +23,12 @@ from safevar_sumo.campaign.questions import (
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.price import Account, seconds_of_simulation, simulations_of_setting
+from safevar_sumo.questions.price import (
+    MEASURED,
+    Account,
+    seconds_of_simulation,
+    simulations_of_setting,
+)
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
@@ -113,6 +118,8 @@ class Evaluator:
         if self.account.is_question:
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
             self.account.open(expected * self._each, seconds)
+            if seconds is not None:
+                self.account.spend(MEASURED * self._each)
         share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
         self.phases.plan(planned, len(self.system.points))

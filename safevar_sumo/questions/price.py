@@ -20,6 +20,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 LONGEST = 900.0
 """Time up to which a question does by default all that it is made for [s]."""
+MEASURED = 2
+"""Settings that are simulated to know how long one takes."""
 DIGITS = 2
 """Digits of a number of simulations that is derived from a time."""
 
@@ -59,8 +61,9 @@ class Account:
             If they are more than may follow.
         """
         self.spent += simulations
-        if self.left < 0:
-            problem = f"{self.most:,} do not suffice: {self.spent:,} are needed to go on"
+        bound = self.asked if self.most is None else self.most
+        if bound is not None and self.spent > bound:
+            problem = f"{bound:,} do not suffice: {self.spent:,} are needed to go on"
             raise InputError("simulations", problem, "a larger number")
 
     def open(self, expected: float, seconds: float | None) -> None:
@@ -89,14 +92,13 @@ def round_down(number: float) -> int:
 
 
 def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
-    """How long a simulation takes, by all workers together [s]; None where it takes milliseconds,
-    as in SUMO.
+    """How long a simulation takes, by all workers together [s], from the original vehicle, which is
+    simulated `MEASURED` times; None where it takes milliseconds, as in SUMO.
     """
     if not system.has_simulator:
         return None
-    original = CharacteristicSet.of(study).original_settings
-    jobs = [(Task(study=study), original)] * pool.workers
-    carry_out(evaluate_settings, jobs, pool)  # workers start, and so do their simulators
+    jobs = [(Task(study=study), CharacteristicSet.of(study).original_settings)]
+    carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
     start = time.perf_counter()
     carry_out(evaluate_settings, jobs, pool)
     return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(system))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.scenarios import Point, Simulator
+from safevar_sumo.scenarios import Point, Scenario, Simulator
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -58,6 +58,24 @@ def check_tables(study: Study, scenario: type) -> None:
             raise InputError(
                 "", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR
             )
+
+
+def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
+    """Refuse a matrix in which SUMO and a simulator of the user's own would both move the vehicle.
+
+    Raises
+    ------
+    InputError
+        With the first such test.
+    """
+    for point in matrix:
+        if isinstance(point.scenario, Simulator) is not isinstance(scenario, Simulator):
+            own, other = "a simulator of the user's own", "a scenario of SUMO"
+            kinds = (own, other) if isinstance(scenario, Simulator) else (other, own)
+            problem = (
+                f"matrix.tests: {point.name!r} is {kinds[1]}, and scenario.model is {kinds[0]}"
+            )
+            raise InputError("", problem, "tests of the kind of scenario.model")
 
 
 def noise_remarks(characteristics: CharacteristicSet, points: Sequence[Point]) -> list[str]:

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
@@ -195,8 +196,12 @@ def _runs_of(
 ) -> SimulationRuns:
     """The runs of N results, each with its own number of samples."""
     traces = [{**NO_TRACE, **result} if TIME not in result else result for result in results]
-    steps = {float(np.diff(trace[TIME][:2])[0]) for trace in traces}
-    step = min(steps)
+    logged = [result[TIME] for result in results if TIME in result] or [NO_TRACE[TIME]]
+    steps = {round(float(np.ptp(times[:2])), 6) for times in logged}
+    if len(steps) > 1:
+        problem = f"scenario.model: runs have time steps of {min(steps):g} and {max(steps):g} s"
+        raise InputError(system.source, problem, "one time step in all runs")
+    step = float(np.diff(logged[0][:2])[0])
     lengths = np.array([len(trace[TIME]) for trace in traces])
     samples = np.arange(lengths.max())
 

@@ -39,7 +39,7 @@ from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
-from safevar_sumo.sumo.simulated_study import noise_remarks
+from safevar_sumo.sumo.simulated_study import check_matrix, noise_remarks
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import (
@@ -328,6 +328,7 @@ def _assemble(study: Study) -> System:
     # The points at which settings are simulated, and what is measured there.
     rater = rater_of(study)
     matrix = matrix_points(expand_protocol(study, weather), lookup)
+    check_matrix(scenario, matrix)
     scenarios = (scenario, *(point.scenario for point in matrix))
     has_stops = any(member.brakes_fully for member in scenarios)
     measuring = measuring_of(study, lookup, has_stops=has_stops)

@@ -93,6 +93,23 @@ def test_indices_of_few_simulations_come_from_a_smaller_design(rig: str) -> None
     assert "simulations" not in usual.numbers
 
 
+def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(rig: str) -> None:
+    searched = "[scenario.search]\ngap = { lower = 38.0 }\n\n[vehicle.ch"
+    Path("searched.toml").write_text(STUDY.replace("[vehicle.ch", searched))
+    answer = sv.tolerance("searched.toml", simulations=800, pool=InlinePool())
+    assert answer.tables["limits"][["alone_low", "alone_high"]].isna().all(axis=None)
+    assert answer.tables["limits"]["together_low"].notna().all()
+
+
+def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
+    account = Account(asked=120)
+    account.open(100, None)
+    assert account.most is None
+    account.spend(120)
+    with pytest.raises(InputError, match="120 do not suffice: 121"):
+        account.spend(1)
+
+
 def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
     with pytest.raises(InputError, match="few simulations"):
         sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=InlinePool())

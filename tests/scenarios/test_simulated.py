@@ -252,6 +252,24 @@ def test_what_a_simulator_does_not_use_is_refused(
     assert told in f"{error.value}"
 
 
+def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
+    parameters = {"test": "CCRs", "speed": 40.0, "headway": 4.0}
+    tests = [
+        {"name": "a", "model": "models:Wall"},
+        {"name": "b", "model": "car_to_car", "parameters": parameters},
+    ]
+    with pytest.raises(InputError, match=r"'b.*' is a scenario of SUMO, and scenario.model is a"):
+        system_of(wall, matrix={"tests": tests})
+
+
+def test_runs_of_one_batch_have_one_time_step(wall: Path) -> None:
+    change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
+    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
+    system = system_of(wall, scenario={"model": "models:Wrong"})
+    with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
+        simulators.simulate_each(system, np.array([[9.0, 0.0], [4.0, 0.5]]))
+
+
 @pytest.mark.parametrize("key", ["ads", "weather"])
 def test_a_study_without_a_simulator_needs_a_driving_system(key: str) -> None:
     tables = tables_of(sv.load_study("smoke"))

@@ -138,8 +138,8 @@ def explain(
     settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
     evaluator.plan({TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)} | LATER)
 
-    # The failures, and the minimal causes of a sample of them; of one where few simulations are
-    # allowed.
+    # The failures, and the minimal causes of a sample of them, of a smaller one where few
+    # simulations are allowed.
     if evaluator.left is not None:
         fits, limit = 0, evaluator.left // 4
         top = max(1, min(top, evaluator.left // FOR_ONE))

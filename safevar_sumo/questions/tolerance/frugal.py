@@ -166,14 +166,16 @@ def answer_roughly(asked: Asked) -> Answer:
     search.test_corners(Stream.FIRST_CORNERS.generator(seed))
     is_tested = search.falsify(Stream.JOINT_LIMITS.generator(seed))
 
-    # A row for each characteristic; joint limits only where vehicles were tried within them.
+    # A row for each characteristic; limits alone only where there is one encounter, joint limits
+    # only where vehicles were tried within them.
+    has_encounters = len(members.scenario) > 0
     together = (search.low, search.high) if is_tested else None
     rows = []
     for column, item in enumerate(members):
         if column in asked.columns:
             ends = NOWHERE if together is None else tuple(float(one[column]) for one in together)
-            limit_alone = (float(one[column]) for one in alone)
-            known = (item.name, item.unit, item.original, *limit_alone, *ends)
+            limit = NOWHERE if has_encounters else tuple(float(one[column]) for one in alone)
+            known = (item.name, item.unit, item.original, *limit, *ends)
             rows.append((*known, *NOWHERE, None, None, None, None))
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
