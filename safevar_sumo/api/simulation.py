@@ -20,6 +20,7 @@ from safevar_sumo.metrics import (
     impact_in_words,
     time_to_collision,
 )
+from safevar_sumo.questions.phases import with_phase_if_set
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
     STANDSTILL,
@@ -308,6 +309,8 @@ def simulate(
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
+    with about("changes"):
+        loaded_study, system = with_phase_if_set(loaded_study, system, changes or {})
     return simulate_with_original(
         loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered
     )

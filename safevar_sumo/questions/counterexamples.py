@@ -18,7 +18,7 @@ from safevar_sumo.questions.words import EXACT, join_phrases
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
-from safevar_sumo.study import unit_text
+from safevar_sumo.study import PHASE, unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
@@ -140,6 +140,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
         values = members.scenario.named(settings[row, ~members.of_vehicle])
+        values |= {PHASE: model.phase} if model.phase else {}
         scenario = encounter(point, values).scenario
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
@@ -161,6 +162,8 @@ def where_in_words(
     """
     own = dict(point.parameters)
     numbers = {**{name: value for name, value in own.items() if name not in OF_ENCOUNTER}, **values}
+    if not numbers.get(PHASE, 1):
+        del numbers[PHASE]
     units = searchable_in(point.scenario)
     texts = {
         name: (

@@ -23,6 +23,7 @@ from safevar_sumo.campaign.questions import (
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
     Account,
@@ -89,6 +90,12 @@ class Evaluator:
     def system(self) -> System:
         """The models of the study, assembled."""
         return assemble(self.study)
+
+    @cached_property
+    def in_phases(self) -> Evaluator | None:
+        """An evaluator of settings that end with the phase of their encounter; None without."""
+        study = in_phases(self.study, self.system)
+        return None if study == self.study else self.for_study(study, verified=0)
 
     def evaluate(
         self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False

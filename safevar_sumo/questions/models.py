@@ -42,6 +42,8 @@ class Model(NamedTuple):
         Numbers of the points of the study's matrix that count; all if empty.
     new_car
         What the original must not be in an encounter that counts, where it has not been tried.
+    phase
+        The phase at which all encounters begin.
     """
 
     fit: int
@@ -49,9 +51,32 @@ class Model(NamedTuple):
     unsafe: Unsafe
     points: tuple[int, ...] = ()
     new_car: Unsafe | None = None
+    phase: float = 0.0
+
+    @property
+    def numbers_of_points(self) -> Sequence[int]:
+        """Numbers of the points that count."""
+        return self.points or range(len(self.evaluator.system.points))
+
+    @property
+    def in_phases(self) -> Model | None:
+        """The model of settings that end with the phase of their encounter; None without phases,
+        and for points of a rating.
+
+        All points of a study that does not search its scenario count, whatever the original does.
+        """
+        evaluator = self.evaluator.in_phases
+        if evaluator is None or self.unsafe.is_of_points:
+            return None
+        is_searched = len(self.evaluator.characteristics.scenario) > 0
+        points = self.points if is_searched else tuple(self.numbers_of_points)
+        return self._replace(evaluator=evaluator, points=points, phase=0.0)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
         """The evaluations of M settings, shape (M, n), at the points that count."""
+        if self.phase and (model := self.in_phases) is not None:
+            phases = np.full(len(settings), self.phase)
+            return model.evaluate(np.column_stack([settings, phases]), stage)
         if not self.points:
             return self.evaluator.evaluate(settings, stage)
         return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)

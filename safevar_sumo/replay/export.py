@@ -23,6 +23,7 @@ from safevar_sumo.replay.simulate import load_target
 from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.shipped import NETWORKS
+from safevar_sumo.study import PHASE
 from safevar_sumo.sumo.network import NetworkFiles, built_network, program_of_sumo, run_program
 from safevar_sumo.sumo.system import assemble
 
@@ -294,6 +295,9 @@ def export(
     system = assemble(target.study)
     system.refuse_simulator("it has no road to export")
     setting = target.setting(system)
+    if system.characteristics.named(setting).get(PHASE):
+        problem = f"solution {solution} has a {PHASE}, which another simulator does not have"
+        raise InputError(directory, problem, "a solution of a study that does not search it")
     vehicle = system.characteristics.vehicle
     of_vehicle = setting[system.characteristics.of_vehicle]
     values = vehicle.named(of_vehicle)

@@ -23,6 +23,7 @@ from safevar_sumo.questions.ask import PointName
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
+from safevar_sumo.questions.phases import with_phase_if_set
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.questions.words import change_texts, ending_in_words, number_of, points_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -33,7 +34,7 @@ from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.safer import rises_again, why_safer
 from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.scenarios import degree_note, pre_crash_sentence
-from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, PHASE_DECIMALS, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import (
     PointResult,
@@ -116,7 +117,8 @@ class Target(NamedTuple):
         """The solution's setting, or the original."""
         if self.row is None:
             return system.characteristics.original
-        return np.array([self.row[name] for name in system.characteristics.names], dtype=float)
+        values = system.characteristics.named(system.characteristics.original)
+        return np.array([self.row.get(name, value) for name, value in values.items()], dtype=float)
 
 
 @contents(
@@ -175,7 +177,12 @@ def show_simulation(
     system = assemble(target.study)
     changes = set
     with about("set"):
+        names = [change.partition("=")[0].strip() for change in changes]
+        study, system = with_phase_if_set(target.study, system, names)
+        target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
+        if PHASE in values:
+            values[PHASE] = np.round(values[PHASE], PHASE_DECIMALS).tolist()
         requested = _combine(values, target.setting(system), system)
         if changes and not beyond:  # what a study or results hold has been checked
             system.region.check(requested, otherwise=", or any with --beyond")
@@ -288,6 +295,8 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     members = system.characteristics.vehicle
     if texts := change_texts(members, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
+    if phase := system.characteristics.named(setting).get(PHASE):
+        verdict.append(f"The encounter begins {phase:g} steps of the driving system later.")
     solution = {} if target.handle is None else {"solution": str(target.handle)}
     return Answer(
         question="simulate",

@@ -31,7 +31,7 @@ from safevar_sumo.scenarios.tracks import (
     travelled as travelled,
 )
 from safevar_sumo.shipped import shipped_table
-from safevar_sumo.study import FreeParameter, Weather, free_parameters
+from safevar_sumo.study import PHASE, FreeParameter, Weather, free_parameters
 
 SCENARIO_BASES: tuple[type, ...] = (Simulator, TrackScenario, WorldScenario)
 """The contracts of a user's scenario."""
@@ -57,6 +57,15 @@ WEATHERS = {
 
 WEATHER_PARAMETERS = free_parameters(Weather)
 """Parameters of a weather that a study may search, by name."""
+PHASES = {
+    PHASE: FreeParameter(
+        lower=0.0,
+        upper=1.0,
+        unit="-",
+        meaning="phase, by which the encounter begins later, in steps",
+    )
+}
+"""The phase, where an encounter has one."""
 
 
 def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
@@ -65,7 +74,10 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     """
     if isinstance(scenario, Simulator):
         return scenario.free()
-    return {} if scenario.brakes_fully else {**scenario.free(), **WEATHER_PARAMETERS}
+    if scenario.brakes_fully:
+        return {}
+    phases = PHASES if scenario.has_phase else {}
+    return {**scenario.free(), **WEATHER_PARAMETERS, **phases}
 
 
 def weather_of(choice: str | Weather) -> Weather:

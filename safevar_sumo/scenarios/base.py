@@ -183,6 +183,9 @@ class Scenario:
     is_uneventful
         In which searched encounters that is so, shape (N,): a run without a collision is an invalid
         test there.
+    has_phase
+        Whether all of an encounter can begin later by a part of a step, while the driving system
+        decides at the same times as ever.
     brakes_fully
         Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
     is_user_code
@@ -198,11 +201,13 @@ class Scenario:
     brakes_fully: bool = False
     border: ClassVar[str] = ""
     # A scenario may have fields or properties of these names: type checkers see properties.
-    # `duration` has no default.
+    # `duration` and `start_speed` have no default.
     if TYPE_CHECKING:
 
         @property
         def duration(self) -> float: ...
+        @property
+        def start_speed(self) -> Quantity: ...
         @property
         def pre_crash(self) -> str: ...
         @property
@@ -219,7 +224,10 @@ class Scenario:
         def uneventful(self) -> str | None: ...
         @property
         def is_uneventful(self) -> Quantity | bool: ...
+        @property
+        def has_phase(self) -> bool: ...
     else:
+        has_phase = False
         pre_crash = ""
         test_speed = None
         profile_until = profile_highest = 0.0
@@ -327,6 +335,7 @@ SPEED_DIMENSION = "speed"
 class Point(NamedTuple):
     """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
     the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
+    All of it begins `phase` steps later, a number or of shape (N,).
     """
 
     scenario: Scenario
@@ -334,6 +343,7 @@ class Point(NamedTuple):
     name: str = ""
     parameters: tuple[tuple[str, Any], ...] = ()
     allowed_impact_speed: float = 0.0
+    phase: Quantity = 0.0
 
 
 class PreCrash(StrEnum):

@@ -43,6 +43,8 @@ class OpenScenario(TrackScenario):
         Values of the file's parameters by name, numbers or texts, or arrays of N numbers.
     """
 
+    has_phase = False  # its storyboard and its Ego's profile run on the clock of the simulation
+
     def __init__(self, file: str, ego: str = "Ego", **values: Quantity | str) -> None:
         self.name = file
         self.file = os.path.abspath(file)

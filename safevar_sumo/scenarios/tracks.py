@@ -20,6 +20,7 @@ from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Grade, Scenario, XmlChanges, as_text
 from safevar_sumo.scenarios.roads import Roads
+from safevar_sumo.study import PHASE
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -229,6 +230,47 @@ class TrackScenario(Scenario):
     @abstractmethod
     def tracks(self, times: FloatArray) -> Sequence[Track]:
         """The bodies at T `times`, shape (T, 1) [s], which begin at 0."""
+
+    @property
+    def has_phase(self) -> bool:
+        """All bodies can begin later, unless the scenario has a parameter of that name itself."""
+        return PHASE not in self.free()
+
+    def tracks_begun(self, times: FloatArray, later: Quantity) -> Sequence[Track]:
+        """The bodies at T `times`, shape (T, 1), of an encounter that begins `later` [s], a number
+        or of shape (N,). Until then the vehicle and all bodies go on as they do at its beginning.
+
+        The vehicle is at (0, 0) at the first time, as ever, so that all bodies are farther ahead by
+        what it covers until the encounter begins.
+
+        Raises
+        ------
+        InputError
+            If a user's scenario does not take times of shape (T, N).
+        """
+        if not np.any(later):
+            return self.tracks(times)
+        since = times - later
+        tracks = self.tracks(np.maximum(since, 0.0))
+
+        # A user's class may read the first column of the times alone.
+        if self.is_user_code and since.shape[1] > 1:
+            alone = self.tracks(np.maximum(since[:, -1:], 0.0))
+            last = (np.atleast_2d(track.x)[:, -1] for track in (*tracks, *alone))
+            columns = np.broadcast_arrays(*last)
+            if not np.allclose(columns[: len(alone)], columns[len(alone) :]):
+                problem = f"{type(self).__name__}.tracks reads the first of several times alone"
+                raise InputError("", problem, "tracks that take times of shape (T, N)")
+
+        # Before its encounter each body keeps its first velocity.
+        before = np.minimum(since, 0.0)
+        way = self.start_speed * later
+        moved = list[Track]()
+        for track in tracks:
+            along, left, speed = (np.atleast_2d(column)[:1] for column in track[6:])
+            x = track.x + way + speed * along * before
+            moved.append(track._replace(x=x, y=track.y + speed * left * before))
+        return moved
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, at its speed."""

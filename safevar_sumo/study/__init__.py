@@ -28,6 +28,8 @@ from safevar_sumo.study.marks import (
     with_effect as with_effect,
 )
 from safevar_sumo.study.parameters import (
+    PHASE as PHASE,
+    PHASE_DECIMALS as PHASE_DECIMALS,
     FreeParameter as FreeParameter,
     free_parameters as free_parameters,
     searched as searched,

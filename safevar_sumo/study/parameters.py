@@ -11,6 +11,13 @@ from msgspec import Meta
 
 from safevar_sumo.study.marks import Table
 
+PHASE = "phase"
+"""The parameter of an encounter by which all of it begins later, as a share of the time between two
+decisions of the driving system.
+"""
+PHASE_DECIMALS = 4
+"""Decimals of a phase that is simulated and printed: unsafe windows of 0.1 % of a step occur."""
+
 
 class FreeParameter(Table, frozen=True, kw_only=True):
     """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.

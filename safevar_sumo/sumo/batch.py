@@ -15,7 +15,7 @@ from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario
 from safevar_sumo.sumo.bodies import SceneWorld
-from safevar_sumo.sumo.drive import Listener, drive
+from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
 from safevar_sumo.sumo.network import copied_network, networks_for
@@ -161,25 +161,25 @@ def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
     """The bodies around N vehicles in their encounters, shape (N, k), at every point; None if the
     scenario observes a world itself.
     """
-    scenarios = [
-        point.scenario for point in system.points if isinstance(point.scenario, TrackScenario)
-    ]
-    if len(scenarios) < len(system.points):
+    points = system.points
+    if not all(isinstance(point.scenario, TrackScenario) for point in points):
         return None
-    group = np.repeat(np.arange(len(scenarios)), len(encounters))
+    group = np.repeat(np.arange(len(points)), len(encounters))
+    n_encounters = 1
 
     # An encounter that several vehicles meet is there once.
     if encounters.shape[1]:
         _, first, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
         if len(first) == len(encounters):
             first = group = np.arange(len(encounters))
-        scenario = system.at_encounters(encounters[first]).scenario
-        assert isinstance(scenario, TrackScenario)
-        scenarios = [scenario]
-    step = system.scenes.step_of(scenarios[0])
-    duration = max(float(np.max(scenario.duration)) for scenario in scenarios)
-    n_samples = round(duration / step) + 1
-    return Traffic(scenarios, np.reshape(group, -1), n_samples=n_samples, step=step)
+        points = system.at_encounters(encounters[first]).points
+        n_encounters = len(first)
+        starts = n_encounters * np.arange(len(points))
+        group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
+    step = system.scenes.step_of(points[0].scenario)
+    last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
+    n_samples = round(last_sample) + 1
+    return Traffic(points, group, n_encounters=n_encounters, n_samples=n_samples, step=step)
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:

@@ -76,8 +76,8 @@ def drive(
     is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
     contacts = FirstContacts(n, is_tested)
     outcomes = _Outcomes(n)
-    durations = per_vehicle([point.scenario.duration / step for point in points], size)
-    last_sample = np.round(durations).astype(int)
+    last_samples = [np.zeros(size) + last_sample_of(point, step) for point in points]
+    last_sample = np.round(np.concatenate(last_samples)).astype(int)
     log = _Log(world, int(last_sample.max()) + 1)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
@@ -117,6 +117,11 @@ def drive(
     encounter = observer.encounter(trace)
     outcomes.ended = outcomes.classify()
     return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
+
+
+def last_sample_of(point: Point, step: float) -> Quantity:
+    """The number of the last sample of runs at a point, which begin later by its phase."""
+    return point.scenario.duration / step + point.phase
 
 
 def _runs(

@@ -27,7 +27,7 @@ from safevar_sumo.scenarios import (
     searchable_in,
 )
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.study import Study, unit_text
+from safevar_sumo.study import PHASE, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
@@ -85,13 +85,15 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
 
 def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the
-    same object if only the weather varies.
+    same object if only weather and phase vary.
     """
+    values = dict(values)
+    phase = values.pop(PHASE, point.phase) if point.scenario.has_phase else point.phase
     of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
     of_scenario = {name: value for name, value in values.items() if name not in of_weather}
     weather = replace_fields(point.weather, **of_weather)
     scenario = point.scenario.at(of_scenario) if of_scenario else point.scenario
-    return point._replace(scenario=scenario, weather=weather)
+    return point._replace(scenario=scenario, weather=weather, phase=phase)
 
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:

@@ -26,7 +26,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, SAFETY_DEGREE, WORST, Study
+from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, WORST, Study
 from safevar_sumo.sumo.batch import drive_all, is_recorded, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
@@ -288,7 +288,8 @@ def simulate_groups(
 
     # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
-    if is_recorded(system, engine) and not len(system.characteristics.scenario):
+    searched = system.characteristics.scenario.names
+    if is_recorded(system, engine) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)

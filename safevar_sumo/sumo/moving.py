@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
-from safevar_sumo.scenarios import Track, TrackScenario
+from safevar_sumo.scenarios import Point, Track, TrackScenario
 from safevar_sumo.scenarios.tracks import SCREEN, first_in_strip
 from safevar_sumo.sumo.bodies import Body
 from safevar_sumo.sumo.track_check import check_motion, check_shapes, check_start
@@ -169,33 +169,38 @@ def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
 
 
 def tracks_of(
-    scenarios: Sequence[TrackScenario], times: FloatArray, n_encounters: int, step: float, own: Body
+    points: Sequence[Point], times: FloatArray, n_encounters: int, step: float, own: Body
 ) -> list[Track]:
-    """The bodies of K scenarios, or of one in N encounters, with columns; body b is that of all
-    scenarios' bodies b. `own` is the vehicle under test at the start.
+    """The bodies at K points, each in N encounters, with columns; body b is that of all scenarios'
+    bodies b. `own` is the vehicle under test at the start.
 
     Raises
     ------
     InputError
         If bodies cannot move as a scenario says.
     """
-    tracks_of_scenarios = [scenario.tracks(times) for scenario in scenarios]
+    tracks_of_scenarios = [
+        point.scenario.tracks_begun(times, np.asarray(point.phase) * step)
+        for point in points
+        if isinstance(point.scenario, TrackScenario)
+    ]
     for tracks in tracks_of_scenarios:
         check_shapes(tracks, len(times), n_encounters, step)
-    joined = [_joined(tracks) for tracks in zip_longest(*tracks_of_scenarios, fillvalue=NOBODY)]
+    of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=NOBODY)
+    joined = [_joined(tracks, n_encounters if len(points) > 1 else 1) for tracks in of_bodies]
     for track in joined:
         check_motion(track, step)
     check_start(joined, own)
     return joined
 
 
-def _joined(tracks: Sequence[Track]) -> Track:
-    """A body of K scenarios as one track with columns."""
+def _joined(tracks: Sequence[Track], width: int) -> Track:
+    """A body of K scenarios as one track with columns, of at least this width for each."""
     columns = []
     for values in zip(*(track[2:] for track in tracks), strict=True):
         parts = [np.atleast_2d(np.asarray(value, dtype=float)) for value in values]
         length = max(len(part) for part in parts)
-        widened = [np.broadcast_to(part, (length, part.shape[1])) for part in parts]
+        widened = [np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts]
         columns.append(slim(np.concatenate(widened, axis=1)))
     first = next(track for track in tracks if track is not NOBODY)
     return Track(first.name, first.kind, *columns)

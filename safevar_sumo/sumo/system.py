@@ -17,7 +17,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
-from safevar_sumo.records import FloatArray, Nominal
+from safevar_sumo.records import FloatArray, Nominal, Quantity
 from safevar_sumo.scenarios import (
     VUT,
     Point,
@@ -79,7 +79,7 @@ class System:
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - `allowed_impact_speed` [m/s] is that of the only point; see `Point`.
+    - `allowed_impact_speed` [m/s] and `phase` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `command` simulates the original vehicle of the study.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
@@ -102,6 +102,7 @@ class System:
     sees_nobody: bool = False
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
+    phase: Quantity = 0.0
     repeats: int = 1
     command: str = ""
 
@@ -110,8 +111,11 @@ class System:
         """Points at which a setting is simulated: the points of the matrix, or the study's only
         scenario.
         """
+        if self.matrix:
+            return self.matrix
         allowed = self.allowed_impact_speed
-        return self.matrix or (Point(self.scenario, self.weather, allowed_impact_speed=allowed),)
+        only = Point(self.scenario, self.weather, allowed_impact_speed=allowed, phase=self.phase)
+        return (only,)
 
     @property
     def has_simulator(self) -> bool:
@@ -165,15 +169,15 @@ class System:
 
     def at_encounters(self, encounters: FloatArray) -> System:
         """The system at encounters, shape (N, n - k): its only point, with arrays as the parameters
-        that the study searches; the system itself if it searches none.
+        that the study searches, or several points if that is the phase alone; the system itself if
+        it searches none.
         """
         if not encounters.shape[1]:
             return self
-        (point,) = self.points
         values = self.characteristics.scenario.columns(encounters)
-        return replace(
-            self.at(encounter(point, values)), characteristics=self.characteristics.vehicle
-        )
+        points = tuple(encounter(point, values) for point in self.points)
+        here = self.at(points[0]) if len(points) == 1 else replace(self, matrix=points)
+        return replace(here, characteristics=self.characteristics.vehicle)
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
@@ -182,6 +186,7 @@ class System:
             scenario=point.scenario,
             weather=point.weather,
             allowed_impact_speed=point.allowed_impact_speed,
+            phase=point.phase,
             matrix=(),
             rater=None,
         )

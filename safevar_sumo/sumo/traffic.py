@@ -18,7 +18,7 @@ from safevar_sumo.records import (
     Quantity,
     Trace,
 )
-from safevar_sumo.scenarios import Scene, Track, TrackScenario
+from safevar_sumo.scenarios import Point, Scene, Track, TrackScenario
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import SCREEN
 from safevar_sumo.sumo.bodies import (
@@ -56,22 +56,29 @@ passed, or scenery.
 class Traffic:
     """The bodies around N vehicles.
 
-    `group`, shape (N,), is the number of each vehicle's scenario; or, where the only one has arrays
-    as parameters, the number of its encounter.
+    `group`, shape (N,), is the number of each vehicle's point; where points have arrays of
+    `n_encounters` values as parameters or phase, the number of its encounter: first those at the
+    first point.
     """
 
     def __init__(
-        self, scenarios: Sequence[TrackScenario], group: IntArray, *, n_samples: int, step: float
+        self,
+        points: Sequence[Point],
+        group: IntArray,
+        *,
+        n_encounters: int = 1,
+        n_samples: int,
+        step: float,
     ) -> None:
-        first = scenarios[0]
+        first = points[0].scenario
+        assert isinstance(first, TrackScenario)
         self.length = first.vut_length
         self.width = first.vut_width
         self.setback = first.sensor_setback
         times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
         own = self._own(np.zeros(1), np.zeros(1))
         n_groups = int(group.max()) + 1
-        n_encounters = n_groups if len(scenarios) == 1 else 1
-        self.tracks = tracks_of(scenarios, times, n_encounters, step, own)
+        self.tracks = tracks_of(points, times, n_encounters, step, own)
         self.n = len(group)
         self.step = step
         # None: all vehicles share a column, or each has its own.

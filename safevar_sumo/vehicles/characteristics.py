@@ -17,7 +17,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import BoolArray, FloatArray, Quantity
-from safevar_sumo.study import Study, plain_values, unit_text
+from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -102,6 +102,8 @@ class Characteristic:
     @property
     def digits(self) -> int:
         """Number of decimals of `text`."""
+        if self.is_scenario and self.name == PHASE:
+            return PHASE_DECIMALS
         return max(0, math.ceil(-math.log10(self.resolution / 4)))
 
     def rounded(self, value: float, *, upwards: bool) -> float:

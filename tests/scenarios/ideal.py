@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.records import SimulationRuns
-from safevar_sumo.scenarios import TrackScenario
+from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traffic import LaneWorld, Traffic
@@ -67,7 +67,8 @@ def ideal(system: System) -> System:
 def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> SimulationRuns:
     """Runs of the original vehicle in N encounters, whose parameters are arrays."""
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
-    traffic = Traffic([scenario], np.arange(n), n_samples=samples, step=STEP)
+    points = [Point(scenario, system.weather)]
+    traffic = Traffic(points, np.arange(n), n_encounters=n, n_samples=samples, step=STEP)
     settings = np.tile(system.characteristics.original, (n, 1))
     world = LaneWorld(traffic, np.zeros(n) + scenario.start_speed, STEP)
     return drive(replace(system, ads=ads, scenario=scenario), settings, world, traffic)

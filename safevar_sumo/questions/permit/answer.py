@@ -127,7 +127,7 @@ class PermitAnswer:
             rows.append(
                 (
                     *(name, permit.up_to, new_car, self.span.unit, verdict, reason),
-                    *(found.test, found.encounter, found.outcome, fit, *after),
+                    *(found.test, found.encounter, found.outcome, found.phase, fit, *after),
                 )
             )
         return rows
@@ -160,6 +160,8 @@ class PermitAnswer:
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
         sentences.append(f"Safe means: {self._safe_in_words()}.")
+        if remark := self.search.remark_on_phases():
+            sentences.append(remark)
         if span.ending:
             tests = join_phrases(span.ending)
             sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")

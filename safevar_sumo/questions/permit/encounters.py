@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import NamedTuple
 
@@ -17,11 +17,12 @@ from safevar_sumo.errors import InputError, SimulationError, check_name
 from safevar_sumo.questions.between import domains_of_axes
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import points_of_tests
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
-from safevar_sumo.study import Study
+from safevar_sumo.study import PHASE, Study
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
@@ -78,6 +79,11 @@ class EncounterRange(NamedTuple):
     def number_of_characteristics(self) -> int:
         return len(self.model.evaluator.characteristics.vehicle)
 
+    @property
+    def has_phases(self) -> bool:
+        """Whether a setting ends with the phase of its encounter."""
+        return self.model.evaluator.characteristics.names[-1] == PHASE
+
     def box(self, lower: FloatArray, upper: FloatArray, up_to: float) -> Box | None:
         """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
         None where there is nothing to search: no such encounter, or one vehicle in one.
@@ -106,7 +112,11 @@ class EncounterRange(NamedTuple):
         """
         members = self.model.evaluator.characteristics
         count = self.number_of_characteristics
-        others = [at for at in range(count, len(members)) if at != self.column]
+        others = [
+            at
+            for at in range(count, len(members))
+            if at != self.column and members.names[at] != PHASE
+        ]
         points = unit_places(len(others), value)
         settings = np.zeros((len(points), len(members)))
         lower, upper = members.lower[others], members.upper[others]
@@ -124,6 +134,17 @@ class EncounterRange(NamedTuple):
             values = np.round(settings[:, column], item.digits)
             rounded[:, column] = np.clip(values, item.lower, item.upper)
         return rounded
+
+    def at_worst_phases(
+        self, settings: FloatArray, left: FloatArray, is_open: BoolArray, stage: str
+    ) -> tuple[FloatArray, FloatArray]:
+        """Settings, shape (M, n), those that are open at their worst phases, and what they leave;
+        `left` is that at phase 0.
+        """
+        if not self.has_phases:
+            return settings, left
+        judge = partial(self.robustness, stage=stage)
+        return meet_worst_phases(self.model, judge, settings, left, is_open)
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What settings leave to the limit, shape (M,), in encounters as they are printed.
@@ -217,7 +238,7 @@ def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
     for test, alone, fixed in _tests_alone(model.evaluator.study, span.name):
-        evaluator = model.evaluator.for_study(alone, verified=0)
+        evaluator = model.evaluator.for_study(in_phases(alone, assemble(alone)), verified=0)
         members = evaluator.characteristics
         low = high = fixed
         column = None

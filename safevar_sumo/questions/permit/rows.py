@@ -14,7 +14,7 @@ from safevar_sumo.questions.permit.speeds import LimitingFailure
 from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
 from safevar_sumo.scenarios import searchable_in
-from safevar_sumo.study import unit_text
+from safevar_sumo.study import PHASE, unit_text
 
 DRIVE, LIMITED, STOP = "drive", "up to", "stop"
 """Verdicts: as fast as was driven, as is needed, or as the new car; up to a speed; not at all."""
@@ -28,6 +28,7 @@ CARS: Columns = {
     "test": Column("", "the test that limits it", is_shown=False),
     "encounter": Column("", "the encounter in which it is unsafe", is_shown=False),
     "outcome": Column("", "what happens there", is_shown=False),
+    "phase": Column("-", "steps by which that encounter begins later", ".4f", is_shown=False),
     "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
     "repair_first": "the measured characteristic that, as new again, raises the value most",
     "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
@@ -43,10 +44,13 @@ SETS: Columns = {
 
 
 class FailureInWords(NamedTuple):
-    """A failure: its test, its encounter, what happens, and a sentence without its end."""
+    """A failure: its test, its encounter with its phase, what happens, and a sentence without its
+    end.
+    """
 
     test: str | None = None
     encounter: str | None = None
+    phase: float | None = None
     outcome: str | None = None
     sentence: str = ""
 
@@ -81,6 +85,7 @@ def failures_in_words(
             }
             units = searchable_in(point.scenario)
             numbers_of = {**axes, **members.scenario.named(setting[~members.of_vehicle])}
+            phase = numbers_of.pop(PHASE, None)
             texts = [
                 f"{name} {value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
                 if isinstance(value, int | float)
@@ -90,6 +95,7 @@ def failures_in_words(
             found[number] = FailureInWords(
                 test=known[row].encounters.test or None,
                 encounter=", ".join(texts) or None,
+                phase=phase,
                 outcome=described[row].breach,
                 sentence=words,
             )

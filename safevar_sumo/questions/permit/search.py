@@ -11,6 +11,7 @@ import numpy as np
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit.encounters import EncounterRange, Span, ranges_of
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.records import BoolArray, FloatArray
 
 REPAIR_STAGE = "cars with one part as new"
@@ -136,6 +137,12 @@ class PermitSearch:
                 failure = search.failures[number]
                 found[car].append(Reached(model.fit, search.up_to(number), failure))
         return [Permit(reached) for reached in found]
+
+    def remark_on_phases(self) -> str:
+        """What to know where not all phases of encounters were met, in a sentence; else ""."""
+        ranges = next(iter(self._ranges.values()))
+        places = [each.places(each.low)[:1] for each in ranges]
+        return remark_on_phases([each.model for each in ranges], places)
 
     def repair_first(
         self,

@@ -153,12 +153,21 @@ class SpeedSearch:
         return [encounters.places(value) for value in values]
 
     def _drive(self, number: int, cars: Sequence[int], places: FloatArray) -> None:
-        """Have cars meet encounters of a test, and keep what they met and what fails."""
+        """Have cars meet encounters of a test at their worst phases, and keep what they met and
+        what fails.
+        """
         encounters = self._ranges[number]
-        rows = [self._settings(car, places) for car in cars]
-        robustness = encounters.robustness(np.concatenate(rows), self._stage)
-        ends = np.cumsum([len(of_car) for of_car in rows])[:-1]
-        for car, own, left in zip(cars, rows, np.split(robustness, ends), strict=True):
+        rows = np.concatenate([self._settings(car, places) for car in cars])
+        # Values above a known failure of a car need not be met at other phases.
+        known = [self.failures[car] for car in cars]
+        most = [np.inf if failure is None else failure.value for failure in known]
+        values = encounters.values_in(rows)
+        is_open = values <= np.repeat(most, len(rows) // len(cars))
+        robustness = encounters.robustness(rows, self._stage)
+        rows, robustness = encounters.at_worst_phases(rows, robustness, is_open, self._stage)
+        for car, own, left in zip(
+            cars, np.split(rows, len(cars)), np.split(robustness, len(cars)), strict=True
+        ):
             self._note(car, encounters, own, left)
             self._met[car][number].append((own, left))
 

@@ -299,6 +299,8 @@ class JointSearch:
                 boxes.accept(validation, may_grow=not is_over)
         self.found = nothing._replace(boxes=number)
         self._note(search.models)
+        # At the worst phases of encounters the own set cuts it, too.
+        self.cut(self.own, _nothing(self.own))
 
     def cut(self, model: Model, unsafe_settings: FloatArray) -> None:
         """Cut the box until it holds with a further parameter set, too, and holds none of
@@ -316,6 +318,9 @@ class JointSearch:
             box = extension.cut(outer, RETREAT_OF_SET * (attempt + 1))
             validation, proof = self._pass(validator, box, attempt)
             if not validation.failures:
+                # The search of the own set has tested more.
+                first = self.found.validations.get(model.fit, validation)
+                validation = first._replace(least=min(first.least, validation.least))
                 passed = {**self.found.validations, model.fit: validation}
                 members = self.found.members
                 if model.fit not in [member.fit for member in members]:
@@ -347,6 +352,8 @@ class JointSearch:
         validation = validator.validate(box, attempt)
         if not validation.failures:
             validation = validator.complete(validation, attempt, CONFIRMATIONS_OF_SET)
+        if not validation.failures:
+            validation = validator.meet_phases(validation)
         proof = self.found.proof
         if validation.failures or box is self.found.box:
             return validation, proof

@@ -14,6 +14,7 @@ from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
 from safevar_sumo.questions.falsify import Falsification, falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.narrowing import NarrowedJudge
+from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
@@ -25,6 +26,8 @@ KNOWN_BETWEEN = 64
 """Number of the worst corners that a search between the tests of a matrix begins with."""
 FIRST_CORNERS = 512
 """Number of corners that are tested first: most boxes fail soon."""
+PHASE_FAILURES = 4
+"""Largest number of settings that fail at another phase, and that later boxes hold none of."""
 STARTS = 256
 """Number of settings with which a further falsification begins."""
 VALIDATION_STAGE = "validation of joint limits"
@@ -88,6 +91,8 @@ class Validator:
         self.budget, self.budget_between = budgets
         self.seed = model.evaluator.study.search.seed
         self._judge = NarrowedJudge(model, VALIDATION_STAGE)
+        self._worst = list[tuple[MovingTest | None, FloatArray]]()
+        """The worst settings of the last box, at the tests and between them."""
         self._proofs = 0
         """Number of upper bounds so far."""
 
@@ -122,6 +127,7 @@ class Validator:
         ]
         validation, robustness = self._test(validation, corners[:MAX_CORNERS])
         worst = corners[np.argsort(robustness, kind="stable")]
+        self._worst = [(None, corners)]
         # Further searches for counterexamples.
         for rng in rngs:
             if not validation.failures:
@@ -131,6 +137,29 @@ class Validator:
         # Of a study that searches its scenario there are more corners.
         if not validation.failures:
             validation, _ = self._test(validation, corners[MAX_CORNERS:])
+        return validation
+
+    def meet_phases(self, validation: Validation) -> Validation:
+        """Have the corners of a box that passed, and the worst settings of each search for
+        counterexamples, meet their worst phases.
+        """
+        for test, settings in self._worst if self.budget else []:
+            model = self.model if test is None else test.model
+            rows, left = at_worst_phases(model, settings, VALIDATION_STAGE)
+            failures = list[Failures]()
+            for row in np.argsort(left, kind="stable")[:PHASE_FAILURES].tolist():
+                if left[row] < 0:
+                    there, vehicle = model, settings[[row]]
+                    if test is not None:
+                        there, vehicle = test.failures(vehicle)
+                    there = there._replace(phase=float(rows[row, -1]))
+                    failures.append(
+                        Failures(there.at_worst_points(vehicle, VALIDATION_STAGE), vehicle)
+                    )
+            validation = validation._replace(
+                least=min(validation.least, float(left.min(initial=np.inf))),
+                failures=(*validation.failures, *failures),
+            )
         return validation
 
     def recheck(self, box: Box, attempt: int) -> Validation:
@@ -182,6 +211,7 @@ class Validator:
             starts = test.spread(known_between, rng)
             judges = [lambda rows, test=test: test.robustness(rows, VALIDATION_STAGE)]
             found = falsify(test.box(box), judges, [starts], budget, rng)
+            self._worst.append((test, test.at_printed_places(found.settings)))
             validation = validation.with_search(found, between=found.simulated)
             failing = [*found.failures.values()]
             if failing:
@@ -198,6 +228,7 @@ class Validator:
             return validation
         before = self._judge.at_all_points
         found = falsify(box, [self._judge], [known], self.budget, rng)
+        self._worst.append((None, found.settings))
         validation = validation.with_search(found, all_points=self._judge.at_all_points - before)
         return validation._replace(failures=self._failures(*found.failures.values()))
 

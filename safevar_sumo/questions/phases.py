@@ -1,0 +1,163 @@
+"""The phase of an encounter: a driving system decides once in a step, so what a vehicle leaves to
+the limit depends on when between two decisions the encounter begins. Claims meet the worst phase.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec.structs import replace as replace_in
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.scenarios import PHASES
+from safevar_sumo.study import PHASE, PHASE_DECIMALS, Domain, Study
+from safevar_sumo.sumo.batch import reason_for_sumo
+from safevar_sumo.sumo.encounters import encounter
+from safevar_sumo.sumo.system import System, assemble
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.falsify import Judge
+    from safevar_sumo.questions.models import Model
+
+NEAR = 3.0
+"""Ways of a step up to which a phase can take clearance away: what the vehicle covers in a step."""
+PARTS, ROUNDS = 10, 3
+"""Into how many parts an interval of phases is divided, and how often: to 0.1 % of a step."""
+AT_ONE_PHASE = "Encounters were met at one phase of the driving system's steps."
+"""What to know of encounters without phases."""
+COUNTS_STEPS = (
+    "An encounter that begins a whole step later ends otherwise here: the driving system or a"
+    " sensor counts its steps, and only encounters that begin within one of them were met."
+)
+"""What to know of a driving system whose cycle is longer than a step."""
+SAME = 1e-6
+"""Difference up to which what is left at two phases is the same."""
+DOMAIN = Domain(unit=PHASES[PHASE].unit, original=0.0, lower=0.0, upper=1.0)
+"""All phases: an encounter that begins a whole step later is the same one."""
+
+
+def in_phases(study: Study, system: System) -> Study:
+    """A study that searches the phase, too, as its last parameter; itself if it is rated, or where
+    the encounters of some point have none, as bodies do not move on tracks.
+    """
+    has_phases = system.rater is None and all(point.scenario.has_phase for point in system.points)
+    if not has_phases or reason_for_sumo(system) or PHASE in system.characteristics.names:
+        return study
+    search = {**study.scenario.search, PHASE: DOMAIN}
+    return replace_in(study, scenario=replace_in(study.scenario, search=search))
+
+
+def with_phase_if_set(study: Study, system: System, names: Iterable[str]) -> tuple[Study, System]:
+    """A study and its system; if the phase is among the names of what is set, both with it as their
+    last parameter.
+
+    Raises
+    ------
+    InputError
+        If the phase is set, and the study's encounters have none.
+    """
+    if PHASE not in names or PHASE in system.characteristics.names:
+        return study, system
+    phased = in_phases(study, system)
+    if phased == study:
+        problem = f"study {study.name!r} has no {PHASE}"
+        expected = "a study whose actors move on tracks, and react to nobody"
+        raise InputError("", problem, expected)
+    # Whether an encounter counts does not become a question by this.
+    scoring = system.measuring.scoring
+    found = assemble(phased)
+    return phased, replace(found, measuring=found.measuring._replace(scoring=scoring))
+
+
+def meet_worst_phases(
+    model: Model, judge: Judge, settings: FloatArray, left: FloatArray, is_open: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """M settings of a model, shape (M, n), whose last value is the phase, at their worst phases,
+    and what they leave there by the judge, shape (M,).
+
+    `left` is what they leave at phase 0: those that fail there, are not open, or leave more than
+    `NEAR` ways of a step stay.
+
+    Notes
+    -----
+    What is left rises or falls slowly over the phases, and jumps where a decision moves to another
+    step: the worst phase is beside a jump. Of the phases that divide an interval the worst one is
+    the end of the next interval, which begins at the one before: it holds the jump.
+    """
+    settings, left = settings.copy(), left.copy()
+    is_open = is_open & (left >= 0)
+    ways = _ways(model, settings)
+
+    # At first a whole step; its end, phase 1, is phase 0 again.
+    low, high = np.zeros(len(left)), np.ones(len(left))
+    shares = np.arange(1, PARTS)[:, np.newaxis] / PARTS
+    for _ in range(ROUNDS):
+        # Within a part of a step, a phase can take away a part of the clearance.
+        near = np.flatnonzero(is_open & (left < NEAR * ways * (high - low)))
+        if not len(near):
+            break
+
+        # All of them at all phases that divide their intervals, in one batch.
+        phases = np.round(low[near] + shares * (high - low)[near], PHASE_DECIMALS)
+        rows = np.tile(settings[near], (len(phases), 1))
+        rows[:, -1] = phases.ravel()
+        values = np.vstack([judge(rows).reshape(phases.shape), left[near]])
+
+        # The interval that ends at the worst of them.
+        ends = np.vstack([low[near], phases, high[near]])
+        worst, each = np.argmin(values, axis=0), np.arange(len(near))
+        low[near], high[near] = ends[worst, each], ends[worst + 1, each]
+        left[near] = values[worst, each]
+    settings[is_open, -1] = high[is_open] % 1
+    return settings, left
+
+
+def _ways(model: Model, settings: FloatArray) -> FloatArray:
+    """The most that each of M vehicles covers in a step at the start of an encounter that counts
+    [m], shape (M,); infinite where the limit is of no distance.
+    """
+    unsafe = model.unsafe
+    if not (unsafe.is_collision or (unsafe.below is not None and unsafe.below >= 0)):
+        return np.full(len(settings), np.inf)
+    system = model.evaluator.system
+    values = system.characteristics.scenario.columns(system.cut(settings)[1])
+    points = (encounter(system.points[number], values) for number in model.numbers_of_points)
+    speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
+    return system.step * np.maximum.reduce(speeds)
+
+
+def at_worst_phases(
+    model: Model, settings: FloatArray, stage: str
+) -> tuple[FloatArray, FloatArray]:
+    """M settings of a model, shape (M, n), with their worst phases behind them, and what they leave
+    there; at phase 0 and infinite without phases.
+    """
+    rows = np.column_stack([settings, np.zeros(len(settings))])
+    claim = model.in_phases
+    if claim is None:
+        return rows, np.full(len(rows), np.inf)
+    judge = partial(claim.robustness, stage=stage)
+    return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
+
+
+def remark_on_phases(models: Sequence[Model], places: Sequence[FloatArray]) -> str:
+    """What to know where models of encounters have no phases, or where the original vehicle ends
+    otherwise in an encounter, each at a place of shape (1, searched parameters), that begins a
+    whole step later; else "".
+    """
+    has_phases = [model.evaluator.characteristics.names[-1] == PHASE for model in models]
+    if not all(has_phases):
+        return AT_ONE_PHASE
+    for model, place in zip(models, places, strict=True):
+        vehicle = model.evaluator.characteristics.vehicle.original_settings
+        rows = np.repeat(np.hstack([vehicle, place]), 2, axis=0)
+        rows[1, -1] = 1.0
+        at_begin, at_end = model.robustness(rows, "phases of the original")
+        if not np.isclose(at_begin, at_end, atol=SAME):
+            return COUNTS_STEPS
+    return ""

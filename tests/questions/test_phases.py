@@ -1,0 +1,209 @@
+"""An encounter may begin between two decisions of a driving system; claims meet the worst phase."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions import phases
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import COUNTS_STEPS, at_worst_phases, in_phases
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import Track, TrackScenario
+from safevar_sumo.study import Study, study_names
+from safevar_sumo.sumo.batch import drive_all, score
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import InlinePool, json_of, refused
+from tests.made_up import drawn
+
+STEP = 0.05
+WITH_EXTRAS = {"metadrive_expert"}  # CI installs all others
+
+
+def at_phase(system: System, phase: float | FloatArray) -> System:
+    points = tuple(point._replace(phase=phase) for point in system.points)
+    return replace(system, matrix=points) if system.matrix else replace(system, phase=phase)
+
+
+def degrees(system: System, settings: FloatArray) -> FloatArray:
+    """Safety degrees at each point, shape (K, N)."""
+    found = simulate_all_points(system, settings)
+    return np.stack([result.evaluations.f_safe for result in found])
+
+
+@pytest.mark.parametrize("name", sorted({*study_names()} - WITH_EXTRAS))
+def test_an_encounter_that_begins_a_whole_step_later_is_the_same(name: str) -> None:
+    study = load_study(name)
+    system = assemble(study)
+    if in_phases(study, system) == study:
+        pytest.skip("its actors do not move on tracks")
+    settings = drawn(system, 4, 1)
+    now, later = (degrees(at_phase(system, phase), settings) for phase in (0.0, 1.0))
+    assert np.isfinite(now).any()
+    # Sensors lose frames by their number, and IDM acts from the first step on.
+    if name in ("sensing", "wear_idm"):
+        assert not np.allclose(later, now, atol=1e-6, equal_nan=True)
+    else:
+        np.testing.assert_allclose(later, now, atol=1e-6)
+
+
+def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
+    study = load_study("wear", matrix={"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}}]})
+    system = assemble(study)
+    settings = drawn(system, 6, 2)
+    for phase in (0.25, 0.8, 1.0):
+        scenario = system.points[0].scenario.at({"time_to_impact": 6 + phase * STEP})
+        later = system.points[0]._replace(scenario=scenario)
+        expected = degrees(replace(system, matrix=(later,)), settings)
+        found = degrees(at_phase(system, phase), settings)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
+    study = load_study("autoware_july")
+    system = assemble(study)
+    phased = assemble(in_phases(study, system))
+    settings = drawn(system, 5, 3)
+    phases = np.array([0.0, 0.4, 0.4, 0.9131, 0.2])
+    found = degrees(phased, np.column_stack([settings, phases]))
+    for row, phase in enumerate(phases.tolist()):
+        alone = degrees(at_phase(system, phase), settings[[row]])
+        np.testing.assert_array_equal(found[:, row], alone[:, 0])
+
+
+def test_sumo_repeats_a_phase_to_the_bit() -> None:
+    system = assemble(load_study("autoware_july", matrix={"point": "CCRs, speed 60, clear"}))
+    system = at_phase(system, 0.3712)
+    settings = drawn(system, 3, 4)
+    runs = [drive_all(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)]
+    here, there = (score(system, settings, one).f_safe for one in runs)
+    np.testing.assert_array_equal(here, there)
+
+
+def ahead(**search: object) -> Study:
+    """A standing car at 60 km/h, or at the speeds that are searched."""
+    return load_study("autoware_july", matrix=False, scenario={"search": search} if search else {})
+
+
+def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the_speed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(phases, "NEAR", np.inf)  # also where the car stops long before
+    speed = {"unit": "km/h", "original": 45, "lower": 40, "upper": 50, "meaning": "speed"}
+    evaluator = Evaluator(ahead(speed=speed), InlinePool())
+    model = Model(0, evaluator, Unsafe(below=0.0), points=(0,))
+    original = evaluator.characteristics.original
+
+    # The tips at phase 0, where the distance ends to brake just one step later.
+    speeds = np.linspace(40, 50, 4001)
+    settings = np.tile(original, (len(speeds), 1))
+    settings[:, evaluator.characteristics.names.index("speed")] = speeds
+    left = model.robustness(settings, "speeds")
+    jumps = np.abs(np.diff(left)) > 0.3
+    tips = np.flatnonzero(jumps[:-1])
+    lower = np.where(left[tips] < left[tips + 1], tips, tips + 1)
+    assert len(lower) > 3
+    some = np.arange(lower[0], lower[-1], 97)
+    rows, worst = at_worst_phases(model, settings[some], "phases")
+    line = np.interp(speeds[some], speeds[lower], left[lower])
+    np.testing.assert_allclose(worst, line, atol=0.01)
+    assert (worst <= left[some]).all()
+
+    # What is printed is what was simulated.
+    claim = model.in_phases
+    assert claim is not None
+    np.testing.assert_array_equal(claim.robustness(rows, "again"), worst)
+    np.testing.assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
+
+
+def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
+    evaluator = Evaluator(ahead(), InlinePool())
+    model = Model(0, evaluator, Unsafe(below=0.0))
+    members = evaluator.characteristics
+    settings = np.tile(members.original, (40, 1))
+    settings[:, members.names.index("brakeTorque")] = np.linspace(0.92, 0.96, 40)
+    _, worst = at_worst_phases(model, settings, "phases")
+    claim = model.in_phases
+    assert claim is not None
+    many = np.repeat(np.linspace(0, 1, 200, endpoint=False), len(settings))
+    rows = np.column_stack([np.tile(settings, (200, 1)), many])
+    scanned = claim.robustness(rows, "scan").reshape(200, -1)
+    is_unsafe = scanned.min(axis=0) < 0
+    assert (is_unsafe & (scanned[0] >= 0)).any()
+    assert ((worst < 0) == is_unsafe).all()
+
+
+def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
+    car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
+    answer = json_of("permit", "autoware_july", *car)
+    (row,) = answer["tables"]["cars"]["rows"]
+    assert row["phase"] > 0
+    assert f"phase {row['phase']:.10g}" in row["because"]
+
+    # The failure can be typed, and is none at phase 0.
+    speed = float(row["encounter"].split()[1])
+    study = {
+        "extends": "autoware_july",
+        "name": "there",
+        "matrix": False,
+        "scenario": {"parameters": {"test": "CCRs", "speed": speed}},
+    }
+    changes = {"brakeTorque": 0.93}
+    assert sv.simulate(study, changes).gap >= 0.3
+    assert sv.simulate(study, {**changes, "phase": row["phase"]}).gap < 0.3
+
+
+def test_simulate_takes_a_phase_and_says_where_there_is_none() -> None:
+    answer = json_of("simulate", "autoware_july", "--set", "phase=0.37124")
+    assert "0.3712 steps" in answer["verdict"]
+    swept = json_of("simulate", "autoware_july", "--set", "phase=0..1")["tables"]["sweep"]["rows"]
+    assert len({row["safety_degree"] for row in swept}) > 3
+    assert swept[0]["safety_degree"] == pytest.approx(swept[-1]["safety_degree"])
+    refused("simulate", "rain", "--set", "phase=0.5", message=("has no phase",))
+
+
+@dataclass(frozen=True)
+class Careless(TrackScenario):
+    """Reads the first column of the times alone."""
+
+    speed: float = 40.0
+    duration = 4.0
+    is_user_code = True
+
+    def tracks(self, times: FloatArray) -> list[Track]:
+        return [Track.of("other", "car", 40 + 2 * times[:, :1], 0.0, 2.0)]
+
+
+def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
+    times = np.arange(5)[:, np.newaxis] * STEP
+    assert len(Careless().tracks_begun(times, 0.01)) == 1
+    with pytest.raises(InputError, match="first of several times"):
+        Careless().tracks_begun(times, np.array([0.0, 0.01]))
+
+
+def test_an_answer_says_that_a_driving_system_counts_steps(in_tmp: Path) -> None:
+    Path("slow_ads.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n"
+        "class Slow(ScalarAds):\n"
+        "    def __init__(self):\n"
+        "        self.calls, self.brake = 0, 0.0\n"
+        "    def drive(self, seen):\n"
+        "        if self.calls % 4 == 0 and seen.gap < 25:\n"
+        "            self.brake = 1.0\n"
+        "        self.calls += 1\n"
+        "        return 0.0, self.brake\n"
+    )
+    study = {"extends": "autoware_july", "name": "slow", "ads": {"model": "slow_ads:Slow"}}
+    options = {"others": "new", "quick": True, "fits": 0, "unsafe": "below=-30", "step": 30}
+    answer = sv.permit(study, set=("brakeTorque=1",), jobs=1, **options)
+    assert COUNTS_STEPS in answer.verdict
