@@ -154,7 +154,8 @@ class Answer:
         code 3.
     lead
         The table of the one screen, by default the first; None for none. Its attribute `lead_rows`
-        holds the places of the rows that it shows, the most important first; by default all.
+        holds the places of the rows that it shows, the most important first; by default all. One
+        with the attribute `shown_whole` is not cut up to this number of rows.
     folded
         Names of tables that readers see only by name; JSON and CSV have all.
     is_whole

@@ -42,6 +42,7 @@ CODE = re.compile("`([^`<>]+)`")
 SCOPE = "Scope: "
 NOTES = (
     *(SCOPE, "Remark: ", "Changed: ", "Criterion: ", "Not simulated: ", "Counted as unsafe: "),
+    "Safe means: ",
     *("Only encounters count", "Only vehicles that satisfy", "Left out"),
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
@@ -78,7 +79,9 @@ class Screen(NamedTuple):
 
 
 def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
-    """The one screen of an answer, whose table has at most so many rows."""
+    """The one screen of an answer, whose table has at most so many rows, unless it is shown whole:
+    its attribute `shown_whole` is the number of rows up to which it is.
+    """
     # Sentences of the verdict by kind.
     plain_sentences = list[str]()
     notes = list[str]()
@@ -98,7 +101,8 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
     name = next(iter(others), "") if answer.lead == "" else answer.lead or ""
     if name not in answer.folded and len(others.get(name, ())):
         whole = next(reader_tables(name, others.pop(name)))[1]
-        lead = lead_table(whole, max_rows)
+        few = whole.attrs.get("shown_whole", 0)
+        lead = lead_table(whole, few if len(whole) <= few else max_rows)
         cut = len(whole.attrs.get("lead_rows", whole)) - len(lead)
         if cut > 0:
             notes.insert(0, f"{cut} more rows: --details.")

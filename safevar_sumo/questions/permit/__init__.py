@@ -20,7 +20,8 @@ from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, ques
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
-from safevar_sumo.questions.permit.answer import PermitAnswer
+from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
+from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
@@ -125,6 +126,10 @@ def permit(
     if limits:
         asked = [_within(members, limits, study, fleet.settings[0])]
     new_car, permits, repaired = _drive(evaluator, search, fleet, asked, is_rough=quick)
+    assumed = [assumed_in_words(study, members, fleet)]
+    # Further simulations of a single car, where their number has no limit.
+    if len(permits) == 1 and not limits and evaluator.account.asked is evaluator.left is None:
+        assumed.append(worst_end_in_words(models, span, values, fleet, permits[0]))
     result = PermitAnswer(
         study=study,
         span=span,
@@ -135,6 +140,7 @@ def permit(
         new_car=new_car,
         is_quick=quick,
         is_box=bool(limits),
+        assumed=assumed,
     )
     answer = result.of(fleet, permits, repaired)
     if out is not None:
@@ -198,8 +204,9 @@ def read_cars(
         cars = {
             f"all cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
         }
+    written = [*CARS, DIGEST]
     return read_fleet(
-        study, members, cars, values, others=others, ignore=ignore, answer_columns=CARS
+        study, members, cars, values, others=others, ignore=ignore, answer_columns=written
     )
 
 

@@ -14,6 +14,7 @@ import pandas as pd
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.permit.assumed import assumed_cells
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.rows import (
@@ -38,11 +39,19 @@ from safevar_sumo.sumo.system import assemble
 
 DIGEST = "study_digest"
 """The column of the list that holds the digest of the study, its models and versions."""
+SHOWN_WHOLE = 50
+"""Number of cars up to which one screen shows all: there the list is the answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PermitAnswer:
-    """What an answer is made of, beside its rows."""
+    """What an answer is made of, beside its rows.
+
+    Attributes
+    ----------
+    assumed
+        What was not measured, in sentences that follow the one about the cars.
+    """
 
     study: Study
     span: Span
@@ -53,6 +62,7 @@ class PermitAnswer:
     new_car: Permit
     is_quick: bool
     is_box: bool
+    assumed: Sequence[str]
 
     def of(
         self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
@@ -68,7 +78,7 @@ class PermitAnswer:
         if self.need is not None:
             too_slow = int((~(cars["up_to"].astype(float) >= self.need)).sum())
         ordered = cars.sort_values("up_to", kind="stable", na_position="first", ignore_index=True)
-        ordered.attrs = cars.attrs
+        ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
         unit = unit_text(span.unit)
         is_cut = bool(span.ending)
         driven = study_up_to(self.study, f"{span.name}={span.high!r}") if is_cut else self.study
@@ -110,24 +120,27 @@ class PermitAnswer:
         self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
     ) -> list[tuple[Any, ...]]:
         """A row of `CARS` for each car, in the order of the list."""
-        names = self.models.own.evaluator.characteristics.names
+        vehicle = self.models.own.evaluator.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
         words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)
         is_proven = not self.is_quick
         rows = list[tuple[Any, ...]]()
-        for name, permit, found, best in zip(fleet.names, permits, words, repaired, strict=True):
+        cells = assumed_cells(vehicle, fleet)
+        every = zip(fleet.names, permits, words, repaired, cells, strict=True)
+        for name, permit, found, best, assumed in every:
             verdict = verdict_of(
                 permit.up_to, new_car, self.span.high, self.need, is_proven=is_proven
             )
             reason = because(permit, found, verdict, self.span, new_car, self.need)
-            after = (None, None) if best is None else (names[best[0]], best[1].up_to)
+            after = (None, None) if best is None else (vehicle.names[best[0]], best[1].up_to)
             least = permit.least
             fit = None if least.failure is None else least.fit
             rows.append(
                 (
                     *(name, permit.up_to, new_car, self.span.unit, verdict, reason),
                     *(found.test, found.encounter, found.outcome, found.phase, fit, *after),
+                    assumed,
                 )
             )
         return rows
@@ -152,14 +165,14 @@ class PermitAnswer:
         for verdict, phrase in phrases.items():
             if counts[verdict]:
                 parts.append(f"{counts[verdict]}{of_all if not parts else ''} {phrase}")
-        sentences = [f"{join_phrases(parts)}; {new_car}."]
+        sentences = [f"{join_phrases(parts)}; {new_car}.", *self.assumed]
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
             may = "may not drive" if np.isnan(up_to) else f"may drive up to {up_to:g}{unit}"
-            sentences = [f"{name[:1].upper()}{name[1:]} {may}; {new_car}. {because_of}"]
+            sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
+            sentences.append(because_of)
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
-        sentences.append(f"Safe means: {self._safe_in_words()}.")
         if remark := self.search.remark_on_phases():
             sentences.append(remark)
         if span.ending:
@@ -169,7 +182,8 @@ class PermitAnswer:
             sentences.append(
                 f"Not driven, as they begin above {top}: {join_phrases(span.left_out)}."
             )
-        return [*sentences, f"Scope: {scope}."]
+        sentences += [f"Scope: {scope}.", f"Safe means: {self._safe_in_words()}."]
+        return [*filter(None, sentences)]
 
     def _safe_in_words(self) -> str:
         """What a safe car does, with the study's own parameter set and with the others."""

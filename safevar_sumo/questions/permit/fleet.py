@@ -99,7 +99,8 @@ def read_fleet(
     ignore
         Columns that are not read.
     answer_columns
-        Columns of the answer, whose names no column of the list has.
+        Columns of the answer. A list that has all of them, beside the name of the car, is one that
+        `--out` wrote, and is read without them; no other list has one of these names.
 
     Raises
     ------
@@ -124,6 +125,11 @@ def read_fleet(
         cells = _cells_of_file(Path(check_text("cars", cars)))
     if not cells.rows:
         raise InputError(cells.place, "no car", "at least one car")
+    # An answer beside the list that it is about, which may have had semicolons and decimal commas.
+    written = {*answer_columns} - {CAR}
+    if is_answer := written <= {text.strip() for text in cells.header}:
+        cells = cells._replace(separator=";")
+        ignore, answer_columns = [*ignore, *written], ()
 
     # The columns, the names in the first one, and the values.
     naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
@@ -132,6 +138,8 @@ def read_fleet(
     settings = _completed(cells, settings, study, vehicle, others)
     _check_constraints(cells, settings, study, vehicle)
     table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
+    if is_answer:
+        table = table.drop(columns=[*written])
     return Fleet(names, settings, measured, table)
 
 
@@ -267,7 +275,7 @@ def _columns(
                 raise InputError("", problem, "characteristics of the vehicle, or --ignore")
             if name in answer_columns and (column, name) != (naming, CAR):
                 problem = f"the column {name!r} has the name of a column of the answer"
-                raise InputError("", problem, "another name")
+                raise InputError("", problem, "another name, or all columns that --out writes")
         return naming, {
             column: _characteristic(names[column], header[column], vehicle) for column in read[1:]
         }

@@ -32,6 +32,7 @@ CARS: Columns = {
     "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
     "repair_first": "the measured characteristic that, as new again, raises the value most",
     "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
+    "assumed": Column("", "what was not measured, with its assumed value", is_detail=True),
 }
 SETS: Columns = {
     "car": "name of the car",

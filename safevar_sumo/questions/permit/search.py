@@ -181,7 +181,7 @@ class PermitSearch:
                     chosen[row] = max(of_car, key=of_car.__getitem__)
                     del of_car[chosen[row]]
             cars = [
-                Cars.one(_with_original(settings[row], column, original))
+                Cars.one(with_value_of(settings[row], column, original))
                 for row, column in chosen.items()
             ]
             above = [self._best_of(permits[row], best[row]).order for row in chosen]
@@ -214,7 +214,7 @@ class PermitSearch:
             for failure in failures[row]:
                 for column in of_car:
                     setting = failure.setting.copy()
-                    setting[: len(original)] = _with_original(settings[row], column, original)
+                    setting[: len(original)] = with_value_of(settings[row], column, original)
                     rows.setdefault(id(failure.encounters), []).append(
                         (row, column, failure.value, setting)
                     )
@@ -228,8 +228,8 @@ class PermitSearch:
                     bounds[row][column] = min(bounds[row][column], most)
 
 
-def _with_original(setting: FloatArray, column: int, original: FloatArray) -> FloatArray:
-    """A car with one of its characteristics as in the original."""
-    repaired = setting.copy()
-    repaired[column] = original[column]
-    return repaired
+def with_value_of(setting: FloatArray, column: int, other: FloatArray) -> FloatArray:
+    """A car with one of its characteristics as in another car, such as the original."""
+    changed = setting.copy()
+    changed[column] = other[column]
+    return changed
