@@ -13,6 +13,7 @@ from hypothesis import given, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.permit.assumed import assumed_cells, assumed_in_words
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -111,6 +112,31 @@ def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user
     assert (first["treadDepth"], first["sensorRange"]) == (3, 20)
     assert second == {**originals, **JOINT.unmeasured_values}
     assert fleet.measured.sum() == 2
+
+
+def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> None:
+    frame = pd.DataFrame({"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": [20, 30]})
+    fleet = read(frame, others="new")
+    vehicle = CharacteristicSet.of(JOINT).vehicle
+    cells = assumed_cells(vehicle, fleet)
+    own = "brakeTorque 1, brakeResponse 0.2 s, payload 75 kg, payloadCentre 2.6 m"
+    assert cells == [f"{own}, sensorLatency 0.1 s", f"treadDepth 8 mm, {own}, sensorLatency 0.1 s"]
+    assert assumed_in_words(JOINT, vehicle, fleet) == (
+        "Assumed, as not measured: brakeTorque 1 (relative brake torque, as in a new car),"
+        " brakeResponse 0.2 s (brake actuator delay, by [unmeasured]), payload 75 kg (payload, as"
+        " in a new car), payloadCentre 2.6 m (longitudinal position of the payload, by"
+        " [unmeasured]), sensorLatency 0.1 s (perception latency, by [unmeasured]) and values in 1"
+        " of 2 cars that others state (column assumed, --details)."
+    )
+    whole = read({"a": vehicle.named(vehicle.original)})
+    assert (assumed_cells(vehicle, whole), assumed_in_words(JOINT, vehicle, whole)) == ([None], "")
+
+
+def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:
+    frame = pd.DataFrame({"plate": ["a"], "treadDepth": ["3,5"]})
+    fleet = read(frame.assign(because="", verdict="", up_to=""), others="new")
+    assert fleet.settings[0, 0] == 3.5
+    pd.testing.assert_frame_equal(fleet.table, frame)
 
 
 HEAD = "car,treadDepth,brakeTorque,payload\n"

@@ -130,6 +130,8 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert by_name["007"]["repair_first"] == "brakeTorque"
     assert by_name["007"]["up_to_after_repair"] == by_name["new"]["up_to"]
     assert by_name["slow"]["repair_first"] in {None, *short.vehicle.characteristics}
+    assert {car["assumed"] for car in cars} == {"payloadCentre 1.4 m, sensorRange 80 m"}
+    assert "Assumed, as not measured: payloadCentre 1.4 m (longitudinal pos" in row["verdict"]
 
     typed = ["permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0"]
     printed = run(*typed, "--format", "csv", "--out", "out.csv").stdout
@@ -142,6 +144,8 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert listing["study_digest"].nunique() == 1
     assert Path("fleet.csv").read_text() == FLEET
     refused(*typed, "--out", "fleet.csv", message=("fleet.csv is the list itself",))
+    typed[3] = "out.csv"
+    assert run(*typed, "--format", "csv").stdout == printed, "the written list has the same answer"
 
 
 def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
@@ -192,6 +196,26 @@ def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
     assert answer.numbers["rough"]
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
     assert set(answer.table()["verdict"]) == {"up to"}
+
+
+def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study) -> None:
+    stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
+    options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
+    told = permit(short, cars={"a": stated}, **options).verdict
+    words = r"the car, (.*) [a-z]+ lowers the speed most: the car is unsafe already at (\d+) km/h"
+    ((worst, failing),) = re.findall(words, told)
+
+    # Each of the ends as a car of a list, which has no such sentence.
+    cars = {
+        f"{item.name} {end:g}": {**stated, item.name: end}
+        for item in assemble(short).characteristics.vehicle
+        for end in (item.lower, item.upper)
+        if item.name not in stated
+    }
+    each = permit(short, cars=cars, **options)
+    up_to = each.table().set_index("car")["up_to"]
+    assert up_to[worst] == up_to.min() == float(failing) - 1
+    assert "lowers" not in each.verdict
 
 
 MATRIX = """

@@ -7,9 +7,13 @@ import textwrap
 
 import pytest
 
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.answer import Answer, tabulate
+from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
 from safevar_sumo.study import study_names
 from tests.in_process import run
 
+STUDY = load_study("smoke")
 WIDTH, MAX_LINES = 100, 30
 FEW = {"simulate": (), "rules": ("--samples", "64")}
 """Questions that each study answers within seconds, with their options."""
@@ -65,3 +69,13 @@ def test_an_answer_is_one_screen(typed: str) -> None:
     whole = [row for row in rows if row[0].strip()]
     for cells in list(zip(*whole, strict=True))[1:] if len(whole) > 1 else []:
         assert len({*map(str.strip, cells)}) > 1, cells
+
+
+@pytest.mark.parametrize(("number", "shown"), [(13, 13), (50, 50), (51, 12)])
+def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
+    table = tabulate("Cars", {"car": ""}, [[f"<{row}>"] for row in range(number)])
+    table.attrs["shown_whole"] = SHOWN_WHOLE
+    answer = Answer(question="", study=STUDY, verdict="", numbers={}, tables={"cars": table})
+    text = answer.render("text")
+    assert len(re.findall("<[0-9]+>", text)) == shown
+    assert ("39 more rows: --details" in text) == (number == 51)

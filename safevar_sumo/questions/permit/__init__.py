@@ -78,7 +78,8 @@ def permit(
     ----------
     cars
         A list of measured cars, as CSV: the first column names the car, each other one is a
-        characteristic in the study's unit.
+        characteristic in the study's unit. The answer names the values of all others that it
+        assumes. A file that `--out` wrote is such a list, too.
     set
         A value that was measured on a single car, in place of a list; may be repeated.
     limits
@@ -108,7 +109,8 @@ def permit(
         A rough answer: the speeds of the grid alone, without this search and without repairs. No
         car may drive without a limit.
     out
-        A file for the list of cars, in the order of the input and with all its columns.
+        A file for the list of cars, in the order of the input and with all its columns as they are
+        given, beside those of the answer; `assumed` names the values that were not measured.
     """
     study = evaluator.study
     span = span_of(study, by)

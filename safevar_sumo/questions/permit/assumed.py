@@ -48,7 +48,8 @@ def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> 
         source = "by [unmeasured]" if item.name in study.unmeasured else "as in a new car"
         phrases.append(f"{texts[column]} ({item.short_name}, {source})")
     if further := np.sum((fleet.measured < is_stated).any(axis=1)):
-        phrases.append(f"values in {further} cars that others state (column assumed)")
+        cars = f"{further} of {len(fleet.names)} cars"
+        phrases.append(f"values in {cars} that others state (column assumed, --details)")
     return f"Assumed, as not measured: {join_phrases(phrases)}." if phrases else ""
 
 
@@ -56,10 +57,10 @@ def worst_end_in_words(
     models: Models, span: Span, values: FloatArray, fleet: Fleet, permit: Permit
 ) -> str:
     """Which assumed value of one car lowers its speed most at an end of its domain, and to what at
-    most, in a sentence; empty if none does, or the car may not drive as it is.
+    most, in a sentence; empty if nothing is assumed, or the car may not drive as it is.
     """
     up_to = permit.up_to
-    if up_to is None:
+    if up_to is None or fleet.measured.all():
         return ""
     # The car with each assumed value at either end, side by side. Any failure shows that it may
     # drive no faster, so the grid up to its own speed is enough, with the set that limits it.
@@ -74,16 +75,14 @@ def worst_end_in_words(
     grid = PermitSearch(limiting, span._replace(high=up_to), values[values <= up_to], budget=0)
     found = [each.least.failure for each in grid.reach(cars, [None] * len(cars))]
     failures = [failure for failure in found if failure is not None]
+    name = span.name.replace("_", " ")
+    shown = "Of these, at the ends of their domains and with the parameter set that limits the car,"
     if not failures:
-        return ""
+        return f"{shown} none lowers the {name} on the grid."
 
     # The failure at the least value, and what is not as in the car itself.
     worst = min(failures, key=lambda failure: failure.value)
     other = worst.setting[: len(setting)]
     (text,) = _texts(vehicle, other)[other != setting]
-    name = span.name.replace("_", " ")
     value = f"{max(worst.value, span.low):g}{unit_text(span.unit)}"
-    return (
-        f"Of these, {text}, at an end of its domain, lowers the {name} most: the car is unsafe"
-        f" at {value} then."
-    )
+    return f"{shown} {text} lowers the {name} most: the car is unsafe already at {value}."
