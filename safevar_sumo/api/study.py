@@ -228,6 +228,8 @@ def _found(
             " original vehicle is safe, as questions demand"
         )
     changes = list[tuple[Any, ...]]()
+    if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
+        following = ""
     if breach := _breach_of_original(case):
         sentence, following = f"{breach}: no change is needed.", ""
     else:

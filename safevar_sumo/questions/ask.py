@@ -253,7 +253,6 @@ class Question:
             return reduce_to_point(subject, point)
 
         from safevar_sumo.campaign.cache import keep_simulations  # SUMO takes long to load
-        from safevar_sumo.questions.answer import contents_of
 
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
@@ -270,12 +269,9 @@ class Question:
                     rough = {**values, "quick": True}
                     first = self.answer(subjects, rough, **how, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
-            answer = self.answer(subjects, values, **how, progress=progress)
-        declared = contents_of(self.compute)
-        if declared is None or not declared.next:
-            return replace(answer, command=command)
-        following = f"{PROGRAM_COMMAND} {declared.next} {quote(_name(source))}"
-        return replace(answer, command=command, next=following)
+            called = _name(source)
+            answer = self.answer(subjects, values, **how, progress=progress, called=called)
+        return replace(answer, command=command)
 
     def _is_long(self, values: JsonObject) -> bool:
         """Whether a rough answer, which comes much earlier, may be shown before the answer."""
@@ -290,9 +286,10 @@ class Question:
         jobs: int | None = None,
         simulations: int | None = None,
         progress: bool | Progress = False,
+        called: str = "",
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
-        options.
+        options. The command that comes next is about the first subject as it is `called`.
         """
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
@@ -321,6 +318,7 @@ class Question:
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
                 evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
+                evaluator.check_measured()
 
             # The question's own function.
             with user_errors(self.name):
@@ -332,6 +330,7 @@ class Question:
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
             evaluator.end()
+            following = self._following(subjects[0], evaluator, called) or answer.next
         numbers = {"driven": not reason, **answer.numbers}
         rough = limited = ""
         if account.most is not None:
@@ -345,7 +344,21 @@ class Question:
         verdict = " ".join(
             filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )
-        return replace(answer, verdict=verdict, numbers=numbers)
+        return replace(answer, verdict=verdict, numbers=numbers, next=following)
+
+    def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
+        """The command that comes next, if it has an answer: the page is about results of `study`,
+        and where nobody else is on the road nothing is unsafe by itself.
+        """
+        from safevar_sumo.questions.answer import contents_of
+
+        declared = contents_of(self.compute)
+        if not (declared and declared.next and called):
+            return ""
+        if evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion:
+            return ""
+        is_too_early = declared.next == "report" and isinstance(subject, Study)
+        return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {quote(called)}"
 
     def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
         """The command that asks this question; it has a flag for each option that is not at its

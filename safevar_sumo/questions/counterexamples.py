@@ -193,7 +193,7 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
         return f"the car {unsafe.in_words}"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-        impact = "" if impact_speed < 1 else f" at {impact_speed:.2g} km/h"
+        impact = "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"
         return f"the car hits {scenario.obstacle()}{impact}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
     return (

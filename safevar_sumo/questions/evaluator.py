@@ -21,7 +21,7 @@ from safevar_sumo.campaign.questions import (
     repeat_first_batches,
 )
 from safevar_sumo.errors import InputError, SimulationError, about
-from safevar_sumo.metrics import METRICS, RATING_POINTS, Unsafe
+from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
@@ -346,7 +346,8 @@ class Evaluator:
         if text is not None:
             return self.parse_criterion(text)
         if not isinstance(source, Study) and len(source.solutions):
-            return source.unsafe
+            return self.parse_criterion(source.unsafe)
+        self.system.refuse_nobody()
         original = original or self.evaluate_original()
         if (
             RATING_POINTS.name in original.metrics
@@ -361,8 +362,20 @@ class Evaluator:
         return Unsafe.default_among(evaluations, original)
 
     def parse_criterion(self, text: Unsafe | str) -> Unsafe:
-        """Parse the criterion that an option states; raises what `criterion_of` raises."""
-        return criterion_of(text, self.study)
+        """Parse the criterion that an option states; raises what `criterion_of` raises, and an
+        InputError if nobody is on the road, from whom it is a distance.
+        """
+        criterion = criterion_of(text, self.study)
+        if criterion.measure == F_SAFE.name:
+            self.system.refuse_nobody()
+        return criterion
+
+    def check_measured(self) -> None:
+        """Refuse the measure of an encounter where nobody else is on the road."""
+        if self.measure and self.system.meets_nobody:
+            original = self.evaluate_original()
+            if np.isnan(original.column(self.measure)[0]):
+                self.system.refuse_nobody()
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

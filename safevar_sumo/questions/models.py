@@ -14,6 +14,7 @@ import numpy as np
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -161,7 +162,7 @@ def limit_criterion(
     """
     study = evaluator.study
     is_distance = unsafe is None and margin is not None
-    criterion = Unsafe() if is_distance else evaluator.choose_criterion(unsafe, subject, original)
+    criterion = evaluator.choose_criterion(COLLISION if is_distance else unsafe, subject, original)
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
     # A collision that is asked for stands alone.

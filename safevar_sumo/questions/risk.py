@@ -37,7 +37,7 @@ from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import join_phrases, percentage, with_scope
+from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
 from safevar_sumo.records import Evaluations, FloatArray, IntArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
@@ -53,8 +53,10 @@ LEAST_BASE_POINTS = 20
 """Least number of base points, where few simulations are allowed; with fewer, a linear regression
 says what decides.
 """
-TINY = 1e-300
-"""In place of a variance that is 0."""
+FEWEST = 3
+"""Number of vehicles for each characteristic with which a sample says what decides; fewer say
+nothing about it.
+"""
 RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
@@ -161,9 +163,13 @@ def risk(
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
-    verdict += deciding_in_words(table, failures)
     base = 0 if design is None else len(design) // block
-    verdict += _in_place_of_design(base, block) if is_limited and base < BASE_POINTS else ""
+    least = FEWEST * len(evaluator.characteristics)
+    if design is None and total < least:
+        verdict += f" What decides is unknown: that needs {least} vehicles."
+    else:
+        verdict += deciding_in_words(table, failures)
+        verdict += _in_place_of_design(base, block) if is_limited and base < BASE_POINTS else ""
     verdict += "" if failures else _bound_in_words(high, total, confidence)
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
@@ -189,7 +195,7 @@ def _sampled(
     if (left := evaluator.left) is not None:
         is_enough = base and left >= LEAST_BASE_POINTS * block
         base = min(base, max(LEAST_BASE_POINTS, left // (2 * block))) if is_enough else 0
-        samples = min(samples, left - base * block)
+        samples = evaluator.at_most(min(samples, left - base * block))
     rng = np.random.default_rng(evaluator.study.search.seed)
     batches = []
     for start in range(0, samples, VEHICLES_PER_CALL):
@@ -254,7 +260,9 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     """The share of unsafe vehicles, and how vehicles vary."""
     share = f"{percentage(failures / total)} %"
     if not study.variation:
-        vehicles = f"{total:,} vehicles that were sampled uniformly over the whole domain"
+        vehicles = (
+            f"{number_of(total, 'vehicle')} that were sampled uniformly over the whole domain"
+        )
         return f"Of {vehicles}, {criterion.number_in_words(failures)}: {share}"
 
     # Distributions other than the uniform one.
@@ -265,7 +273,7 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     ]
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
-    vehicles = f"Of {total:,} vehicles that vary as the study says ({manner})"
+    vehicles = f"Of {number_of(total, 'vehicle')} that vary as the study says ({manner})"
     return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"
 
 
@@ -315,7 +323,8 @@ def regression_indices(
     def shares(rows: IntArray, output: FloatArray) -> FloatArray:
         design = np.column_stack([np.ones(len(rows)), inputs[rows]])
         slopes, *_ = np.linalg.lstsq(design, output[rows], rcond=None)
-        return np.asarray(slopes[1:] ** 2 / max(float(np.var(output[rows])), TINY))
+        varies = np.ptp(output[rows]) > 0  # of equal values nothing causes a share
+        return np.asarray(slopes[1:] ** 2 / np.var(output[rows]) if varies else 0 * slopes[1:])
 
     def indices_of(output: FloatArray) -> Indices:
         rng = np.random.default_rng(evaluator.study.search.seed)
@@ -414,7 +423,7 @@ def _table(
     is_unsafe = criterion.of(evaluations)
     failures = int(is_unsafe.sum())
     found = dict[str, Indices]()
-    if len(degree) and np.ptp(degree) > 0:
+    if len(degree) >= FEWEST * len(names) and np.ptp(degree) > 0:
         found["degree"] = indices_of(degree)
     if MIN_OUTCOMES <= failures <= len(degree) - MIN_OUTCOMES:
         found["unsafe"] = indices_of(is_unsafe.astype(float))

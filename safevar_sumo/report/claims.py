@@ -27,7 +27,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import has_criterion
+from safevar_sumo.questions.ask import has_criterion, with_criterion
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
@@ -35,8 +35,9 @@ from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
-from safevar_sumo.report.page import answer_to, make_page
+from safevar_sumo.report.page import answer_or_reason, answer_to, make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.report.sheet import with_speed
 from safevar_sumo.results import (
     MANIFEST,
     SOLUTIONS,
@@ -185,6 +186,12 @@ class Packed:
         (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
         return case
 
+    @cached_property
+    def _usual(self) -> list[str]:
+        """Questions that a pack has if nobody asks others; one of them may have no answer."""
+        unsafe = self.packed.unsafe
+        return [with_criterion(text, unsafe) for text in usual_questions(self.shown)]
+
     def answer(self, text: str) -> Answer:
         if text not in self._answers:
             add_import_folders(self._places)
@@ -197,9 +204,9 @@ class Packed:
                     path.parent.mkdir()
                     path.write_bytes(self.files[name])
                     placed = with_list(text, str(path))
-                answer = answer_to(
-                    placed, [case], [self._directory], None, self._jobs, self._progress
-                )
+                is_asked = text in self.packed.questions and text not in self._usual
+                ask = answer_to if is_asked else answer_or_reason
+                answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
             command = answer.command.replace(f"{folder}/", "")
             self._answers[text] = replace(answer, command=command)
         return self._answers[text]
@@ -213,6 +220,8 @@ class Packed:
         study = ReportedStudy(
             directory=self._directory, case=self.shown, versions=versions, answers=answers
         )
+        unsafe = self.packed.unsafe
+        study = with_speed(study, lambda text: self.answer(with_criterion(text, unsafe)))
         return make_page([study], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from itertools import chain, count
 from pathlib import Path
@@ -34,7 +35,7 @@ from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.sections import ReportedStudy, page_commands, replays, tested, trust
-from safevar_sumo.report.sheet import sheet_of, speed_question, speeds_of
+from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
@@ -140,7 +141,7 @@ def report(
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
-        texts = [*chain(*map(_with_speed, asked, by_criterion)), *joint]
+        texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
         parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
@@ -166,17 +167,14 @@ def report(
                 point=point or "",
                 later_changes=later_changes[number],
             )
-            if text := speed_question(study):
-                speed = next_answer(text, chosen, is_asked=False)
-                study = replace(study, answers=[*study.answers, speed])
-            studies.append(study)
+            studies.append(with_speed(study, partial(next_answer, chosen=chosen, is_asked=False)))
         shared = [next_answer(text, slice(None)) for text in joint]
         page = make_page(studies, shared, parts)
     write_whole(out, page)
     return out
 
 
-def _with_speed(asked: Sequence[str], case: Case) -> list[str]:
+def _with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
     """The questions about results, with that of the greatest speed that their sheet has."""
     has_sheet = any(text.startswith("tolerance") for text in asked)
     return [*asked, *(["permit"] if has_sheet and speeds_of(case) else [])]

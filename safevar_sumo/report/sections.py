@@ -133,6 +133,8 @@ class ReportedStudy:
         The only point of the matrix that the page is about; "" for the whole study.
     later_changes
         The files and versions that have changed since.
+    speed
+        The answer to `speed_question`, which is among the answers, too.
     """
 
     directory: Path
@@ -141,6 +143,7 @@ class ReportedStudy:
     answers: Sequence[Answer]
     point: str = ""
     later_changes: Sequence[str] = ()
+    speed: Answer | None = None
 
     @cached_property
     def system(self) -> System:

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from shlex import join
 from typing import Any
@@ -59,8 +60,8 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     missing = _why_no_limits(study, limits)
     wider = [] if missing or "wider" not in limits.tables else _records(limits.tables["wider"])
     claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
-    if speed_question(study):
-        claim = study.answers[-1]
+    if study.speed is not None:
+        claim = study.speed
         up_to, missing = _greatest_speed(study, claim, wider)
         reasons = [claim.verdict]
 
@@ -132,6 +133,17 @@ def speed_question(study: ReportedStudy) -> str:
             low, high = _together(item, rows.get(item.name))
             words += ["--limits", f"{item.name} >= {low!r}", "--limits", f"{item.name} <= {high!r}"]
     return join(["permit", "--others", "new", *words])
+
+
+def with_speed(study: ReportedStudy, ask: Callable[[str], Answer]) -> ReportedStudy:
+    """A study with the answer to its `speed_question`, if it has one, as the last of its answers:
+    the sheet is about the limits of that question, whatever else was asked.
+    """
+    text = speed_question(study)
+    if not text:
+        return study
+    speed = ask(text)
+    return replace(study, answers=[*study.answers, speed], speed=speed)
 
 
 def _limits_of(study: ReportedStudy) -> Answer | None:

@@ -4,6 +4,7 @@ the closed form.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,16 @@ def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None
 def test_too_few_simulations_are_refused(rig: str) -> None:
     with pytest.raises(InputError, match="1 do not suffice"):
         sv.explain(rig, simulations=1, pool=InlinePool())
+
+
+def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig: str) -> None:
+    with pytest.raises(InputError, match="4 do not suffice"):
+        sv.risk(rig, simulations=4, pool=InlinePool())
+    for number in range(5, 16):
+        answer = sv.risk(rig, simulations=number, pool=InlinePool())
+        is_enough = answer.numbers["samples"] >= 6
+        assert ("What decides is unknown: that needs 6 vehicles." in answer.verdict) != is_enough
+        assert not re.search(r"\b(nan|inf)\b", answer.render("text", details=True))
 
 
 def test_what_takes_long_by_default_is_limited_and_said_first(

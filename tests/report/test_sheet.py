@@ -20,7 +20,6 @@ from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.replay.animation import template_environment
-from safevar_sumo.report import sheet as module
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.sheet import sheet_of, speed_question
@@ -84,6 +83,7 @@ def reported(
     changes: tuple[str, ...] = (),
     unsafe: str = "collision",
     stated: Unsafe | None = None,
+    speed: Answer | None = None,
 ) -> ReportedStudy:
     """Answers about the study of the first one, by default `wear`."""
     study = answers[0].study if answers else STUDY
@@ -99,6 +99,7 @@ def reported(
         versions={"libsumo": "1.28", "safevar_sumo": "0.5.0", "deap": "1.4.4", "numpy": "2.4.6"},
         answers=answers,
         later_changes=changes,
+        speed=speed,
     )
 
 
@@ -114,15 +115,8 @@ def html_of(study: ReportedStudy) -> str:
 
 
 def sheet_with(*answers: Answer, **options: Any) -> str:
-    """The words of the sheet, whose limits are about no speed unless an answer is; empty without a
-    sheet.
-    """
-    study = reported(*answers, **options)
-    if any(answer.question == "permit" for answer in answers):
-        return words_of(html_of(study))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "speeds_of", lambda case: None)
-        return words_of(html_of(study))
+    """The words of the sheet; empty without a sheet."""
+    return words_of(html_of(reported(*answers, **options)))
 
 
 def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do() -> None:
@@ -229,9 +223,10 @@ def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
 
 
 def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_codes() -> None:
-    foreman, _, engineer = sheet_with(answer_of(), speed_of()).partition(
-        "For the manufacturer's engineer"
-    )
+    """Those of the sheet's own limits: an answer about other cars is not theirs."""
+    assert "Greatest speed" not in sheet_with(answer_of(), speed_of(30.0))
+    sheet = sheet_with(answer_of(), speed_of(30.0), speed=speed_of())
+    foreman, _, engineer = sheet.partition("For the manufacturer's engineer")
     assert "Greatest speed: 40 km/h. Up to this speed every simulated vehicle within" in foreman
     assert not re.search("CP[FNL]|parameter set", foreman)
     assert "in CPFA. 12 parameter sets; 120,000 simulations that search" in engineer
@@ -241,13 +236,13 @@ def test_a_failure_in_a_wider_study_lowers_the_greatest_speed() -> None:
     answer = answer_of()
     row = ("wear_joint", "up to 60 km/h", False, "A child is hit.", {"speed": 36.2})
     answer.tables["wider"] = tabulate("Wider", WIDER, [row])
-    sheet = sheet_with(answer, speed_of())
+    sheet = sheet_with(answer, speed=speed_of())
     assert "Greatest speed: 36 km/h." in sheet
     assert "a vehicle within these limits fails above the greatest speed." in sheet
 
 
 def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
-    sheet = sheet_with(answer_of(), speed_of(None))
+    sheet = sheet_with(answer_of(), speed=speed_of(None))
     assert (
         "Do not use this sheet. Vehicles within its limits are not safe even at 10 km/h." in sheet
     )
@@ -257,7 +252,7 @@ def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
 
 def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -> None:
     refused = replace(speed_of(), verdict="No answer: it is refused.", numbers={}, tables={})
-    sheet = sheet_with(answer_of(), refused)
+    sheet = sheet_with(answer_of(), speed=refused)
     assert "The question about the greatest speed has no answer." in sheet
     assert "not safe even at" not in sheet
     assert "No answer: it is refused." in sheet
@@ -279,7 +274,7 @@ def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_other
     _, values = parse_question(speed_question(reported(joint)))
     assert not [limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))]
     assert (values["unsafe"], values["quick"]) == ("drac > 6", True)
-    sheet = sheet_with(joint, speed_of(study=joint.study))
+    sheet = sheet_with(joint, speed=speed_of(study=joint.study))
     assert "these values: brake actuator delay 0.2 s; detection range of the sensors 40 m;" in sheet
     # Nobody asks where there is no speed, or nothing to work by.
     assert not speed_question(reported(replace(answer_of(), study=read_study("r13h"))))
@@ -303,10 +298,9 @@ def sheet_of_shipped(name: str) -> str:
     if study.wider:
         row = (study.wider, scope_of(read_study(study.wider)), False, "A child is hit. " * 20, {})
         limits.tables["wider"] = tabulate("Wider", WIDER, [row])
-    answers = [replace(limits, study=study)]
-    if speed_question(reported(*answers)):
-        answers.append(speed_of(study=study))
-    return html_of(reported(*answers))
+    own = replace(limits, study=study)
+    has_speed = speed_question(reported(own))
+    return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))
 
 
 @pytest.mark.parametrize(("name", "leads"), [("wear", True), ("native", True), ("sun", False)])

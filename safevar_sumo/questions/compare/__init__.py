@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import about
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, Margin, question
@@ -233,19 +233,20 @@ def _criteria(
     bodies touch.
     """
     # The stated criterion, a distance to keep, or what results suggest.
-    stated = [side.parse_criterion(unsafe) for side in evaluators if unsafe is not None]
-    if stated:
-        criterion = stated[0]
-    elif margin is not None:
-        criterion = Unsafe()
-    else:
-        criterion = _default_criterion(subjects, evaluators, originals)
+    stated = criteria.COLLISION if unsafe is None and margin is not None else unsafe
+    criterion = (
+        _default_criterion(subjects, evaluators, originals)
+        if stated is None
+        else evaluators[0].parse_criterion(stated)
+    )
     check_margin(criterion, margin)
-    if criterion.is_collision and (margin is not None or not stated):
+    if criterion.is_collision and (margin is not None or unsafe is None):
         criterion = replace(
             criterion, keep=max(distance_to_keep(side.study, margin) for side in evaluators)
         )
-    return [replace(criterion, contact=side.system.contact) for side in evaluators]
+    return [
+        replace(side.parse_criterion(criterion), contact=side.system.contact) for side in evaluators
+    ]
 
 
 def _default_criterion(

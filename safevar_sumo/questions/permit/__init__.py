@@ -14,6 +14,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
@@ -277,7 +278,7 @@ def _within(
 
 def _criterion(evaluator: Evaluator, unsafe: str | None, margin: float | None) -> Unsafe:
     """What is unsafe: the stated criterion, or else a collision or less than the margin."""
-    criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
+    criterion = evaluator.parse_criterion(COLLISION if unsafe is None else unsafe)
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
     if not criterion.is_collision or (margin is None and unsafe is not None):

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from safevar_sumo.campaign.identity import manifest_now
@@ -168,7 +167,7 @@ class PermitAnswer:
         sentences = [f"{join_phrases(parts)}; {new_car}.", *self.assumed]
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
-            may = "may not drive" if np.isnan(up_to) else f"may drive up to {up_to:g}{unit}"
+            may = "may not drive" if pd.isna(up_to) else f"may drive up to {up_to:g}{unit}"
             sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
             sentences.append(because_of)
         if self.need is not None:

@@ -22,7 +22,8 @@ import tomli_w
 
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_SAFE, Unsafe, margin_of
+from safevar_sumo.metrics import F_SAFE, margin_of
+from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
@@ -36,7 +37,7 @@ from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
-from safevar_sumo.questions.words import encounter_in_words, join_phrases
+from safevar_sumo.questions.words import encounter_in_words, join_phrases, percentage
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
@@ -186,7 +187,7 @@ def repair(
             legal = "--quick without --out, or --out without --quick"
             raise InputError("quick", f"a rough repair is not written to {out}", legal)
         _check_file(Path(out), study)
-    criterion = Unsafe() if unsafe is None else evaluator.parse_criterion(unsafe)
+    criterion = evaluator.parse_criterion(COLLISION if unsafe is None else unsafe)
     check_margin(criterion, margin)
     keep = margin_of(study, margin) if unsafe is None or margin is not None else 0.0
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
@@ -450,7 +451,7 @@ def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, 
     return (
         f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
         f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe: with"
-        f" {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.2g} % are"
+        f" {100 * CONFIDENCE:g} % confidence at most {percentage(at_most)} % are"
     )
 
 

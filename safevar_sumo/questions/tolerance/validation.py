@@ -72,7 +72,7 @@ class Validation(NamedTuple):
     ) -> Validation:
         """With what a further search found."""
         return self._replace(
-            least=min(self.least, *found.robustness[:1].tolist()),
+            least=min([self.least, *found.robustness[:1].tolist()]),
             attacked=self.attacked + (0 if between else found.simulated),
             at_all_points=self.at_all_points + all_points,
             between=self.between + between,
