@@ -201,7 +201,7 @@ def test_one_car_that_may_not_drive_has_an_answer(asked: dict[str, Any]) -> None
     answer = permit("autoware_july", **asked, others="new", quick=True)
     assert answer.numbers["stop"] == 1
     assert "may not drive; the new car may drive up to" in answer.verdict
-    assert "Not even at 34 km/h: " in answer.verdict
+    assert "Not even at 30 km/h: " in answer.verdict
     assert answer.to_dict()["tables"]["cars"]["rows"][0]["up_to"] is None
 
 
