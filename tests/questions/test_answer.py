@@ -22,6 +22,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
 from safevar_sumo.questions.answer import Answer, Column, Wide, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
+from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
 from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
@@ -99,6 +100,16 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     assert f"{last} " in text
     assert f"│ {last + 1} " not in text
     assert "same" in answer.render("text", details=True)
+
+
+@pytest.mark.parametrize(("number", "shown"), [(13, 13), (50, 50), (51, 12)])
+def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
+    table = tabulate("Cars", {"car": ""}, [[f"<{row}>"] for row in range(number)])
+    table.attrs["shown_whole"] = SHOWN_WHOLE
+    answer = Answer(question="", study=STUDY, verdict="", numbers={}, tables={"cars": table})
+    text = answer.render("text")
+    assert len(re.findall("<[0-9]+>", text)) == shown
+    assert ("39 more rows: --details" in text) == (number == 51)
 
 
 def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_valid() -> None:
