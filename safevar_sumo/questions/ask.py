@@ -318,7 +318,8 @@ class Question:
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
                 evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
-                evaluator.check_measured()
+                if evaluator.measure:
+                    evaluator.check_measured(evaluator.measure)
 
             # The question's own function.
             with user_errors(self.name):
@@ -330,7 +331,6 @@ class Question:
             about = evaluator if answer.study is study else evaluator.for_study(answer.study)
             reason = about.no_verdict
             evaluator.end()
-            following = self._following(subjects[0], evaluator, called) or answer.next
         numbers = {"driven": not reason, **answer.numbers}
         rough = limited = ""
         if account.most is not None:
@@ -344,7 +344,8 @@ class Question:
         verdict = " ".join(
             filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )
-        return replace(answer, verdict=verdict, numbers=numbers, next=following)
+        following = self._following(subjects[0], evaluator, called)
+        return replace(answer, verdict=verdict, numbers=numbers, next=following or answer.next)
 
     def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
@@ -353,9 +354,8 @@ class Question:
         from safevar_sumo.questions.answer import contents_of
 
         declared = contents_of(self.compute)
-        if not (declared and declared.next and called):
-            return ""
-        if evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion:
+        is_vain = evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion
+        if not (declared and declared.next and called) or is_vain:
             return ""
         is_too_early = declared.next == "report" and isinstance(subject, Study)
         return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {quote(called)}"

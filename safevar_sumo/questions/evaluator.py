@@ -347,7 +347,7 @@ class Evaluator:
             return self.parse_criterion(text)
         if not isinstance(source, Study) and len(source.solutions):
             return self.parse_criterion(source.unsafe)
-        self.system.refuse_nobody()
+        self.check_measured()
         original = original or self.evaluate_original()
         if (
             RATING_POINTS.name in original.metrics
@@ -367,15 +367,17 @@ class Evaluator:
         """
         criterion = criterion_of(text, self.study)
         if criterion.measure == F_SAFE.name:
-            self.system.refuse_nobody()
+            self.check_measured()
         return criterion
 
-    def check_measured(self) -> None:
-        """Refuse the measure of an encounter where nobody else is on the road."""
-        if self.measure and self.system.meets_nobody:
-            original = self.evaluate_original()
-            if np.isnan(original.column(self.measure)[0]):
-                self.system.refuse_nobody()
+    def check_measured(self, measure: str = F_SAFE.name) -> None:
+        """Refuse what is measured in an encounter, as a distance, where nobody else is on the
+        road.
+        """
+        if self.system.meets_nobody and np.isnan(self.evaluate_original().column(measure)[0]):
+            problem = "nobody else is on the road, so that no vehicle collides or is too close"
+            legal = 'a metric with a limit, such as "stopping_distance > 100"'
+            raise InputError("unsafe", problem, legal)
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

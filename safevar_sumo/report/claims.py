@@ -186,17 +186,12 @@ class Packed:
         (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
         return case
 
-    @cached_property
-    def _usual(self) -> list[str]:
-        """Questions that a pack has if nobody asks others; one of them may have no answer."""
-        unsafe = self.packed.unsafe
-        return [with_criterion(text, unsafe) for text in usual_questions(self.shown)]
-
     def answer(self, text: str) -> Answer:
         if text not in self._answers:
             add_import_folders(self._places)
             shown = self.shown
-            case = shown if has_criterion(text, self.packed.unsafe) else self.case
+            unsafe = self.packed.unsafe
+            case = shown if has_criterion(text, unsafe) else self.case
             with temporary_folder() as folder:
                 placed = text
                 if name := list_in(text):
@@ -204,8 +199,8 @@ class Packed:
                     path.parent.mkdir()
                     path.write_bytes(self.files[name])
                     placed = with_list(text, str(path))
-                is_asked = text in self.packed.questions and text not in self._usual
-                ask = answer_to if is_asked else answer_or_reason
+                usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
+                ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
                 answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
             command = answer.command.replace(f"{folder}/", "")
             self._answers[text] = replace(answer, command=command)
@@ -220,8 +215,9 @@ class Packed:
         study = ReportedStudy(
             directory=self._directory, case=self.shown, versions=versions, answers=answers
         )
-        unsafe = self.packed.unsafe
-        study = with_speed(study, lambda text: self.answer(with_criterion(text, unsafe)))
+        study = with_speed(
+            study, lambda text: self.answer(with_criterion(text, self.packed.unsafe))
+        )
         return make_page([study], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:

@@ -243,12 +243,9 @@ def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any) -> Answe
     try:
         return answer_to(text, cases, *arguments)
     except InputError as error:
-        return _no_answer(text.partition(" ")[0], cases[0], error)
-
-
-def _no_answer(question: str, case: Case, error: InputError) -> Answer:
-    verdict = f"No answer: {error.problem}; expected: {error.legal}."
-    return Answer(question=question, study=case.study, verdict=verdict, numbers={}, tables={})
+        name, study = text.partition(" ")[0], cases[0].study
+        verdict = f"No answer: {error.problem}; expected: {error.legal}."
+        return Answer(question=name, study=study, verdict=verdict, numbers={}, tables={})
 
 
 def make_page(

@@ -133,13 +133,6 @@ class System:
         """Whether nobody else is on the road at any point, so that nothing can collide."""
         return all(point.scenario.brakes_fully for point in self.points)
 
-    def refuse_nobody(self) -> None:
-        """Refuse a collision or a distance as the criterion where nobody else is on the road."""
-        if self.meets_nobody:
-            problem = "nobody else is on the road, so that no vehicle collides or is too close"
-            legal = 'a metric with a limit, such as "stopping_distance > 100"'
-            raise InputError("unsafe", problem, legal)
-
     @property
     def step(self) -> float:
         """Time step of the simulations [s]; 0 in a simulator of the user's own, which has its

@@ -190,21 +190,6 @@ def test_all_cars_within_limits(short: Study) -> None:
         assert not are_unsafe(short, fit, np.unique(cars, axis=0), speeds, PLACES, keep=0.1).any()
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"cars": {"slow": {"brakeTorque": 0.5}}},
-        pytest.param({"limits": ["brakeTorque >= 0.5"]}, marks=pytest.mark.slow),
-    ],
-)
-def test_one_car_that_may_not_drive_has_an_answer(asked: dict[str, Any]) -> None:
-    answer = permit("autoware_july", **asked, others="new", quick=True)
-    assert answer.numbers["stop"] == 1
-    assert "may not drive; the new car may drive up to" in answer.verdict
-    assert "Not even at 30 km/h: " in answer.verdict
-    assert answer.to_dict()["tables"]["cars"]["rows"][0]["up_to"] is None
-
-
 def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
     cars = {"new": {}, "worn": {"treadDepth": 3}}
     answer = permit(short, cars=cars, others="new", fits=0, quick=True)

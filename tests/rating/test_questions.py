@@ -4,8 +4,6 @@ computed in this process.
 
 from __future__ import annotations
 
-import html
-import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +24,7 @@ from safevar_sumo.questions.explain.failures import compare_at_cells
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of, refused, run, searched
+from tests.in_process import InlinePool, json_of, refused, run
 from tests.made_up import case_of, original_of
 from tests.sumo.test_recording import still as still
 
@@ -122,21 +120,6 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     ((endings, worse_cells),) = compare_at_cells(evaluator, original)
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert endings.startswith(f"At {matrix[4].name}: ")
-
-
-@pytest.mark.slow
-def test_a_rating_has_a_page_and_is_packed_and_made_again(in_tmp: Path) -> None:
-    search = {"population": 4, "evaluations": 8}
-    searched(load_study("euro_ncap_rating", search=search), Path("results"))
-    run("report", "results", "--out", "it.html")
-    page = Path("it.html").read_text()
-    (command,) = re.findall(r"<code>python -m safevar_sumo (rating .*)</code>", page)
-    answer = run(*command.split(), "--format", "html").stdout
-    assert html.unescape(answer).strip() in html.unescape(page)
-    run("evidence", "results", "--out", "it.zip")
-    claims = json_of("verify", "it.zip")["tables"]["claims"]["rows"]
-    assert {claim["verdict"] for claim in claims} == {"same"}
-    assert any(claim["claim"].startswith("answer rating") for claim in claims)
 
 
 @pytest.mark.slow
