@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -128,20 +127,16 @@ def _ways(model: Model, settings: FloatArray) -> FloatArray:
     values = system.characteristics.scenario.columns(system.cut(settings)[1])
     points = (encounter(system.points[number], values) for number in model.numbers_of_points)
     speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
-    return system.step * np.maximum.reduce(speeds)
+    return np.asarray(system.step * np.maximum.reduce(speeds))
 
 
 def at_worst_phases(
-    model: Model, settings: FloatArray, stage: str
+    claim: Model, judge: Judge, settings: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """M settings of a model, shape (M, n), with their worst phases behind them, and what they leave
-    there; at phase 0 and infinite without phases.
+    """M settings, shape (M, n - 1), with their worst phases behind them, and what they leave there
+    by the judge; `claim` is the model with phases.
     """
     rows = np.column_stack([settings, np.zeros(len(settings))])
-    claim = model.in_phases
-    if claim is None:
-        return rows, np.full(len(rows), np.inf)
-    judge = partial(claim.robustness, stage=stage)
     return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
 
 

@@ -106,7 +106,9 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
 def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
     table = tabulate("Cars", {"car": ""}, [[f"<{row}>"] for row in range(number)])
     table.attrs["shown_whole"] = SHOWN_WHOLE
-    answer = Answer(question="", study=STUDY, verdict="", numbers={}, tables={"cars": table})
+    answer = Answer(
+        question="", study=load_study("smoke"), verdict="", numbers={}, tables={"cars": table}
+    )
     text = answer.render("text")
     assert len(re.findall("<[0-9]+>", text)) == shown
     assert ("39 more rows: --details" in text) == (number == 51)

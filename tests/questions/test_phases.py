@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -114,15 +115,16 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     lower = np.where(left[tips] < left[tips + 1], tips, tips + 1)
     assert len(lower) > 3
     some = np.arange(lower[0], lower[-1], 97)
-    rows, worst = at_worst_phases(model, settings[some], "phases")
+    claim = model.in_phases
+    assert claim is not None
+    judge = partial(claim.robustness, stage="phases")
+    rows, worst = at_worst_phases(claim, judge, settings[some])
     line = np.interp(speeds[some], speeds[lower], left[lower])
     np.testing.assert_allclose(worst, line, atol=0.01)
     assert (worst <= left[some]).all()
 
     # What is printed is what was simulated.
-    claim = model.in_phases
-    assert claim is not None
-    np.testing.assert_array_equal(claim.robustness(rows, "again"), worst)
+    np.testing.assert_array_equal(judge(rows), worst)
     np.testing.assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
 
 
@@ -132,9 +134,9 @@ def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
     members = evaluator.characteristics
     settings = np.tile(members.original, (40, 1))
     settings[:, members.names.index("brakeTorque")] = np.linspace(0.92, 0.96, 40)
-    _, worst = at_worst_phases(model, settings, "phases")
     claim = model.in_phases
     assert claim is not None
+    _, worst = at_worst_phases(claim, partial(claim.robustness, stage="phases"), settings)
     many = np.repeat(np.linspace(0, 1, 200, endpoint=False), len(settings))
     rows = np.column_stack([np.tile(settings, (200, 1)), many])
     scanned = claim.robustness(rows, "scan").reshape(200, -1)

@@ -208,6 +208,7 @@ def repair(
     ]
     problem = problems[0]
     between = [each for one in problems for each in ([] if at_tests else one.between(unsafe_today))]
+    between += [each for one in problems for each in one.in_phases()]
     first = _first_vehicles(problem, subject)
     if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"

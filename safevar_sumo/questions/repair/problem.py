@@ -27,7 +27,7 @@ from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_o
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
-from safevar_sumo.study import FreeParameter, ModelTable, Study, limits_of
+from safevar_sumo.study import PHASE, FreeParameter, ModelTable, Study, limits_of
 from safevar_sumo.study.characteristics import check_limits
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import FeasibleRegion
@@ -250,6 +250,22 @@ class RepairProblem:
             )
             for test in tests
         ]
+
+    def in_phases(self) -> list[RepairProblem]:
+        """The same problem with settings that end with the phase of their encounter, if it has
+        phases.
+        """
+        model = Model(self.fit, self.evaluator, self.unsafe).in_phases
+        if model is None:
+            return []
+        lower, upper = np.append(self.promise.lower, 0.0), np.append(self.promise.upper, 1.0)
+        promise = Promise(model.evaluator.region, lower, upper)
+        return [replace(self, evaluator=model.evaluator, promise=promise)]
+
+    @property
+    def has_phases(self) -> bool:
+        """Whether settings end with the phase of their encounter."""
+        return self.evaluator.characteristics.names[-1] == PHASE
 
     @cached_property
     def today(self) -> FloatArray:

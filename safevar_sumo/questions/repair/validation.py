@@ -10,6 +10,8 @@ import numpy as np
 from safevar_sumo.questions.between import PLACES
 from safevar_sumo.questions.box import Judgement, Proof, prove
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
@@ -34,8 +36,8 @@ def find_failures(
     number: int,
 ) -> Failures:
     """Attack a change in all fits: promised settings that it does not keep safe, and a driving
-    system could; then `between` the tests of a matrix, whose problems are numbered after the
-    others. `number` counts the attacks, for their random numbers.
+    system could; then `between` the tests of a matrix and at other phases, whose problems are
+    numbered after the others. `number` counts the attacks, for their random numbers.
     """
     own = problems[0]
     # These numbers are of no `Stream`: repairs depend on them.
@@ -46,11 +48,18 @@ def find_failures(
     for row, problem in enumerate(between, len(problems)):
         if failures:
             break
+        judge = partial(problem.robustness, change, stage=ATTACK_STAGE)
+        # The worst known vehicles and corners at their worst phases.
+        if problem.has_phases:
+            corners = own.promise.corners(own.study.search.seed, number)[:KNOWN]
+            model = Model(problem.fit, problem.evaluator, problem.unsafe)
+            rows, left = at_worst_phases(model, judge, np.concatenate([known[:KNOWN], corners]))
+            failures = {row: rows[left < 0]} if (left < 0).any() else {}
+            continue
         # The worst known vehicles, each at some random places on the axes.
         vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
         start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
         start[:, : vehicles.shape[1]] = vehicles
-        judge = partial(problem.robustness, change, stage=ATTACK_STAGE)
         found = falsify(problem.promise, [judge], [start], LEAST_SIMULATIONS, rng)
         if found.failures:
             failures = {row: found.failures[0]}

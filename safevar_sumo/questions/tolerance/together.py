@@ -311,7 +311,7 @@ class JointSearch:
             return
         search = self._search
         search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_settings])
-        validator = self._validator(model, budget_of_set(self._budget))
+        validator = self._validator(model, budget_of_set(self._budget), with_phases=True)
         extension = Extension(search)
         met = list[Model]()
         for attempt in range(MAX_CUTS):
@@ -352,8 +352,6 @@ class JointSearch:
         validation = validator.validate(box, attempt)
         if not validation.failures:
             validation = validator.complete(validation, attempt, CONFIRMATIONS_OF_SET)
-        if not validation.failures:
-            validation = validator.meet_phases(validation)
         proof = self.found.proof
         if validation.failures or box is self.found.box:
             return validation, proof
@@ -364,9 +362,9 @@ class JointSearch:
         proved = self._validators[0].prove(Validation(box), attempt)
         return validation._replace(failures=proved.failures), proved.proof
 
-    def _validator(self, model: Model, budget: int) -> Validator:
+    def _validator(self, model: Model, budget: int, *, with_phases: bool = False) -> Validator:
         budgets = budget, budget_of_set(budget) if model.fit == 0 else budget
-        return Validator(model, self._tests[model.fit], budgets)
+        return Validator(model, self._tests[model.fit], budgets, with_phases=with_phases)
 
     def _note(self, models: Sequence[Model]) -> None:
         """Note what was met, and what is beyond the box."""

@@ -5,6 +5,7 @@ the tests of a matrix and between them, and sampled vehicles.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -82,13 +83,21 @@ class Validation(NamedTuple):
 class Validator:
     """Validates boxes in one model, whose matrix gains the encounters that fail between its tests.
     `budget` simulations falsify each box at the tests' points, and as many as `budget_between` in
-    each of the tests that move.
+    each of the tests that move; the worst settings meet their worst phases if `with_phases`.
     """
 
-    def __init__(self, model: Model, tests: Sequence[MovingTest], budgets: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        model: Model,
+        tests: Sequence[MovingTest],
+        budgets: tuple[int, int],
+        *,
+        with_phases: bool,
+    ) -> None:
         self.model = model
         self.tests = tests
         self.budget, self.budget_between = budgets
+        self._with_phases = with_phases
         self.seed = model.evaluator.study.search.seed
         self._judge = NarrowedJudge(model, VALIDATION_STAGE)
         self._worst = list[tuple[MovingTest | None, FloatArray]]()
@@ -107,6 +116,11 @@ class Validator:
         is_searched = len(box.region.characteristics.scenario) > 0
         validation, robustness = self._test(Validation(box), first)
         if validation.failures or not self.budget:
+            return validation
+        # Phases first: they cut off most of what fails between the tests.
+        self._worst = [(None, first)]
+        validation = self._meet_phases(validation)
+        if validation.failures:
             return validation
         worst = first[np.argsort(robustness, kind="stable")]
         rng = Stream.JOINT_LIMITS.generator(self.seed, attempt, self.model.fit)
@@ -127,7 +141,7 @@ class Validator:
         ]
         validation, robustness = self._test(validation, corners[:MAX_CORNERS])
         worst = corners[np.argsort(robustness, kind="stable")]
-        self._worst = [(None, corners)]
+        self._worst = []
         # Further searches for counterexamples.
         for rng in rngs:
             if not validation.failures:
@@ -137,15 +151,17 @@ class Validator:
         # Of a study that searches its scenario there are more corners.
         if not validation.failures:
             validation, _ = self._test(validation, corners[MAX_CORNERS:])
-        return validation
+        return validation if validation.failures else self._meet_phases(validation)
 
-    def meet_phases(self, validation: Validation) -> Validation:
-        """Have the corners of a box that passed, and the worst settings of each search for
-        counterexamples, meet their worst phases.
-        """
-        for test, settings in self._worst if self.budget else []:
+    def _meet_phases(self, validation: Validation) -> Validation:
+        """Have the worst settings of a box that passed meet their worst phases."""
+        for test, settings in self._worst if self._with_phases else []:
             model = self.model if test is None else test.model
-            rows, left = at_worst_phases(model, settings, VALIDATION_STAGE)
+            claim = model.in_phases
+            if claim is None or not len(settings):
+                continue
+            judge = partial(claim.robustness, stage=VALIDATION_STAGE)
+            rows, left = at_worst_phases(claim, judge, settings)
             failures = list[Failures]()
             for row in np.argsort(left, kind="stable")[:PHASE_FAILURES].tolist():
                 if left[row] < 0:
@@ -157,7 +173,7 @@ class Validator:
                         Failures(there.at_worst_points(vehicle, VALIDATION_STAGE), vehicle)
                     )
             validation = validation._replace(
-                least=min(validation.least, float(left.min(initial=np.inf))),
+                least=min(validation.least, float(left.min())),
                 failures=(*validation.failures, *failures),
             )
         return validation
