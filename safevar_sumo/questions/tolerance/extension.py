@@ -4,6 +4,8 @@ failure.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from safevar_sumo.questions.box import Box
@@ -102,14 +104,17 @@ class Extension:
         search.unsafe_settings = np.concatenate([search.unsafe_settings, *found.values()])
         return bool(found)
 
-    def cut(self, box: Box, clearance: float) -> Box:
+    def cut(self, box: Box, clearance: float, avoided: Sequence[FloatArray] = ()) -> Box:
         """The largest box within a box without its known failures that was found: they are cut off
         in several orders, first those that leave the least choice of a limit to move in. Limits
-        keep off failures by a `clearance` above 0, as a share of a move.
+        keep off failures by a `clearance` above 0, as a share of a move. No box holds settings
+        that are `avoided`, either, each of shape (K, n).
         """
         search = self.search
         sides = search.sides_of(box)
-        failures = search.extents(search.unsafe_inside(sides))
+        inside = search.unsafe_inside(sides)
+        failures = search.extents(np.concatenate([inside, *avoided]))
+        failures = failures[(failures <= sides).all(axis=(1, 2))]
         if not len(failures):
             return box
         choices = np.count_nonzero(search.is_free & (failures > 0), axis=(1, 2))

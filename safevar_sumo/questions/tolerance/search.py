@@ -303,9 +303,9 @@ class BoxSearch(BoxGeometry):
         self._keep_causes(causes)
         return causes
 
-    def approach(self, causes: FloatArray, model: Model) -> None:
+    def approach(self, causes: FloatArray, model: Model) -> FloatArray:
         """Know, for each change of K causes, the value nearest to the original from which on it is
-        unsafe with the others.
+        unsafe with the others: the settings in which all changes have these values, shape (K, n).
         """
         is_changed = (causes != self.original) & self.is_free.any(axis=0)
         rows, columns = np.nonzero(is_changed)
@@ -314,6 +314,9 @@ class BoxSearch(BoxGeometry):
         starts[np.arange(len(rows)), columns] = self.original[columns]
         found = find_boundaries(starts, ends, partial(model.are_unsafe, stage=SEARCH_STAGE))
         self.unsafe_settings = np.concatenate([self.unsafe_settings, found.unsafe])
+        nearest = causes.copy()
+        nearest[rows, columns] = found.unsafe[np.arange(len(rows)), columns]
+        return nearest
 
     def _corners_of(self, causes: FloatArray) -> FloatArray:
         """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its

@@ -314,8 +314,9 @@ class JointSearch:
         validator = self._validator(model, budget_of_set(self._budget), with_phases=True)
         extension = Extension(search)
         met = list[Model]()
+        avoided = list[FloatArray]()
         for attempt in range(MAX_CUTS):
-            box = extension.cut(outer, RETREAT_OF_SET * (attempt + 1))
+            box = extension.cut(outer, RETREAT_OF_SET * (attempt + 1), avoided)
             validation, proof = self._pass(validator, box, attempt)
             if not validation.failures:
                 # The search of the own set has tested more.
@@ -331,7 +332,10 @@ class JointSearch:
                 break
             met += [failures.model for failures in validation.failures]
             for failures, causes in _learn(search, validation):
-                search.approach(causes, failures.model)
+                nearest = search.approach(causes, failures.model)
+                # Windows of phases are narrow and deep: one limit moves until they close.
+                if failures.model.phase:
+                    avoided.append(nearest)
             if validator not in self._validators:
                 self._validators.append(validator)
         else:
