@@ -140,7 +140,8 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
         values = members.scenario.named(settings[row, ~members.of_vehicle])
-        values |= {PHASE: model.phase} if model.phase else {}
+        if runs.settings.shape[1] > len(members):
+            values[PHASE] = float(runs.settings[row, -1])
         scenario = encounter(point, values).scenario
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])

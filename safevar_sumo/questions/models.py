@@ -18,6 +18,7 @@ from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
@@ -43,8 +44,8 @@ class Model(NamedTuple):
         Numbers of the points of the study's matrix that count; all if empty.
     new_car
         What the original must not be in an encounter that counts, where it has not been tried.
-    phase
-        The phase at which all encounters begin.
+    at_worst_phase
+        Whether each setting meets its encounter at the worst phase, where encounters have one.
     """
 
     fit: int
@@ -52,7 +53,7 @@ class Model(NamedTuple):
     unsafe: Unsafe
     points: tuple[int, ...] = ()
     new_car: Unsafe | None = None
-    phase: float = 0.0
+    at_worst_phase: bool = False
 
     @property
     def numbers_of_points(self) -> Sequence[int]:
@@ -71,13 +72,16 @@ class Model(NamedTuple):
             return None
         is_searched = len(self.evaluator.characteristics.scenario) > 0
         points = self.points if is_searched else tuple(self.numbers_of_points)
-        return self._replace(evaluator=evaluator, points=points, phase=0.0)
+        return self._replace(evaluator=evaluator, points=points, at_worst_phase=False)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
-        """The evaluations of M settings, shape (M, n), at the points that count."""
-        if self.phase and (model := self.in_phases) is not None:
-            phases = np.full(len(settings), self.phase)
-            return model.evaluate(np.column_stack([settings, phases]), stage)
+        """The evaluations of M settings, shape (M, n), at the points that count; at their worst
+        phases of settings that end with them.
+        """
+        claim = self.in_phases if self.at_worst_phase else None
+        if claim is not None:
+            judge = partial(claim.robustness, stage=stage)
+            return claim.evaluate(at_worst_phases(claim, judge, settings)[0], stage)
         if not self.points:
             return self.evaluator.evaluate(settings, stage)
         return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)

@@ -4,7 +4,7 @@ the limit depends on when between two decisions the encounter begins. Claims mee
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -140,19 +140,14 @@ def at_worst_phases(
     return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
 
 
-def remark_on_phases(models: Sequence[Model], places: Sequence[FloatArray]) -> str:
-    """What to know where models of encounters have no phases, or where the original vehicle ends
-    otherwise in an encounter, each at a place of shape (1, searched parameters), that begins a
-    whole step later; else "".
+def remark_on_phases(model: Model, place: FloatArray) -> str:
+    """What to know of a model without phases, or in which the original vehicle ends otherwise in an
+    encounter at a place, shape (1, searched parameters), that begins a whole step later; else "".
     """
-    has_phases = [model.evaluator.characteristics.names[-1] == PHASE for model in models]
-    if not all(has_phases):
+    members = model.evaluator.characteristics
+    if members.names[-1] != PHASE:
         return AT_ONE_PHASE
-    for model, place in zip(models, places, strict=True):
-        vehicle = model.evaluator.characteristics.vehicle.original_settings
-        rows = np.repeat(np.hstack([vehicle, place]), 2, axis=0)
-        rows[1, -1] = 1.0
-        at_begin, at_end = model.robustness(rows, "phases of the original")
-        if not np.isclose(at_begin, at_end, atol=SAME):
-            return COUNTS_STEPS
-    return ""
+    rows = np.repeat(np.hstack([members.vehicle.original_settings, place]), 2, axis=0)
+    rows[1, -1] = 1.0
+    at_begin, at_end = model.robustness(rows, "phases of the original")
+    return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS

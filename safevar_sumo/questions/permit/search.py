@@ -140,9 +140,8 @@ class PermitSearch:
 
     def remark_on_phases(self) -> str:
         """What to know where not all phases of encounters were met, in a sentence; else ""."""
-        ranges = next(iter(self._ranges.values()))
-        places = [each.places(each.low)[:1] for each in ranges]
-        return remark_on_phases([each.model for each in ranges], places)
+        first, *_ = next(iter(self._ranges.values()))
+        return remark_on_phases(first.model, first.places(first.high)[:1])
 
     def repair_first(
         self,

@@ -198,7 +198,8 @@ class BoxSearch(BoxGeometry):
     def join(self, model: Model) -> None:
         """Take a model into the search, or more points of one that is in it."""
         for number, member in enumerate(self.models):
-            if member.evaluator is model.evaluator and member.phase == model.phase:
+            is_same = member.at_worst_phase == model.at_worst_phase
+            if member.evaluator is model.evaluator and is_same:
                 points = (*member.points, *model.points) if member.points and model.points else ()
                 model = member._replace(points=tuple(sorted({*points})))
                 del self.models[number]

@@ -334,7 +334,7 @@ class JointSearch:
             for failures, causes in _learn(search, validation):
                 nearest = search.approach(causes, failures.model)
                 # Windows of phases are narrow and deep: one limit moves until they close.
-                if failures.model.phase:
+                if failures.model.at_worst_phase:
                     avoided.append(nearest)
             if validator not in self._validators:
                 self._validators.append(validator)

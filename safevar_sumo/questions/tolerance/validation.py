@@ -5,7 +5,6 @@ the tests of a matrix and between them, and sampled vehicles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,6 @@ from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
 from safevar_sumo.questions.falsify import Falsification, falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.narrowing import NarrowedJudge
-from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.records import FloatArray
 
@@ -156,26 +154,19 @@ class Validator:
     def _meet_phases(self, validation: Validation) -> Validation:
         """Have the worst settings of a box that passed meet their worst phases."""
         for test, settings in self._worst if self._with_phases else []:
-            model = self.model if test is None else test.model
-            claim = model.in_phases
-            if claim is None or not len(settings):
+            model = (self.model if test is None else test.model)._replace(at_worst_phase=True)
+            if model.in_phases is None or not len(settings):
                 continue
-            judge = partial(claim.robustness, stage=VALIDATION_STAGE)
-            rows, left = at_worst_phases(claim, judge, settings)
-            failures = list[Failures]()
-            for row in np.argsort(left, kind="stable")[:PHASE_FAILURES].tolist():
-                if left[row] < 0:
-                    there, vehicle = model, settings[[row]]
-                    if test is not None:
-                        there, vehicle = test.failures(vehicle)
-                    there = there._replace(phase=float(rows[row, -1]))
-                    failures.append(
-                        Failures(there.at_worst_points(vehicle, VALIDATION_STAGE), vehicle)
-                    )
-            validation = validation._replace(
-                least=min(validation.least, float(left.min())),
-                failures=(*validation.failures, *failures),
-            )
+            left = model.robustness(settings, VALIDATION_STAGE)
+            worst = settings[np.argsort(left, kind="stable")[:PHASE_FAILURES]]
+            if left.min() < 0 and test is not None:
+                model, worst = test.failures(worst[: np.count_nonzero(left < 0)])
+                failures = Failures(model._replace(at_worst_phase=True), worst)
+                validation = validation._replace(failures=(*validation.failures, failures))
+            elif left.min() < 0:
+                found = self._failures(worst[: np.count_nonzero(left < 0)], model=model)
+                validation = validation._replace(failures=(*validation.failures, *found))
+            validation = validation._replace(least=min(validation.least, float(left.min())))
         return validation
 
     def recheck(self, box: Box, attempt: int) -> Validation:
@@ -248,10 +239,10 @@ class Validator:
         validation = validation.with_search(found, all_points=self._judge.at_all_points - before)
         return validation._replace(failures=self._failures(*found.failures.values()))
 
-    def _failures(self, *settings: FloatArray) -> tuple[Failures, ...]:
+    def _failures(self, *settings: FloatArray, model: Model | None = None) -> tuple[Failures, ...]:
         """Unsafe settings, each with the model at the points where they are unsafe."""
         return tuple(
-            Failures(self.model.at_worst_points(rows, VALIDATION_STAGE), rows)
+            Failures((model or self.model).at_worst_points(rows, VALIDATION_STAGE), rows)
             for rows in settings
             if len(rows)
         )
