@@ -15,8 +15,6 @@ from typing import Any
 
 MAX_JOBS = 1024
 """Largest number of worker processes."""
-MAX_BATCH = 10_000
-"""Largest number of settings in a batch that a user may ask for."""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)

@@ -9,7 +9,7 @@ from pathlib import Path
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import MAX_BATCH, InputError, check_text, check_whole, warn
+from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.questions.research_questions.fronts import few_evaluations
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.study import Study, StudyLike
@@ -27,7 +27,6 @@ def run(
     pool: Pool | None = None,
     progress: bool | Progress = False,
     only: Sequence[tuple[str, int]] | None = None,
-    batch: int | None = None,
     engine: str = Engine.RECORDED,
     retry_failed: bool = False,
 ) -> Results:
@@ -53,8 +52,6 @@ def run(
     only
         The only runs to carry out, as (algorithm, number from 0); the results are complete once
         every run is finished.
-    batch
-        Maximum number of settings per batch, gathered from several runs; never changes a result.
     engine
         "recorded": simulate in a recorded scene if no actor reacts to the vehicle under test, else
         in SUMO; "sumo": always in SUMO. Never changes a result.
@@ -81,8 +78,6 @@ def run(
                     "(algorithm of the study, run from 0 to less than `search.runs`)",
                 )
         keys = [RunKey(*key) for key in only]
-    if batch is not None:
-        check_whole("batch", batch, MAX_BATCH)
 
     # Where results go.
     directory = Path("results") / loaded_study.name if out is None else Path(check_text("out", out))
@@ -100,7 +95,6 @@ def run(
             workers,
             show,
             warn,
-            batch,
             engine,
             retry_failed=retry_failed,
         )

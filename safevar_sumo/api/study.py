@@ -24,7 +24,7 @@ from safevar_sumo.campaign.campaign import (
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import ask_why_no_verdict
-from safevar_sumo.errors import MAX_BATCH, InputError, warn
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Jobs, Range
@@ -111,7 +111,6 @@ def study(
     algorithms: Annotated[str | None, "NAME,..."] = None,
     seed: Annotated[int | None, Range(0, 2**63 - 1)] = None,
     unsafe: Criterion = None,
-    batch: Annotated[int | None, Range(1, MAX_BATCH)] = None,
     engine: Literal["recorded", "sumo"] = "recorded",
     out: Path | None = None,
     jobs: Jobs = None,
@@ -137,9 +136,6 @@ def study(
     unsafe
         What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as
         "drac > 6".
-    batch
-        Maximum settings per batch, gathered from several runs; does not change results. By default
-        the fastest.
     engine
         What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor
         reacts to the vehicles; some results are verified in SUMO. sumo: always SUMO.
@@ -185,7 +181,7 @@ def study(
     # Measured or searched.
     if dry_run:
         with open_pool(jobs, cluster) as pool:
-            return _measured(loaded, system, len(keys), engine, batch, pool)
+            return _measured(loaded, system, len(keys), engine, pool)
     try:
         with open_progress(not quiet) as show:
             parts = Parts(show, [0, FEW if system.has_simulator else VERDICT_COST])
@@ -197,7 +193,6 @@ def study(
                 jobs=jobs,
                 cluster=cluster,
                 only=keys,
-                batch=batch,
                 engine=engine,
             )
             return _found(results, system, unsafe, jobs, parts.begin())
@@ -270,13 +265,11 @@ def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:
     return keys
 
 
-def _measured(
-    study: Study, system: System, runs: int, engine: str, batch: int | None, pool: Pool
-) -> Answer:
+def _measured(study: Study, system: System, runs: int, engine: str, pool: Pool) -> Answer:
     """The estimated time of a search, from a short measurement."""
     # The speed on this machine.
     used, reason = choose_engine(system, engine)
-    task = Task(study=study, engine=used, batch_size=batch or settings_per_batch(system, used))
+    task = Task(study=study, engine=used, batch_size=settings_per_batch(system, used))
     begin = time.monotonic()
     evaluate_original(task, pool)
     ask_why_no_verdict(study, pool)

@@ -79,10 +79,10 @@ def run_campaign(
     pool: Pool,
     progress: Progress,
     warn: Callable[[str], None],
-    batch_size: int | None = None,
     engine: str = Engine.RECORDED,
     *,
     retry_failed: bool = False,
+    batch_size: int | None = None,
 ) -> Campaign:
     """Carry out runs of a study, or resume unfinished ones; write the solutions if these are all
     runs of the study.
@@ -91,13 +91,14 @@ def run_campaign(
     ----------
     directory
         The directory of the results.
-    batch_size
-        Maximum number of settings in a batch, which may hold settings of several runs.
     engine
         What moves the vehicles; when the results are written, some of those from recorded scenes
         are verified in SUMO.
     retry_failed
         Whether to simulate settings again that failed before.
+    batch_size
+        Maximum number of settings in a batch, which may hold settings of several runs; by default
+        the fastest. It changes no result.
 
     Raises
     ------

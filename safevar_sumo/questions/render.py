@@ -17,7 +17,6 @@ from rich.console import Console
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
-    cell_text,
     csv_cell,
     html_table,
     latex_notes,
@@ -139,12 +138,6 @@ def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
         _print_table(console, frame)
     for text in _details_in_words(answer):
         print_text(console, text)
-    if answer.study is not None:  # `list` has checked nothing
-        in_table = answer.tables.get("results", pd.DataFrame({"result": []}))["result"].tolist()
-        numbers = {name: value for name, value in answer.numbers.items() if name not in in_table}
-        print_text(
-            console, "; ".join(f"{name}: {cell_text(value)}" for name, value in numbers.items())
-        )
 
 
 def _print_screen(answer: Answer, screen: Screen, console: Console) -> None:

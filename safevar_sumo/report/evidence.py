@@ -70,13 +70,15 @@ def evidence(
     out: Path,
     ask: tuple[str, ...] = (),
     unsafe: Criterion = None,
-    with_names: bool = False,
     jobs: Jobs = None,
     progress: bool | Progress = False,
     fresh: bool = False,
 ) -> str:
     """Pack results with their study, page and answers, so that anybody can compute every number
     again.
+
+    A pack has lists of cars without names: they are "car 1", "car 2" and so on, and the columns
+    that a question ignores are empty.
 
     Parameters
     ----------
@@ -90,9 +92,6 @@ def evidence(
     unsafe
         What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a
         metric such as "drac > 6".
-    with_names
-        Pack lists of cars as they are; by default the pack calls the cars "car 1", "car 2" and so
-        on, and leaves the columns that a question ignores empty.
     jobs
         Number of worker processes, by default one for each core.
     progress
@@ -121,9 +120,7 @@ def evidence(
     files = dict[str, bytes]()
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            described, own_files = _pack_study(
-                number, directory, ask, unsafe, with_names, jobs, show
-            )
+            described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -135,7 +132,6 @@ def _pack_study(
     directory: Path,
     ask: Sequence[str],
     unsafe: str | None,
-    with_names: bool,
     jobs: int | None,
     progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
@@ -154,7 +150,7 @@ def _pack_study(
     # The questions, by the criterion that the user gave.
     (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
-    questions, lists = _with_lists(list(dict.fromkeys(asked)), with_names)
+    questions, lists = _with_lists(list(dict.fromkeys(asked)))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
     described = PackedStudy(
@@ -170,7 +166,7 @@ def _pack_study(
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
 
 
-def _with_lists(questions: Sequence[str], with_names: bool) -> tuple[list[str], dict[str, bytes]]:
+def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
     """Questions about the lists of cars as a pack holds them, and these lists by their names in the
     pack.
     """
@@ -180,8 +176,7 @@ def _with_lists(questions: Sequence[str], with_names: bool) -> tuple[list[str], 
         if path := list_in(text):
             name = f"{LISTS}/{len(lists) + 1}.csv"
             ignored = parse_question(text)[1].get("ignore", ())
-            own = list_without_names(Path(path), ignored)
-            lists[name] = Path(path).read_bytes() if with_names else own
+            lists[name] = list_without_names(Path(path), ignored)
             text = with_list(text, name)
         found.append(text)
     return found, lists

@@ -42,12 +42,7 @@ from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progre
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-USUAL_QUESTIONS = (
-    "tolerance",
-    "explain --limit 30000",
-    "risk --samples 4000",
-    "rules --samples 4000",
-)
+USUAL_QUESTIONS = ("tolerance", "explain", "risk --samples 4000", "rules --samples 4000")
 """Questions of a page, the one whose verdict decides first; with smaller samples than those of the
 commands.
 """

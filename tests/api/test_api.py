@@ -213,7 +213,6 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     [
         ({"jobs": -1}, "jobs: -1\nexpected: a whole number from 1 to 1,024"),
         ({"jobs": 0}, "jobs: 0\nexpected: a whole number from 1 to 1,024"),
-        ({"batch": 0}, "batch: 0\nexpected: a whole number from 1 to 10,000"),
         ({"only": [("rs", 0), ("nsga2", 9)]}, "only: ('nsga2', 9)\nexpected: (algorithm"),
         ({"only": [("sr", 0)]}, "only: ('sr', 0)"),
         ({"out": ""}, "out: ''"),
@@ -240,7 +239,7 @@ def test_a_run_refuses_what_its_command_refuses(
         (sv.report, "results", 3),
         (sv.run, "out", {"study": "smoke", "out": 3}),
         (sv.risk, "point", {"source": "wear", "point": 3}),
-        (sv.tolerance, "by", {"source": "smoke", "by": 3}),
+        (sv.tolerance, "up_to", {"source": "smoke", "up_to": 3}),
     ],
 )
 def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(

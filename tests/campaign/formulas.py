@@ -101,8 +101,8 @@ def carried_out(
             pool,
             progress,
             warnings.append,
-            batch,
             engine="sumo",
+            batch_size=batch,
         )
 
 

@@ -27,18 +27,20 @@ algorithms = ["nsga2", "rs", "safe_fuzzer"]
 evaluations = 150
 """
 TIMEOUT = 60.0  # s
+SMALL_BATCHES = Path(__file__).parent / "small_batches.py"
 Process = subprocess.Popen[str]
 running = []
 """Processes that a test has started."""
 
 
-def started(*arguments: str, **options: object) -> Process:
+def started(*arguments: str, batch: int | None = None, **options: object) -> Process:
     """Start a command in its own process group and with Ctrl-C as a shell does, whatever this
-    process ignores.
+    process ignores; with `batch`, in batches of at most so many settings.
     """
+    program = ["-m", "safevar_sumo"] if batch is None else [str(SMALL_BATCHES), str(batch)]
     running.append(
         subprocess.Popen(
-            [sys.executable, "-m", "safevar_sumo", *arguments],
+            [sys.executable, *program, *arguments],
             stdout=subprocess.PIPE,  # type: ignore[call-overload]
             stderr=subprocess.PIPE,
             text=True,

@@ -33,7 +33,7 @@ def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
     moments = random.Random(4)
     for _ in range(6):
         before = written(OUT)
-        process = started("study", "small.toml", "--out", "out", "--jobs", "1", "--batch", "1")
+        process = started("study", "small.toml", "--out", "out", "--jobs", "1", batch=1)
         until(lambda: written(OUT) > before, process)  # noqa: B023
         time.sleep(moments.uniform(0, 0.1))
         assert process.poll() is None, "the study is too short to be killed so often"
@@ -53,9 +53,7 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
 @SLOW
 def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     moments = random.Random(5)
-    process = started(
-        "study", "small.toml", "--out", "out", "--jobs", "2", "--batch", "5", "--quiet"
-    )
+    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--quiet", batch=5)
     until(lambda: written(OUT) > 0, process)
     for worker in workers_of(process):
         worker.kill()  # each share loses one
@@ -191,7 +189,7 @@ def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(line: str, 
         'extends = "small.toml"\nname = "deadly"\n[ads]\nmodel ='
         ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
     )
-    process = started("study", "deadly.toml", "--out", "out", "--jobs", "1", "--batch", "1")
+    process = started("study", "deadly.toml", "--out", "out", "--jobs", "1", batch=1)
     until(lambda: written(OUT) > 0, process)
     Path("now").touch()
     errors = ended(process, 2)
@@ -270,7 +268,7 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
         lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)),
         workers[0],
     )
-    process = started("study", "small.toml", "--cluster", address, "--out", "out", "--batch", "1")
+    process = started("study", "small.toml", "--cluster", address, "--out", "out", batch=1)
     until(lambda: written(OUT) > 0 and all(busy(one) for one in workers), process)
     assert process.poll() is None, "too late: the study is over"
     killed(workers[0])

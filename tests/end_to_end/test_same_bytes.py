@@ -20,7 +20,7 @@ from tests.end_to_end.conftest import solutions, study
 from tests.in_process import run
 
 QUESTIONS = {
-    "explain": "small.toml --limit 300 --top 1 --fits 0",
+    "explain": "small.toml --quick --top 1",
     "tolerance": "small.toml --characteristics mass,tireFric --fits 0 --attack 500",
     "risk": "small.toml --samples 300",
     "rules": "small.toml --samples 300",
@@ -40,7 +40,7 @@ def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command
 
 @pytest.mark.usefixtures("small", "worker_processes")
 def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> None:
-    study("--jobs", "2", "--batch", "7", "--out", "out")
+    study("--jobs", "2", "--out", "out")
     assert solutions("out") == solutions(whole)
 
 

@@ -52,8 +52,8 @@ QUESTIONS = {
     "risk tiny.toml --samples 300": f"{DEMANDED}.*left out",
     "risk results --samples 300": COUNTED,
     "rules tiny.toml --samples 300": COUNTED,
-    "explain tiny.toml --limit 500 --top 2 --fits 0": f"{CAUSE}.* {COUNTED}",
-    "explain results --limit 500 --top 2 --fits 0": CAUSE,
+    "explain tiny.toml --quick --top 2": f"{CAUSE}.* {COUNTED}",
+    "explain results --quick --top 2": CAUSE,
     "tables results": (
         rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}"
     ),
@@ -251,7 +251,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path
 
 @pytest.mark.slow
 def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() -> None:
-    ask = ("--ask", "explain --limit 500 --top 2 --fits 0", "--jobs", "1")
+    ask = ("--ask", "explain --quick --top 2", "--jobs", "1")
     run("report", "results", "--out", "page.html", *ask)
     page = Path("page.html").read_text()
     replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)

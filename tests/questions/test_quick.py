@@ -48,8 +48,8 @@ def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
 
 
 def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:
-    asked = ["tolerance", "explain --limit 30000", "risk"]
-    assert quick_questions(asked) == ["tolerance --quick", "explain --limit 30000 --quick", "risk"]
+    asked = ["tolerance", "explain --top 3", "risk"]
+    assert quick_questions(asked) == ["tolerance --quick", "explain --top 3 --quick", "risk"]
 
 
 @pytest.mark.slow
@@ -66,6 +66,6 @@ def test_on_a_terminal_the_rough_answer_comes_first(
     """Elsewhere nothing is computed twice."""
     for is_terminal in (False, True):
         monkeypatch.setattr(sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False)
-        answer = sv.explain("smoke", limit=2000, fits=0, progress=True)
+        answer = sv.explain("smoke", fits=0, progress=True)
         assert answer.numbers["rough"] is False
         assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal

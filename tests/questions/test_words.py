@@ -31,8 +31,8 @@ FEW = ("--characteristics", "tireFric,maxBrakeTorque", "--fits", "0")
 TYPED = (
     ("risk", "tiny.toml", "--samples", "256"),
     ("rules", "tiny.toml", "--samples", "512"),
-    ("explain", "tiny.toml", "--fits", "2", "--top", "2", "--limit", "500"),
-    ("explain", "results", "--fits", "2", "--top", "2", "--limit", "500"),
+    ("explain", "tiny.toml", "--fits", "2", "--top", "2"),
+    ("explain", "results", "--fits", "2", "--top", "2"),
     ("compare", "rain", "tiny.toml", "--samples", "64"),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW),
     ("tolerance", "tiny.toml", "--attack", "200", *FEW, "--limits", "tireFric >= 3"),
@@ -109,7 +109,7 @@ def test_half_of_the_originals_is_said_by_every_question(
     monkeypatch.chdir(tmp_path)
     assert load_cases(["results"])[0].unsafe.is_half
     for typed in (
-        ("explain", "results", "--fits", "0", "--limit", "200", "--top", "1"),
+        ("explain", "results", "--quick", "--top", "1"),
         ("risk", "results", "--samples", "64"),
         ("rules", "results", "--samples", "64"),
         ("tolerance", "results", "--attack", "50", *FEW),

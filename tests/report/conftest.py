@@ -15,7 +15,7 @@ from tests.questions.conftest import Plant
 
 ASK = (
     "tolerance --fits 0 --characteristics tireFric,mass",
-    "explain --limit 2000 --top 3 --fits 0",
+    "explain --quick --top 3",
     "risk --samples 400",
     "rules --samples 400",
 )

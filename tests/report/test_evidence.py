@@ -167,7 +167,7 @@ def verified(*arguments: str) -> list[str]:
 @pytest.mark.usefixtures("coarse")
 def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_path: Path) -> None:
     pack = tmp_path / "pack.zip"
-    ask = ("--ask", "explain --limit 500 --fits 0", "--ask", "risk --samples 300")
+    ask = ("--ask", "explain --quick", "--ask", "risk --samples 300")
     run("evidence", str(slippery), "--out", str(pack), *ask)
     _, files = read_pack(pack)
     assert {name.removeprefix("1-slippery/") for name in files} == {
@@ -237,27 +237,22 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     assert done.stdout.startswith("7 of 7 claims are the same")
 
 
-def test_a_pack_holds_a_list_of_cars_without_their_names_unless_it_is_told(
+def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("of_cars.py").write_text(OF_CARS)
-    list_of_cars = "plate;mass;driver\nM-XY 1;2100,5;Ada\nM-XY 2;2200;Bob\n"
-    Path("fleet.csv").write_text(list_of_cars)
+    Path("fleet.csv").write_text("plate;mass;driver\nM-XY 1;2100,5;Ada\nM-XY 2;2200;Bob\n")
     monkeypatch.syspath_prepend(str(in_tmp))
     ask = "of_cars:named --cars fleet.csv --ignore driver"
-    for options, told, packed in (
-        ((), "car 1, car 2", ["plate;mass;driver", "car 1;2100,5;", "car 2;2200;"]),
-        (("--with-names",), "M-XY 1, M-XY 2", list_of_cars.splitlines()),
-    ):
-        run("evidence", str(slippery), "--ask", ask, "--out", "it.zip", *options)
-        texts = texts_of(Path("it.zip"))
-        (answer,) = json.loads(texts["1-slippery/answers.json"])
-        assert answer["verdict"] == told
-        assert "--cars lists/1.csv --ignore driver" in answer["command"]
-        assert texts["1-slippery/lists/1.csv"].decode().replace('"', "").splitlines() == packed
-        named = [name for name, text in texts.items() if b"M-XY" in text or b"Ada" in text]
-        assert bool(named) == bool(options)
-        assert len(verified("it.zip", "--run-code")) == 7
+    run("evidence", str(slippery), "--ask", ask, "--out", "it.zip")
+    texts = texts_of(Path("it.zip"))
+    (answer,) = json.loads(texts["1-slippery/answers.json"])
+    assert answer["verdict"] == "car 1, car 2"
+    assert "--cars lists/1.csv --ignore driver" in answer["command"]
+    packed = texts["1-slippery/lists/1.csv"].decode().replace('"', "").splitlines()
+    assert packed == ["plate;mass;driver", "car 1;2100,5;", "car 2;2200;"]
+    assert not [name for name, text in texts.items() if b"M-XY" in text or b"Ada" in text]
+    assert len(verified("it.zip", "--run-code")) == 7
     named_elsewhere = changed(
         Path("it.zip"), Path("bad.zip"), DESCRIPTION, lambda text: text.replace("lists/1", "fleet")
     )

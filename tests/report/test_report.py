@@ -187,7 +187,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 @pytest.mark.parametrize(
     "text",
     [
-        "explain --top 1 --limit 200",
+        "explain --top 1 --quick",
         "tolerance --attack 0 --characteristics tireFric",
         "risk --samples 50",
         "rules --samples 50",

@@ -113,7 +113,7 @@ gap = { unit = "m", original = 50, lower = 35, upper = 55 }
     "typed",
     [
         "risk mine.toml --samples 64",
-        "explain mine.toml --fits 0 --limit 200 --top 1",
+        "explain mine.toml --quick --top 1",
         "tolerance mine.toml --fits 0 --attack 64 --characteristics brakeTorque",
         "repair mine.toml --fits 0 --promise brakeTorque>=0.9 --change margin",
     ],

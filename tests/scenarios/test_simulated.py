@@ -316,7 +316,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
 def test_questions_answer_about_a_simulator(wall: Path, model: str) -> None:
     """Failures are explained without reference drivers, and limits are those of the formula."""
     wall.write_text(STUDY.replace("models:Wall", f"models:{model}"))
-    found = json_of("explain", "wall.toml", "--limit", "500")
+    found = json_of("explain", "wall.toml", "--quick")
     assert found["numbers"]["collisions"] is None
     assert not found["tables"]["drivers"]["rows"]
     causes = [row["boundary"] for row in found["tables"]["causes"]["rows"]]

@@ -296,7 +296,7 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     None
 ):
     study = planted()
-    answer = explain.compute(study, Evaluator(study, InlinePool()), fits=0, limit=200, top=2)
+    answer = explain.compute(study, Evaluator(study, InlinePool()), quick=True, top=2)
     for cause in answer.tables["causes"].to_dict("records"):
         assert [*cause["changes"]] == ["brakes"]
         speed = cause["encounter"]["speed"] * KMH

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Count, Criterion, Range, question
+from safevar_sumo.questions.ask import Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
@@ -68,8 +68,10 @@ if TYPE_CHECKING:
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 NO_COLLISION_NUMBERS: JsonObject = dict.fromkeys(COLLISION_NUMBERS)
-QUICK_LIMIT = 4_000
-"""Approximate number of simulations for minimal causes in a rough answer."""
+LIMIT, QUICK_LIMIT = 40_000, 4_000
+"""Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
+if all would take more, a random sample is analysed.
+"""
 FOR_ONE = 800
 """Settings for each failure that is explained, where few simulations are allowed."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
@@ -105,7 +107,6 @@ def explain(
     solution: tuple[str, ...] = (),
     unsafe: Criterion = None,
     top: Annotated[int, Range(1, 1000)] = 8,
-    limit: Count = 40_000,
     fits: Annotated[int, Range(0, 1000)] = 20,
     quick: bool = False,
 ) -> Answer:
@@ -123,17 +124,15 @@ def explain(
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     top
         Largest number of failures that are explained.
-    limit
-        Approximate number of simulations for the minimal causes of all failures; if all would take
-        more, a random sample is analysed.
     fits
         Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
         checked again; 0 leaves this out.
     quick
         A rough answer: the study's own parameter set alone, and causes of few failures.
     """
+    limit = LIMIT
     if quick:
-        fits, limit = 0, min(limit, QUICK_LIMIT)
+        fits, limit = 0, QUICK_LIMIT
     study = evaluator.study
     settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
     evaluator.plan({TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)} | LATER)

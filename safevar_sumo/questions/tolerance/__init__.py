@@ -58,7 +58,6 @@ def tolerance(
     fits: Annotated[int | None, Range(0, 1000)] = None,
     attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     up_to: Annotated[str | None, "NAME=V"] = None,
-    by: Annotated[str | None, "NAME=V1,V2,..."] = None,
     at_tests: bool = False,
     quick: bool = False,
 ) -> Answer:
@@ -93,8 +92,6 @@ def tolerance(
     up_to
         Limits that hold up to a value of a searched parameter or of an axis of the matrix, such as
         speed=40: encounters with a larger value do not count.
-    by
-        Has ended: ask `permit STUDY`, or for limits up to one value by `up_to`.
     at_tests
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.
@@ -102,9 +99,6 @@ def tolerance(
         A rough answer: the study's own parameter set, and the shortest search for counterexamples.
         No limit is called kept, and with limits the exit code is 3.
     """
-    if by is not None:
-        legal = "permit STUDY: how fast a car may drive; or --up-to speed=V: joint limits up to V"
-        raise InputError("by", f"{by!r}: tolerance --by has ended", legal)
     whole = evaluator
     if up_to is not None:
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
