@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from difflib import get_close_matches
-from numbers import Integral
 from os import PathLike
 from typing import Any
 
@@ -153,12 +152,6 @@ def unknown_name(
     return InputError(
         source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}"
     )
-
-
-def check_whole(option: str, value: object, highest: int) -> None:
-    """Refuse what is no whole number from 1 to `highest`; raises an InputError."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= highest:
-        raise InputError(option, repr(value), f"a whole number from 1 to {highest:,}")
 
 
 def check_text(argument: str, value: Any) -> Any:

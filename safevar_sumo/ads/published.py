@@ -279,8 +279,13 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         )
         is_braking = self._decide_to_brake(seen, gap, lateral, memory.is_braking)
         is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
+        low, middle, high = self.throttle
+        level = seen.speed / SPEED_LEVEL
+        above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
         throttle = np.where(
-            is_braking | is_waiting | (seen.speed > SPEED_LIMIT), 0.0, self._throttle(seen.speed)
+            is_braking | is_waiting | (seen.speed > SPEED_LIMIT),
+            0.0,
+            np.where(level < 1, low + (middle - low) * level, above_first_level),
         )
         command, *pending_commands = (
             *memory.pending_commands,
@@ -309,9 +314,3 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
         is_braking = is_seen & (starts_braking | was_braking)
         return is_braking
-
-    def _throttle(self, speed: FloatArray) -> FloatArray:
-        low, middle, high = self.throttle
-        level = speed / SPEED_LEVEL
-        above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
-        return np.where(level < 1, low + (middle - low) * level, above_first_level)

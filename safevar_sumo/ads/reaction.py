@@ -203,7 +203,11 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
         # Since when is the driver aware of it? It forgets a cause that no longer blocks the way.
         is_aware = is_endangered | (is_known & is_same & blocks)
-        new_time = _new_time(seen, memory, danger)
+        # The time for which a new danger has lasted [s]: that since `nearness` was 0 in this step.
+        before = np.where(seen.obstacle == memory.leader, memory.nearness, 0.0)
+        now = np.maximum(_nearness(seen, danger), LEAST_DIVISOR)
+        part_of_step = 1 / (1 - np.minimum(before, 0.0) / now)
+        new_time = np.maximum(np.minimum(danger.longest, memory.step * part_of_step), 0.0)
         known_time = np.where(is_known, memory.aware_time + memory.step, new_time)
         aware_time = np.where(is_aware, known_time, -1.0)
 
@@ -236,14 +240,6 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
 def _nearness(seen: Observation, danger: Danger) -> FloatArray:
     """The nearness of a danger for each vehicle, shape (N,), bounded below."""
     return np.maximum(danger.nearness, np.full_like(seen.gap, -LARGEST_GAP))
-
-
-def _new_time(seen: Observation, memory: Reaction, danger: Danger) -> FloatArray:
-    """The time for which a new danger has lasted [s]: that since `nearness` was 0 in this step."""
-    before = np.where(seen.obstacle == memory.leader, memory.nearness, 0.0)
-    now = np.maximum(_nearness(seen, danger), LEAST_DIVISOR)
-    part_of_step = 1 / (1 - np.minimum(before, 0.0) / now)
-    return np.maximum(np.minimum(danger.longest, memory.step * part_of_step), 0.0)
 
 
 def _decelerations(

@@ -359,7 +359,23 @@ def simulate_with_original(
     """
     characteristics = system.characteristics
     filtered_setting = characteristics.filter(requested)
-    pair = _drive_pair(system, filtered_setting if filtered else requested)
+
+    # Both drive at the setting's worst point, unless it is the original vehicle.
+    setting = filtered_setting if filtered else requested
+    original = characteristics.with_original_vehicle(setting)
+    settings = np.stack([original] if np.array_equal(original, setting) else [original, setting])
+    point = worst_point(system, setting)
+    at_point = system.at(point)
+    observations = list[Observation]()
+    runs = drive_all(
+        at_point,
+        settings,
+        Engine.LIBSUMO,
+        listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
+    )
+    pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
+
+    # With the values that the filter resets.
     values = zip(characteristics.names, requested.tolist(), filtered_setting.tolist(), strict=True)
     return Simulation(
         study=study,
@@ -374,21 +390,3 @@ def load_and_assemble(study: StudyLike) -> tuple[Study, System]:
     """Load a study and assemble its system."""
     loaded_study = read_study(study)
     return loaded_study, assemble(loaded_study)
-
-
-def _drive_pair(system: System, setting: FloatArray) -> Pair:
-    """Drive a setting, shape (n,), at its worst point beside the original vehicle, unless it is
-    that one.
-    """
-    original = system.characteristics.with_original_vehicle(setting)
-    settings = np.stack([original] if np.array_equal(original, setting) else [original, setting])
-    point = worst_point(system, setting)
-    at_point = system.at(point)
-    observations = list[Observation]()
-    runs = drive_all(
-        at_point,
-        settings,
-        Engine.LIBSUMO,
-        listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
-    )
-    return Pair(point, at_point, runs, score(at_point, settings, runs), observations)

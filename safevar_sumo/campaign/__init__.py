@@ -19,7 +19,6 @@ Questions ask the same pool for single batches.
 from safevar_sumo.campaign.campaign import Campaign as Campaign, run_campaign as run_campaign
 from safevar_sumo.campaign.runs import (
     RunKey as RunKey,
-    algorithm_of as algorithm_of,
     all_runs as all_runs,
     check_algorithms as check_algorithms,
 )

@@ -99,7 +99,16 @@ class Cache:
         """
         packed_study = msgspec.msgpack.encode(study)
         if packed_study not in self._keys:
-            self._keys[packed_study] = _key_of_study(study, use)
+            # The study and its files count as in the identity of results, and besides that where
+            # the files are, this package's own files, and the versions of Python and of all that
+            # is installed.
+            manifest = manifest_now(study, system_of(study), use.modules)
+            paths = [
+                os.path.abspath(file_by_name(name, study.origin.places))
+                for name in manifest["files"]
+            ]
+            parts = [identity_digest(manifest), paths, _environment()]
+            self._keys[packed_study] = sha256(msgspec.json.encode(parts)).digest()
         return self._keys[packed_study]
 
     def get(self, key: bytes) -> bytes | None:
@@ -318,18 +327,6 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
         )
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
         return None
-
-
-def _key_of_study(study: Study, use: Use) -> bytes:
-    """What the simulations of a study depend on besides their settings, as a digest.
-
-    The study and its files count as in the identity of results, and besides that where the files
-    are, this package's own files, and the versions of Python and of all that is installed.
-    """
-    manifest = manifest_now(study, system_of(study), use.modules)
-    paths = [os.path.abspath(file_by_name(name, study.origin.places)) for name in manifest["files"]]
-    parts = [identity_digest(manifest), paths, _environment()]
-    return sha256(msgspec.json.encode(parts)).digest()
 
 
 def _digest(key: bytes, content: bytes) -> bytes:

@@ -159,29 +159,24 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
             f"a batch cannot be computed: {str(error) or 'no memory is left'}"
         ) from None
     if len(rows) == 1:
-        return _failed_evaluation(task.study, rows, failure)
+        # A setting that SUMO cannot simulate has an evaluation, too; an error of user code has a
+        # command.
+        characteristics = CharacteristicSet.of(task.study)
+        setting = rows[:, : len(characteristics)]  # without the ADS's parameters
+        if isinstance(failure, UserCodeError):
+            command = reproduction_command(task.study, setting[0])
+            raise UserCodeError(
+                failure.source, f"{failure.problem}{REPRODUCED_BY}{command}", failure.legal
+            ) from None
+        reasons = {rows[0].tobytes(): " ".join(str(failure).split())}
+        changes = characteristics.change_objectives(setting)
+        return Evaluations.undefined(
+            rows, Outcome.SIMULATOR_ERROR, METRICS, reasons=reasons, **changes
+        )
     halves = [evaluate_settings(task, half) for half in np.array_split(rows, 2)]
     if isinstance(failure, UserCodeError):
         raise failure
     return Evaluations.concatenate(halves)
-
-
-def _failed_evaluation(
-    study: Study, row: FloatArray, failure: SimulationError | UserCodeError
-) -> Evaluations:
-    """The evaluation of a setting that SUMO cannot simulate; raises the error of user code, with a
-    command.
-    """
-    characteristics = CharacteristicSet.of(study)
-    setting = row[:, : len(characteristics)]  # without the ADS's parameters
-    if isinstance(failure, UserCodeError):
-        command = reproduction_command(study, setting[0])
-        raise UserCodeError(
-            failure.source, f"{failure.problem}{REPRODUCED_BY}{command}", failure.legal
-        ) from None
-    reasons = {row[0].tobytes(): " ".join(str(failure).split())}
-    changes = characteristics.change_objectives(setting)
-    return Evaluations.undefined(row, Outcome.SIMULATOR_ERROR, METRICS, reasons=reasons, **changes)
 
 
 def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:

@@ -33,11 +33,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     """
     files = files_of(study, system, used)
     identity = {"files": files, "results": RESULTS, "platform": PLATFORM}
-    return manifest_of(study, {**identity, "versions": _simulator_versions(study, system)})
-
-
-def _simulator_versions(study: Study, system: System) -> dict[str, str]:
-    """Versions of the user's simulators, and of the distributions that they name."""
+    # Versions of the user's simulators, and of the distributions that they name.
     versions = {}
     for scenario in (point.scenario for point in system.points):
         if not isinstance(scenario, Simulator):
@@ -52,7 +48,7 @@ def _simulator_versions(study: Study, system: System) -> dict[str, str]:
                 raise InputError(
                     study.source, problem, "names of installed distributions"
                 ) from None
-    return versions
+    return manifest_of(study, {**identity, "versions": versions})
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:

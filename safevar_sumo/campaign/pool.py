@@ -12,11 +12,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager, suppress
+from numbers import Integral
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar
 
 from safevar_sumo.campaign import cluster as dask, local
-from safevar_sumo.errors import MAX_JOBS, SafevarError, check_whole
+from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import Use
 from safevar_sumo.records import JsonObject
@@ -169,8 +170,10 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
         If `jobs` is no number of processes, the scheduler does not answer, or the extra `cluster`
         is not installed.
     """
-    if jobs is not None:
-        check_whole("jobs", jobs, MAX_JOBS)
+    if jobs is not None and (
+        isinstance(jobs, bool) or not isinstance(jobs, Integral) or not 1 <= int(jobs) <= MAX_JOBS
+    ):
+        raise InputError("jobs", repr(jobs), f"a whole number from 1 to {MAX_JOBS:,}")
     with ExitStack() as stack:
         if cluster is None:
             folder = stack.enter_context(temporary_folder())

@@ -174,8 +174,8 @@ def run_command_line() -> None:
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a
     limit is not kept) or 130 (interrupted).
     """
-    # Without its file and line.
-    # Warnings are lines; a signal to end is an interruption; a crash has its line.
+    # A warning is a line, without its place in the code; a signal to end is an interruption; a
+    # crash has its line.
     warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -143,7 +143,7 @@ class Lookup:
         target = member.target
         near = [base for base in bases if _has_some(target, base)]
         base = next(
-            (base for base in bases if _derives(target, base)),
+            (base for base in bases if inspect.isclass(target) and issubclass(target, base)),
             next(
                 (base for base in bases if not violation(target, base)),
                 near[0] if len(near) == 1 else bases[-1],
@@ -220,10 +220,6 @@ def _has_some(candidate: Any, base: type) -> bool:
     """Whether a class has a method that is abstract in a base."""
     abstract = (name for name, method in vars(base).items() if hasattr(method, ABSTRACT))
     return any(hasattr(candidate, name) for name in abstract)
-
-
-def _derives(candidate: Any, base: type) -> bool:
-    return inspect.isclass(candidate) and issubclass(candidate, base)
 
 
 def unload_user_modules() -> None:

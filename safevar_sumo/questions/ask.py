@@ -262,7 +262,12 @@ class Question:
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
         with keep_simulations(command, fresh=fresh):
-            is_long = self._is_long(values) and simulations is None
+            # A rough answer, which comes much earlier, may be shown before the answer.
+            is_long = (
+                self.has_rough_answer
+                and not any(values.get(name) for name in (QUICK, "out"))
+                and simulations is None
+            )
             if is_long and progress is True and sys.stderr.isatty():
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
@@ -272,10 +277,6 @@ class Question:
             called = _name(source)
             answer = self.answer(subjects, values, **how, progress=progress, called=called)
         return replace(answer, command=command)
-
-    def _is_long(self, values: JsonObject) -> bool:
-        """Whether a rough answer, which comes much earlier, may be shown before the answer."""
-        return self.has_rough_answer and not any(values.get(name) for name in (QUICK, "out"))
 
     def answer(
         self,

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.questions.answer import Answer, Column
-from safevar_sumo.questions.research_questions.statistics import compare_samples, signed_rank_test
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.questions.answer import Answer, Column, Columns
+from safevar_sumo.records import BoolArray, Evaluations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,9 +21,9 @@ UNSAFE_IN = {"a": "only_a_unsafe", "b": "only_b_unsafe", "both": "both", "neithe
 """In which systems a setting is unsafe, as the table says it, and the number that counts such
 settings.
 """
-SETTING_COLUMNS = {
-    "solution": Column("", "handle of the solution"),
-    "unsafe_in": Column("", f"systems in which the setting is unsafe: {', '.join(UNSAFE_IN)}"),
+SETTING_COLUMNS: Columns = {
+    "solution": "handle of the solution",
+    "unsafe_in": f"systems in which the setting is unsafe: {', '.join(UNSAFE_IN)}",
     **{
         f"{side}_{name}": column
         for side in SIDES
@@ -62,13 +61,6 @@ def counts_of(settings: pd.DataFrame) -> dict[str, int]:
     return {
         number: int((settings["unsafe_in"] == where).sum()) for where, number in UNSAFE_IN.items()
     }
-
-
-def paired_test(a: FloatArray, b: FloatArray) -> tuple[float, float]:
-    """The p-value of the signed-rank test of pairs, and the probability that A's value is greater
-    (Vargha and Delaney's A12), above 0.5 where A is better; NaN without pairs.
-    """
-    return signed_rank_test(a, b).p_value, compare_samples(a, b).effect_size
 
 
 def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:

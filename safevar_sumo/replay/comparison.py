@@ -213,12 +213,20 @@ def comparison_of(simulation: Simulation) -> Comparison:
         *METRICS,
         RATING_POINTS.name,
     }
+
+    # The pedals of the sample before an impact also at the impact, where a command has no effect
+    # any more.
+    trace = pair.runs.trace
+    pedals = np.stack([trace.throttle, trace.brake])
+    for row in np.flatnonzero(~np.isnan(pair.runs.collision_speed)).tolist():
+        end = int(np.flatnonzero(trace.active[:, row])[-1])
+        pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
     return Comparison(
         title=f"{title} ({pair.point.name})" if pair.point.name else title,
         system=pair.system,
         point=pair.point,
         evaluations=pair.evaluations,
-        runs=_hold_pedals_at_impact(pair.runs),
+        runs=replace(pair.runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1])),
         # The points of a rating belong to all cells together.
         objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
     )
@@ -241,18 +249,6 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
                 DrawnLane(kind or ("path" if for_persons else "road"), np.array(line), width)
             )
     return tuple(lanes)
-
-
-def _hold_pedals_at_impact(runs: SimulationRuns) -> SimulationRuns:
-    """Runs with the pedals of the sample before an impact also at the impact, where a command has
-    no effect any more.
-    """
-    trace = runs.trace
-    pedals = np.stack([trace.throttle, trace.brake])
-    for row in np.flatnonzero(~np.isnan(runs.collision_speed)).tolist():
-        end = int(np.flatnonzero(trace.active[:, row])[-1])
-        pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
-    return replace(runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1]))
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:

@@ -260,7 +260,7 @@ def make_page(
         shared=list(_sections("all", shared)),
         commands=[*of_studies, *of_shared],
         player=player_files(),
-        css=_web_file("report.css"),
+        css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
     return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
 
@@ -326,7 +326,3 @@ def _picture(figure: Figure) -> JsonObject:
         "alt": words.replace("\n", " "),
         "source": "data:image/svg+xml," + quote(svg, safe=" =:/;,()'!?@&+$*"),
     }
-
-
-def _web_file(name: str) -> Markup:
-    return Markup((TEMPLATE_FOLDER / name).read_text(encoding="utf-8"))

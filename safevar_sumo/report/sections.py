@@ -21,7 +21,7 @@ import pandas as pd
 from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import warn
-from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.model_spread import compute_model_spreads
@@ -73,27 +73,27 @@ GENERAL_LIMITS = (
         " says how far the models agree with them."
     ),
 )
-CHARACTERISTICS = {
-    "characteristic": Column("", "characteristic of the vehicle, or of its encounter"),
-    "unit": Column("", "unit of its values"),
+CHARACTERISTICS: Columns = {
+    "characteristic": "characteristic of the vehicle, or of its encounter",
+    "unit": "unit of its values",
     "original": Column("as in column unit", "value of the original vehicle"),
     "lowest": Column("as in column unit", "lower end of its domain"),
     "highest": Column("as in column unit", "upper end of its domain"),
     "threshold": Column("as in column unit", "a change smaller than this is undone"),
-    "meaning": Column("", "what it is"),
+    "meaning": "what it is",
 }
-AGREEMENT = {
-    "file": Column("", "published data"),
-    "rows": Column("", "vehicles"),
+AGREEMENT: Columns = {
+    "file": "published data",
+    "rows": "vehicles",
     "spearman": Column("-", "Spearman's rank correlation of the safety degrees", ".2f"),
     "mean_absolute_error": Column("m", "mean of |here - published| safety degrees", ".2f"),
     "bias": Column("m", "mean of here - published safety degrees", ".2f"),
-    "collisions_here": Column("", "vehicles that collide here"),
-    "collisions_reference": Column("", "vehicles that collide in the published data"),
-    "collisions_both": Column("", "vehicles that collide in both"),
+    "collisions_here": "vehicles that collide here",
+    "collisions_reference": "vehicles that collide in the published data",
+    "collisions_both": "vehicles that collide in both",
 }
-SPREAD = {
-    "vehicle": Column("", "the original, or a solution"),
+SPREAD: Columns = {
+    "vehicle": "the original, or a solution",
     **with_interval(
         SAFETY_DEGREE,
         Column(
@@ -102,15 +102,13 @@ SPREAD = {
             ".2f",
         ),
     ),
-    "sets": Column(
-        "", "parameter sets of the vehicle model that agree with published data about as well"
-    ),
-    "collisions": Column("", "parameter sets in which it collides"),
+    "sets": "parameter sets of the vehicle model that agree with published data about as well",
+    "collisions": "parameter sets in which it collides",
 }
-PUBLISHED = {
-    "metric": Column("", "safety metric of the original vehicle"),
-    "published": Column("", "its published value"),
-    "here": Column("", "its value here"),
+PUBLISHED: Columns = {
+    "metric": "safety metric of the original vehicle",
+    "published": "its published value",
+    "here": "its value here",
     "difference": Column("%", "here minus published, in per cent of the published value", ".1f"),
 }
 
@@ -222,9 +220,7 @@ def tested(study: ReportedStudy) -> Answer:
 
 
 def _remarks(texts: Sequence[str]) -> pd.DataFrame:
-    return tabulate(
-        "Remarks", {"remark": Column("", "what to bear in mind")}, [(text,) for text in texts]
-    )
+    return tabulate("Remarks", {"remark": "what to bear in mind"}, [(text,) for text in texts])
 
 
 def _conditions(study: ReportedStudy) -> str:

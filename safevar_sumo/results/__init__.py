@@ -18,7 +18,6 @@ from safevar_sumo.results.load import (
     FailedSetting as FailedSetting,
     SolutionId as SolutionId,
     choose_handle as choose_handle,
-    failed_settings as failed_settings,
     failure_lines as failure_lines,
     handles_of as handles_of,
     load_runs as load_runs,

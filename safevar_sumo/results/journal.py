@@ -133,8 +133,22 @@ class Journal:
             raise
 
     def append(self, positions: Sequence[int], evaluations: Evaluations) -> None:
-        """Add a batch."""
-        self._add(_batch_line(positions, evaluations, self._characteristics))
+        """Add a batch of evaluations, as a table."""
+        line = {
+            POSITION: list(positions),
+            OUTCOME: evaluations.outcome.tolist(),
+            **dict(zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)),
+            **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
+            **{name: values.tolist() for name, values in evaluations.metrics.items()},
+        }
+        if evaluations.worst_points is not None:
+            line[POINT] = evaluations.worst_points.tolist()
+        if evaluations.reasons:
+            reasons = [
+                evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings
+            ]
+            line |= {REASON: reasons} if any(reasons) else {}
+        self._add(line)
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
         """Add the result, the positions of the solutions and the allowed number of evaluations;
@@ -299,25 +313,6 @@ def _decoded(text: bytes) -> JsonObject:
         return msgspec.json.decode(text, type=JsonObject) if text.endswith(b"\n") else {}
     except msgspec.DecodeError:
         return {}
-
-
-def _batch_line(
-    positions: Sequence[int], evaluations: Evaluations, characteristics: Iterable[str]
-) -> JsonObject:
-    """A batch of evaluations as a table."""
-    line = {
-        POSITION: list(positions),
-        OUTCOME: evaluations.outcome.tolist(),
-        **dict(zip(characteristics, evaluations.settings.T.tolist(), strict=True)),
-        **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
-        **{name: values.tolist() for name, values in evaluations.metrics.items()},
-    }
-    if evaluations.worst_points is not None:
-        line[POINT] = evaluations.worst_points.tolist()
-    if evaluations.reasons:
-        reasons = [evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings]
-        line |= {REASON: reasons} if any(reasons) else {}
-    return line
 
 
 def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:

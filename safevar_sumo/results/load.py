@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.results.store import (
@@ -39,14 +39,6 @@ class FailedSetting(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.algorithm}:{self.run}, evaluation {self.position}: {self.reason}"
-
-
-def failed_settings(
-    key: tuple[str, int], positions: Sequence[int], evaluations: Evaluations
-) -> list[FailedSetting]:
-    """The settings of a run that could not be simulated."""
-    rows = np.flatnonzero(evaluations.failed).tolist()
-    return [FailedSetting(*key, positions[row], evaluations.reason(row)) for row in rows]
 
 
 def failure_lines(failures: Sequence[FailedSetting]) -> list[str]:
@@ -117,7 +109,9 @@ def load_runs(directory: str | Path) -> StoredResults:
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append((key, evaluations))
         all_positions += positions
-        failures += failed_settings(key, positions, evaluations)
+        # The settings of a run that could not be simulated.
+        rows = np.flatnonzero(evaluations.failed).tolist()
+        failures += [FailedSetting(*key, positions[row], evaluations.reason(row)) for row in rows]
         if budget in content.results:
             solutions_of_runs.append((key, content.take_positions(content.results[budget])))
 

@@ -157,17 +157,14 @@ def _intended_type(kind: Any, value: Any) -> Any:
     kinds = [
         member
         for member in get_args(kind)
-        if member is not NoneType and _is_table(member) == isinstance(value, dict)
+        if member is not NoneType
+        and (_is_record(member) or get_origin(member) is dict) == isinstance(value, dict)
     ]
     for record in filter(_is_record, kinds):
         config = record.__struct_config__
         if value.get(config.tag_field or "") == config.tag:
             return record
     return next(iter(kinds), kind)
-
-
-def _is_table(kind: Any) -> bool:
-    return _is_record(kind) or get_origin(kind) is dict
 
 
 def _is_record(kind: Any) -> bool:

@@ -18,7 +18,7 @@ import pandas as pd
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
@@ -56,10 +56,13 @@ from safevar_sumo.questions.pairs import (
     UNSAFE_IN,
     counts_of,
     draw_pairs,
-    paired_test,
     table_of_pairs,
 )
-from safevar_sumo.questions.research_questions.statistics import fewest_runs
+from safevar_sumo.questions.research_questions.statistics import (
+    compare_samples,
+    fewest_runs,
+    signed_rank_test,
+)
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
 from safevar_sumo.questions.words import counted_in_words, join_phrases
@@ -69,8 +72,8 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
 RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
 MAX_REASONS = 3
 """Largest number of differences that the verdict names."""
-PAIR_COLUMNS = {
-    "pair": Column("", "run, with its solutions in both systems, or line of sampled settings"),
+PAIR_COLUMNS: Columns = {
+    "pair": "run, with its solutions in both systems, or line of sampled settings",
     "a": Column("", "mean in A", ".2f"),
     "b": Column("", "mean in B", ".2f"),
 }
@@ -345,7 +348,10 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
             pairs = means
             names = [f"{name}-{int(run):02d} of {side.upper()}" for side, name, run in pairs.index]
             unit = "runs"
-    p, a12 = paired_test(*pairs.to_numpy(dtype=float).T)
+    # The p-value of pairs, and the probability that A's value is greater: above 0.5 A is better.
+    sides = pairs.to_numpy(dtype=float).T
+    p = signed_rank_test(*sides).p_value
+    a12 = compare_samples(*sides).effect_size
     quantity = "rating" if are_rated else "safety degree"
     rows = pairs.reset_index(drop=True).assign(pair=names)
     table = tabulate(f"Pairs that are tested: mean {quantity}", PAIR_COLUMNS, rows)

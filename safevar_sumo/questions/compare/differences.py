@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Column, tabulate, with_interval
+from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.counterexamples import where_in_words
@@ -30,16 +30,16 @@ from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
 
-LIMIT_COLUMNS = {
-    "characteristic": Column("", "characteristic of the vehicle"),
-    "unit": Column("", "its unit"),
+LIMIT_COLUMNS: Columns = {
+    "characteristic": "characteristic of the vehicle",
+    "unit": "its unit",
     **with_interval(
         "a", Column("", "value of A's original vehicle; the interval is safe alone in A", ".10g")
     ),
     **with_interval(
         "b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")
     ),
-    "change": Column("", "how the interval changes from A to B: grown, shrunk, both, or the same"),
+    "change": "how the interval changes from A to B: grown, shrunk, both, or the same",
 }
 SUMMARY_COLUMNS = {
     "what": Column("", "what is compared"),

@@ -26,7 +26,7 @@ from safevar_sumo.metrics import F_SAFE, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
@@ -57,11 +57,11 @@ CAUSES_OF = 4
 """Number of failures of full braking whose causes are told."""
 SHOWN_LIMITS = 3
 """Number of limits of full braking that the verdict names."""
-REPAIRS = {
+REPAIRS: Columns = {
     "parameters": Column(
         "", "the parameters that change, with their new values", ".10g", is_shown=False
     ),
-    "change": Column("", "what changes, in words"),
+    "change": "what changes, in words",
     "changed": Column("-", "number of parameters that change", is_shown=False),
     "fits": Column(
         "-", "number of parameter sets of the vehicle model in which it holds", is_shown=False
