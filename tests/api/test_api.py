@@ -16,10 +16,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.study import tables_of
-from safevar_sumo.sumo.matrix import at_point, simulate_all_points, worst_points
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.made_up import original_of
 
 
 @pytest.fixture(scope="module")
@@ -115,15 +112,6 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
     frame = sv.evaluate("sun", asked, jobs=1)
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
-
-
-def test_a_simulation_is_shown_beside_the_original() -> None:
-    comparison = sv.comparison_of(sv.simulate("sun", {"tireFric": 1.2}))
-    assert comparison.changes == ["tireFric 3.5 -> 1.20 (-65.7 %)"]
-    assert (
-        comparison.evaluations.f_safe.tolist()
-        == sv.evaluate("sun", [{}, {"tireFric": 1.2}], jobs=1)["f_safe"].tolist()
-    )
 
 
 def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() -> None:
@@ -259,17 +247,6 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     )
     done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["begun", "True"]
-
-
-@pytest.mark.slow
-def test_the_trace_in_a_matrix_is_that_of_the_worst_point() -> None:
-    study = load_study("euro_ncap_pedestrian")
-    system = assemble(study)
-    points = simulate_all_points(system, original_of(system))
-    worst = points[worst_points(system, [point.evaluations for point in points])[0]].point.name
-    assert worst != points[-1].point.name  # the last one that is driven
-    alone = sv.simulate(at_point(study, worst)).trace
-    pd.testing.assert_frame_equal(sv.simulate(study).trace, alone)
 
 
 @pytest.mark.slow

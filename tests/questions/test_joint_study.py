@@ -250,7 +250,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path
 
 
 @pytest.mark.slow
-def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() -> None:
+def test_the_page_replays_causes_in_their_encounters() -> None:
     ask = ("--ask", "explain --quick --top 2", "--jobs", "1")
     run("report", "results", "--out", "page.html", *ask)
     page = Path("page.html").read_text()
@@ -258,5 +258,3 @@ def test_the_page_replays_causes_in_their_encounters_and_evidence_is_verified() 
     assert replays
     assert all("in its encounter: collides" in one for one in replays), replays
     assert "Each vehicle drives in its own encounter (distance)" in page
-    run("evidence", "results", "--out", "pack.zip", *ask)
-    assert json_of("verify", "pack.zip")["numbers"]["differs"] == 0

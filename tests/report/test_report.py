@@ -183,24 +183,6 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
     assert Outline(other).open == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "text",
-    [
-        "explain --top 1 --quick",
-        "tolerance --attack 0 --characteristics tireFric",
-        "risk --samples 50",
-        "rules --samples 50",
-    ],
-)
-def test_every_question_may_be_asked_first_alone_and_twice(text: str, slippery: Path) -> None:
-    """`explain` tells fits, but not of limits."""
-    question, values = parse_question(text)
-    first = question(str(slippery), **values, jobs=1).verdict.partition(". ")[0]
-    for ask in ([text], [text, text]):
-        assert first in words_of(page_of(slippery, ask=ask, jobs=1))
-
-
 @pytest.mark.parametrize(
     "text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"]
 )

@@ -8,11 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions import evaluator
-from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_for_sumo
@@ -94,45 +91,6 @@ def test_a_matrix_runs_over_them(in_tmp: Path) -> None:
     study = load_study("wear", matrix={"tests": [test]}, scenario={"model": "own:Mine"})
     names = [point.name for point in assemble(study).points]
     assert names == ["scooter, gap 40, scooter 10.0, wet", "scooter, gap 50, scooter 10.0, wet"]
-
-
-STUDY = """
-extends = "wear"
-name = "mine"
-title = "A scooter"
-[scenario]
-model = "own:Mine"
-[scenario.search]
-scooter = { unit = "km/h", original = 15, lower = 8, upper = 25 }
-gap = { unit = "m", original = 50, lower = 35, upper = 55 }
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "typed",
-    [
-        "risk mine.toml --samples 64",
-        "explain mine.toml --quick --top 1",
-        "tolerance mine.toml --fits 0 --attack 64 --characteristics brakeTorque",
-        "repair mine.toml --fits 0 --promise brakeTorque>=0.9 --change margin",
-    ],
-)
-def test_questions_answer_about_encounters_with_a_users_class(
-    typed: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They draw encounters, too: the parameters of the class stand beside the vehicle's
-    characteristics.
-    """
-    monkeypatch.setattr(scans, "SCAN_VALUES", 5)
-    monkeypatch.setattr(evaluator, "ENCOUNTERS", 4)
-    monkeypatch.setattr(evaluator, "CANDIDATES", 64)
-    (in_tmp / "own.py").write_text(MINE)
-    (in_tmp / "mine.toml").write_text(STUDY)
-    answer = json_of(*typed.split())
-    assert answer["numbers"]["driven"]
-    assert "scooter" in str(answer["tables"]) + answer["verdict"]
-    assert "gap" in str(answer["tables"]) + answer["verdict"]
 
 
 TRAFFIC = """

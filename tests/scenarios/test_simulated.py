@@ -127,6 +127,12 @@ def system_of(study: Path, **changes: object) -> System:
     return assemble(sv.load_study(str(study), **changes))
 
 
+def wrong_system(study: Path, change: str, **changes: object) -> System:
+    """The system of a simulator whose results are changed."""
+    (study.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
+    return system_of(study, scenario={"model": "models:Wrong"}, **changes)
+
+
 def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
     system = system_of(wall)
     found = drive_and_score(system, np.array([[8.0, 0.0], [3.0, 1.0]]))
@@ -145,8 +151,7 @@ def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
 
 def test_metrics_that_a_trace_does_not_define_are_undefined(wall: Path) -> None:
     change = "lambda r: {k: r[k] for k in ('time', 'speed', 'separation', 'outcome')}"
-    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
-    system = system_of(wall, scenario={"model": "models:Wrong"})
+    system = wrong_system(wall, change)
     found = drive_and_score(system, np.array([[8.0, 0.0]]))
     assert np.isnan([found.metrics[name][0] for name in METRICS if name != "safety_degree"]).all()
     assert found.f_safe[0] > 0
@@ -222,9 +227,7 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     ],
 )
 def test_a_wrong_result_is_refused_with_its_reason(wall: Path, change: str, told: str) -> None:
-    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
-    changes = {"scenario": {"model": "models:Wrong"}, "search": {"time_limit": 0.5}}
-    system = system_of(wall, **changes)
+    system = wrong_system(wall, change, search={"time_limit": 0.5})
     with pytest.raises(UserCodeError) as error:
         drive_and_score(system, np.array([[8.0, 0.0]]))
     assert told in f"{error.value}"
@@ -264,8 +267,7 @@ def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
 
 def test_runs_of_one_batch_have_one_time_step(wall: Path) -> None:
     change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
-    (wall.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
-    system = system_of(wall, scenario={"model": "models:Wrong"})
+    system = wrong_system(wall, change)
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
         simulators.simulate_each(system, np.array([[9.0, 0.0], [4.0, 0.5]]))
 
@@ -312,10 +314,8 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["Wall", "Rig"])
-def test_questions_answer_about_a_simulator(wall: Path, model: str) -> None:
-    """Failures are explained without reference drivers, and limits are those of the formula."""
-    wall.write_text(STUDY.replace("models:Wall", f"models:{model}"))
+def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(wall: Path) -> None:
+    """Failures are explained without reference drivers."""
     found = json_of("explain", "wall.toml", "--quick")
     assert found["numbers"]["collisions"] is None
     assert not found["tables"]["drivers"]["rows"]
@@ -323,8 +323,6 @@ def test_questions_answer_about_a_simulator(wall: Path, model: str) -> None:
     alone = [row["decel"] for row in causes if [*row] == ["decel"]]
     assert alone
     assert all(value == pytest.approx(225 / 2 / 32.5, abs=0.1) for value in alone)
-    limits = json_of("tolerance", "wall.toml", "--quick")
-    assert limits["tables"]["limits"]["rows"]
     assert "weather" not in run("tolerance", "wall.toml", "--quick").stdout
 
 

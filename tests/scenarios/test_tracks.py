@@ -5,7 +5,6 @@ by hand.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import verify_everywhere
 from tests.made_up import original_of
 from tests.scenarios.holding import Hold, driven
 
@@ -171,39 +169,6 @@ def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
     )
     depth = float(find_overlaps(own, other)[0])
     assert (depth > 1e-9) == (distance == 0) or abs(depth) < 1e-6
-
-
-OWN = '''
-import msgspec
-from safevar_sumo.scenarios import Track, travelled
-
-
-class CutIn(msgspec.Struct, frozen=True, kw_only=True):
-    """A car moves over from the next lane."""
-
-    speed: float = 80.0
-    gap: float = 15.0
-    duration: float = 12.0
-
-    def tracks(self, times):
-        y = 3.5 - times.clip(1.0, 4.5) + 1.0
-        vy = -1.0 * ((times >= 1.0) & (times < 4.5))
-        x = self.gap + 2.0115 + (self.speed - 60.0) / 3.6 + travelled(60.0 / 3.6, times)
-        return [Track.of("car", "car", x, y, 60.0 / 3.6, vy)]
-'''
-
-
-@pytest.mark.parametrize("gap", [6.0, 15.0])
-def test_a_users_cut_in_is_the_same_in_sumo(gap: float, in_tmp: Path) -> None:
-    """He crosses lanes and turns into his course; the user's class derives from nothing of ours."""
-    Path("cut.py").write_text(OWN)
-    scenario = {"model": "cut:CutIn", "parameters": {"gap": gap}}
-    system = assemble(load_study("wear", matrix=None, scenario=scenario))
-    vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
-    run = drive_worst(system, vehicles)
-    verify_everywhere(system, vehicles)
-    assert run.trace.gap[20] == pytest.approx(gap, abs=0.5), "when it begins to move over"
-    assert set(run.outcome) <= {"collision", "passed", "timeout", "stopped"}
 
 
 def test_distances_travelled_are_sums_of_trapezes() -> None:

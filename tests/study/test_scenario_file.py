@@ -126,7 +126,6 @@ def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None
     slower = study.scenario.search["slower_kmh"]
     assert (gap.lower, gap.upper, gap.original) == (5, 45, 20)
     assert (slower.lower, slower.upper, slower.original, slower.unit) == (10, 25, 25, "km/h")
-    assert study.matrix is not None
     assert len(study.matrix.tests) == 5 * 2
     names = {point.name for point in assemble(study).points}
     assert "cut_in_logical, sideways_mps 0.5, side 1, body lorry, wet" in names
@@ -219,37 +218,22 @@ def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path:
     write(tmp_path, car=(teleport(at(-2, 100)), speed("$v")), parameters=PARAMETER)
     with pytest.warns(match=r"1 of 3 combinations .* the first is v = -5: Car drives backwards"):
         study = study_of(logical(tmp_path, 5, -5, 10))
-    assert study.matrix is not None
     assert [test.over for test in study.matrix.tests] == [{"v": [5]}, {"v": [10]}]
 
 
-VALUES = 'file = "files/cut_in_logical.xosc"\nvalues = { ego_kmh = 80, sideways_mps = 1.5, '
+SEARCHED = """
+file = "files/cut_in_logical.xosc"
+values = { ego_kmh = 80, sideways_mps = 1.5, body = "hatchback", side = -1 }
+search = { gap_m = {}, slower_kmh = { upper = 25 } }
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("coarse")
-@pytest.mark.parametrize(
-    "tables",
-    [
-        'file = "files/cut_in.xosc"\nvalues = { gap_m = 12 }\n',
-        f"{VALUES}slower_kmh = 20, gap_m = 8 }}\n",
-        f'{VALUES}body = "hatchback", side = -1 }}\nsearch = {{ gap_m = {{}}, slower_kmh = {{ upper = 25 }} }}\n',
-    ],
-    ids=["concrete", "matrix", "search"],
-)
-def test_questions_take_results_of_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tables: str
-) -> None:
-    """Compared with itself nothing differs; a pack of it has all files, and every claim is the
-    same.
-    """
-    monkeypatch.chdir(tmp_path)
+def test_a_pack_of_a_search_over_a_file_has_all_files(in_tmp: Path) -> None:
     copytree(FILES, "files")
-    Path("scene.toml").write_text(f'extends = "wear"\n[scenario]\n{tables}')
+    Path("scene.toml").write_text(f'extends = "wear"\n[scenario]\n{SEARCHED}')
     budget = ["--runs", "1", "--evaluations", "50", "--algorithms", "rs", "--jobs", "1"]
     run("study", "scene.toml", *budget, "--out", "results")
-    compared = json_of("compare", "results", "scene.toml", "--samples", "20", "--jobs", "1")
-    assert (compared["numbers"]["only_a_unsafe"], compared["numbers"]["only_b_unsafe"]) == (0, 0)
     run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 50", "--jobs", "1")
     with zipfile.ZipFile("pack.zip") as pack:
         names = {Path(name).name for name in pack.namelist()}
