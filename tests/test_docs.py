@@ -31,7 +31,7 @@ from safevar_sumo.study import (
 )
 from safevar_sumo.vehicles import VEHICLES
 from tests.manual import PROGRAM, ROOT, blocks
-from tests.pages import PAGES, run_page, shortened
+from tests.pages import PAGES, run_page
 
 
 @pytest.mark.slow
@@ -39,21 +39,6 @@ from tests.pages import PAGES, run_page, shortened
 def test_every_block_of_a_page_does_and_shows_what_it_says(page: str, in_tmp: Path) -> None:
     for block, output in run_page(page, options_of_tests=True):
         assert block.text == output, f"{page}: `make docs-outputs` fills it in"
-
-
-def test_a_page_shows_parts_of_an_output() -> None:
-    table = ["Limits", "┏━┓", "┃a┃", "┡━┩", "│1│", "│2│", "└─┘"]
-    output = "\n".join(["All hold.", "Next: go", *table, "Remarks", "one: two", ""])
-    assert shortened(output, "output: verdict") == "All hold.\nNext: go\n"
-    assert shortened(output, "output: Limits: 1") == "Limits\n┏━┓\n┃a┃\n┡━┩\n│1│\n...\n"
-    second = output.replace("Remarks", "\n".join([*table[1:], "Remarks"]))
-    assert shortened(second, "output: Limits") == "\n".join([*table, *table[1:], ""])
-    assert shortened(output, "output: one; Lim") == "\n".join(["one: two", *table, ""])
-    assert shortened(output, "output") == output
-    line = f"{'word ' * 16}word\n"
-    assert shortened("word " * 40, "output") == f"{line}{line}{'word ' * 5}word\n"
-    with pytest.raises(LookupError, match="no part begins with 'Causes'"):
-        shortened(output, "output: Causes")
 
 
 def test_lines_of_prose_have_at_most_100_characters() -> None:
@@ -67,8 +52,6 @@ def test_lines_of_prose_have_at_most_100_characters() -> None:
 def script_of_docs(name: str) -> Any:
     """A script beside the pages, as a module."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -419,10 +419,8 @@ def test_a_stop_is_that_of_a_constant_deceleration_after_a_delay() -> None:
     assert all(np.isnan(value(name, half)) for name in STOPS)
 
 
-def test_the_law_allows_70_m_from_100_km_h_and_a_stricter_mean_deceleration() -> None:
-    """0.1 v + 0.006 v^2; a car that just keeps 6.43 m/s^2 stops in 60 m and its delay's way."""
-    assert pytest.approx(70.0) == 0.1 * 100 + 0.006 * 100**2
-    assert pytest.approx(60.0, abs=0.05) == (100 / 3.6) ** 2 / (2 * 6.43)
+def test_the_study_of_the_law_asks_for_its_mean_deceleration() -> None:
+    """Of 100 km/h in 60 m without the delay's way; the law's 0.1 v + 0.006 v^2 are 70 m with it."""
     criterion = load_study("r13h").unsafe
     assert criterion.criterion == "mfdd < 6.43"
     assert "not checked against the regulation's text" in criterion.source

@@ -7,20 +7,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import tables_of
 from tests.in_process import json_of, run
 
-NAMES = {
-    "wear sensorLatency": "perception latency",
-    "wear brakeResponse": "brake actuator delay",
-    "wear payloadCentre": "longitudinal position of the payload",
-    "native decel": "maximum deceleration",
-    "sun dampRateZeroT_CE": "engine drag (closed throttle, clutch engaged)",
-}
 OWN = """
 extends = "native"
 name = "native"
@@ -33,12 +24,6 @@ tau = { meaning = "", measurement = "" }
 def rows_of(study: str) -> dict[str, Any]:
     rows = json_of("list", "characteristics", study)["tables"]["characteristics"]["rows"]
     return {row["name"]: row for row in rows}
-
-
-@pytest.mark.parametrize("place", NAMES)
-def test_a_characteristic_has_the_name_that_a_supplier_understands(place: str) -> None:
-    study, name = place.split()
-    assert rows_of(study)[name]["short_name"] == NAMES[place]
 
 
 def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) -> None:

@@ -116,11 +116,6 @@ def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None
         sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=InlinePool())
 
 
-def test_too_few_simulations_are_refused(rig: str) -> None:
-    with pytest.raises(InputError, match="1 do not suffice"):
-        sv.explain(rig, simulations=1, pool=InlinePool())
-
-
 def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig: str) -> None:
     with pytest.raises(InputError, match="4 do not suffice"):
         sv.risk(rig, simulations=4, pool=InlinePool())
@@ -132,7 +127,7 @@ def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig:
 
 
 def test_what_takes_long_by_default_is_limited_and_said_first(
-    rig: str, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     account = Account(is_question=True)
     account.open(10_000, 0.4)

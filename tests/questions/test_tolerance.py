@@ -33,7 +33,7 @@ from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_
 
 
 def degrees(rows: FloatArray) -> FloatArray:
-    return np.asarray(8 - np.abs(rows[:, 0] - 5))
+    return 8 - np.abs(rows[:, 0] - 5)
 
 
 def scans_of(n: int, region: Region, failing: Region = nowhere) -> list[OneAtATimeScan]:
@@ -131,7 +131,7 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     """
 
     def sliver(rows: FloatArray) -> BoolArray:
-        return np.asarray(
+        return (
             (np.abs(rows[:, 0] - rows[:, 1]) < 0.001)
             & (rows[:, 0] > 7)
             & (np.abs(rows[:, 2:] - 2).max(axis=1) < 0.5)
@@ -187,26 +187,8 @@ def share_of_domain(answer: Answer) -> float:
     return float(((limits["together_high"] - limits["together_low"]) / 10).prod())
 
 
-def test_the_names_that_others_read() -> None:
+def test_a_specified_limit_is_shown_and_every_limit_has_its_line_in_the_figure() -> None:
     answer = answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",))
-    record = json.loads(answer.render("json"))
-    numbers = (
-        "unsafe margin kept scope box boxes samples failures at_most fits fits_tried attacked"
-        " least_attacked"
-    )
-    assert {*numbers.split()} <= record["numbers"].keys()
-    keys = (
-        "characteristic unit original alone_low alone_high together_low together_high specified_low"
-        " specified_high"
-    )
-    assert list(record["tables"]["limits"]["rows"][0]) == [
-        *keys.split(),
-        "kept",
-        "fails_first",
-        "fails_at",
-        "sentence",
-    ]
-    assert record["verdict"].startswith("All limits hold")
     assert "up to 8" in answer.render("text")
     (axis,) = answer.figure().get_axes()
     assert len(axis.get_yticks()) == len(answer.tables["limits"])
@@ -288,16 +270,7 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     assert ("failed: limit of decel 4.6 m/s^2: the car hits a standing vehicle" in done.stderr) == (
         code == 3
     )
-    if code == 0:
-        assert decel["together_low"] == float(limit)
-        return
-    assert [row[name] for row in (decel, gain) for name in ("together_low", "together_high")] == [
-        None
-    ] * 4
-    assert [row["sentence"].endswith(": no joint limits were found.") for row in (decel, gain)] == [
-        True,
-        True,
-    ]
+    assert decel["together_low"] == (float(limit) if code == 0 else None)
 
 
 @pytest.mark.slow

@@ -19,7 +19,8 @@ import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.cli.program import command_function
+from safevar_sumo.questions.answer import Answer, contents_of
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
@@ -301,68 +302,16 @@ def test_the_table_for_a_paper_marks_each_metric_that_is_significant() -> None:
     assert not re.search(r"^IGD & ", lines.partition("HV")[0], re.MULTILINE)
 
 
-@pytest.mark.parametrize(
-    ("name", "columns"),
-    [
-        (
-            "rq1",
-            (
-                "setting algorithm metric p_value effect_size magnitude n1 n2 method mean original"
-                " enough_runs"
-            ),
-        ),
-        (
-            "rq2",
-            (
-                "setting baseline metric p_value effect_size magnitude n1 n2 method algorithm"
-                " enough_runs evaluations baseline_evaluations"
-            ),
-        ),
-        (
-            "rq1-runs",
-            (
-                "setting algorithm metric p_value p_holm effect_size effect_size_low"
-                " effect_size_high magnitude runs method mean original enough_runs"
-            ),
-        ),
-        (
-            "rq2-runs",
-            (
-                "setting baseline metric p_value p_holm effect_size effect_size_low"
-                " effect_size_high magnitude n1 n2 method algorithm enough_runs"
-            ),
-        ),
-        ("medians", "setting algorithm metric runs median median_low median_high"),
-        ("convergence", "case algorithm evaluations hypervolume low high"),
-        (
-            "rq2-common",
-            (
-                "setting baseline metric p_value p_holm effect_size effect_size_low"
-                " effect_size_high magnitude n1 n2 method algorithm enough_runs"
-            ),
-        ),
-        ("evaluations", "setting algorithm run requested simulated budget"),
-        ("rq3.1", "setting run j count"),
-        ("rq3.2", "setting characteristic j percent rank"),
-        ("rq3.3", "setting characteristic direction j pc delta n"),
-        ("rq3.3-safety", "setting quantity j value percent n"),
-        ("collisions", "setting algorithm solutions collisions share"),
-        ("combinations", "setting rank characteristics percent"),
-    ],
-)
-def test_tables_have_the_promised_columns(name: str, columns: str) -> None:
-    table = answer_about("two").to_dict()["tables"][name]
-    assert set(table["columns"]) == {
-        *columns.split(),
-        *(["significant"] if "p_value" in columns else []),
-    }
-    for cells in table["rows"]:
-        assert set(cells) == set(table["columns"])
-        counts = [
-            cells.get(name)
-            for name in ("n1", "n2", "n", "rank", "solutions", "collisions", "count")
-        ]
-        assert all(isinstance(count, int) for count in counts if count is not None)
+def test_tables_have_the_columns_that_their_command_declares() -> None:
+    declared = contents_of(command_function("tables"))
+    tables = answer_about("two").to_dict()["tables"]
+    assert {*declared.tables} - {*tables} == {"causes", "budget", "diversity"}
+    counts = ("n1", "n2", "n", "rank", "solutions", "collisions", "count")
+    for name, table in tables.items():
+        assert {*table["columns"]} == {*declared.tables[name]}, name
+        for cells in table["rows"]:
+            numbers = [cells[count] for count in counts if cells.get(count) is not None]
+            assert all(isinstance(number, int) for number in numbers), name
 
 
 @pytest.mark.slow
