@@ -310,7 +310,9 @@ def simulate(
     """
     loaded_study, system = load_and_assemble(study)
     with about("changes"):
-        loaded_study, system = with_phase_if_set(loaded_study, system, changes or {})
+        loaded_study, system = with_phase_if_set(
+            loaded_study, system, () if changes is None else [*changes]
+        )
     return simulate_with_original(
         loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered
     )

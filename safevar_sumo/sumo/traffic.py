@@ -56,17 +56,15 @@ passed, or scenery.
 class Traffic:
     """The bodies around N vehicles.
 
-    `group`, shape (N,), is the number of each vehicle's point; where points have arrays of
-    `n_encounters` values as parameters or phase, the number of its encounter: first those at the
-    first point.
+    `group`, shape (N,), is the number of each vehicle's encounter: each point has `n_encounters`,
+    those of arrays as parameters or phase.
     """
 
     def __init__(
         self,
         points: Sequence[Point],
         group: IntArray,
-        *,
-        n_encounters: int = 1,
+        n_encounters: int,
         n_samples: int,
         step: float,
     ) -> None:

@@ -27,7 +27,7 @@ NO_NUMBER = re.compile(r"(?<![\w./-])-?(nan|inf)\b|\d[eE]\+\d")
 FEW = "--simulations {}"
 SMALL = {
     "study": "--algorithms rs --runs 1 --evaluations 10 --out next",
-    "explain": "--quick --limit 20 --top 1",
+    "explain": "--quick --top 1",
     "tolerance": "--simulations 400",
     "risk": "--samples 64",
     "rules": "--samples 64",
