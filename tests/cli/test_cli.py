@@ -13,7 +13,6 @@ import subprocess
 import sys
 from io import StringIO
 from pathlib import Path
-from unittest.mock import patch
 
 import click
 import pytest
@@ -22,7 +21,7 @@ from rich.console import Console
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.cli.program import COMMANDS, command_function, commands, run_command_line
+from safevar_sumo.cli.program import COMMANDS, command_function, commands
 from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
@@ -49,7 +48,6 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
     output = " ".join(CliRunner().invoke(commands, ["--help"]).stdout.split())
     for name in COMMANDS:
         found = commands.get_command(None, name)  # type: ignore[arg-type]
-        assert found is not None
         sentence, _, _ = (found.help or "").partition("\n\n")
         assert f" {name} {' '.join(sentence.split())}" in output
 
@@ -103,30 +101,22 @@ def simulate(*arguments: str) -> Result:
 
 
 @pytest.mark.parametrize(
-    ("condition", "code", "words"),
-    [("safety_degree < 99", 3, "failed: safety_degree = "), ("safety_degree < 0.1", 0, "")],
+    ("typed", "condition", "words"),
+    [
+        ("simulate smoke", "safety_degree < 99", "failed: safety_degree = "),
+        ("simulate smoke", "safety_degree < 0.1", ""),
+        (
+            "list weathers",
+            "weathers.road_friction < 0.7",
+            "failed: weathers.road_friction = 0.59 < 0.7 in the row hard_rain\n",
+        ),
+    ],
 )
-def test_a_gate_ends_with_code_3(
-    condition: str, code: int, words: str, capfd: pytest.CaptureFixture[str]
+def test_a_gate_ends_with_code_3_and_of_a_table_it_names_the_row(
+    typed: str, condition: str, words: str
 ) -> None:
-    with (
-        patch("sys.argv", ["safevar-sumo", "simulate", "smoke", "--fail-if", condition]),
-        pytest.raises(SystemExit) as end,
-    ):
-        run_command_line()
-    assert end.value.code == code
-    assert words in capfd.readouterr().err
-
-
-def test_a_gate_on_a_table_names_the_row(capfd: pytest.CaptureFixture[str]) -> None:
-    typed = ["safevar-sumo", "list", "weathers", "--fail-if", "weathers.road_friction < 0.7"]
-    with patch("sys.argv", typed), pytest.raises(SystemExit) as end:
-        run_command_line()
-    assert end.value.code == 3
-    assert (
-        capfd.readouterr().err
-        == "failed: weathers.road_friction = 0.59 < 0.7 in the row hard_rain\n"
-    )
+    gate = ("--fail-if", condition)
+    assert words in run(*typed.split(), *gate, expect=3 if words else 0).stderr
 
 
 @pytest.mark.parametrize(
@@ -305,7 +295,6 @@ def test_names_of_no_table_and_no_number_are_refused_before_anything_is_loaded(
     """The subjects do not exist, and the message names what there is."""
     subjects = ["nothing"] * (2 if command in ("compare", "validate") else 1)
     declared = contents_of(command_function(command))
-    assert declared is not None
     refused(
         command,
         *subjects,

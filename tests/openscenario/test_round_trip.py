@@ -19,9 +19,28 @@ from safevar_sumo.sumo.system import assemble
 
 FILES = Path(__file__).parent / "files"
 WEAR = {"treadDepth": 1.6, "brakeTorque": 0.2}
-CCRB = {"test": "CCRb", "speed": 50}
-CPNA = {"test": "CPNA", "speed": 40}
-COLLISION = Outcome.COLLISION
+COLLISION, PASSED, STOPPED = Outcome.COLLISION, Outcome.PASSED, Outcome.STOPPED
+
+
+def scene_of(file: str, **values: float) -> dict[str, Any]:
+    return {"file": str(FILES / file), "values": values}
+
+
+SCENES: dict[str, dict[str, Any]] = {
+    "cut-in": scene_of("cut_in.xosc"),
+    "near cut-in": scene_of("cut_in.xosc", gap_m=6, slower_kmh=30),
+    "pedestrian": scene_of("crossing_pedestrian.xosc"),
+    "leader": scene_of("braking_leader.xosc"),
+    "CCRb": {"model": "car_to_car", "parameters": {"test": "CCRb", "speed": 50}},
+    "CPNA": {"model": "crossing", "parameters": {"test": "CPNA", "speed": 40}},
+}
+FAST = [("near cut-in", COLLISION), ("CCRb", COLLISION), ("cut-in", PASSED)]
+SLOW = [
+    *((name, COLLISION) for name in ("pedestrian", "leader", "CPNA")),
+    *((name, STOPPED) for name in ("pedestrian", "leader", "CPNA")),
+    ("CCRb", PASSED),
+]
+"""How runs end: worn vehicles collide, new ones do not."""
 
 
 def runs_of(study: Study, wear: Mapping[str, float]) -> tuple[SimulationRuns, Any, np.ndarray]:
@@ -34,51 +53,13 @@ def runs_of(study: Study, wear: Mapping[str, float]) -> tuple[SimulationRuns, An
 
 
 @pytest.mark.parametrize(
-    ("scenario", "wear", "outcome"),
-    [
-        pytest.param(
-            {"file": str(FILES / "crossing_pedestrian.xosc")},
-            WEAR,
-            COLLISION,
-            marks=pytest.mark.slow,
-        ),
-        (
-            {"file": str(FILES / "cut_in.xosc"), "values": {"gap_m": 6, "slower_kmh": 30}},
-            WEAR,
-            COLLISION,
-        ),
-        pytest.param(
-            {"file": str(FILES / "braking_leader.xosc")}, WEAR, COLLISION, marks=pytest.mark.slow
-        ),
-        ({"model": "car_to_car", "parameters": CCRB}, WEAR, COLLISION),
-        pytest.param(
-            {"model": "crossing", "parameters": CPNA}, WEAR, COLLISION, marks=pytest.mark.slow
-        ),
-        ({"file": str(FILES / "cut_in.xosc")}, {}, Outcome.PASSED),
-        pytest.param(
-            {"file": str(FILES / "crossing_pedestrian.xosc")},
-            {},
-            Outcome.STOPPED,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"file": str(FILES / "braking_leader.xosc")},
-            {},
-            Outcome.STOPPED,
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"model": "car_to_car", "parameters": CCRB}, {}, Outcome.PASSED, marks=pytest.mark.slow
-        ),
-        pytest.param(
-            {"model": "crossing", "parameters": CPNA}, {}, Outcome.STOPPED, marks=pytest.mark.slow
-        ),
-    ],
+    ("name", "outcome"), [*FAST, *(pytest.param(*one, marks=pytest.mark.slow) for one in SLOW)]
 )
 def test_an_exported_run_is_the_same_from_its_file(
-    tmp_path: Path, scenario: dict[str, Any], wear: Mapping[str, float], outcome: Outcome
+    tmp_path: Path, name: str, outcome: Outcome
 ) -> None:
-    study = load_study("wear", scenario=scenario, matrix={"tests": []})
+    wear = WEAR if outcome == COLLISION else {}
+    study = load_study("wear", scenario=SCENES[name], matrix={"tests": []})
     runs, system, setting = runs_of(study, wear)
     write_files(
         comparison_of(simulate_with_original(study, system, setting, filtered=False)),
@@ -92,11 +73,12 @@ def test_an_exported_run_is_the_same_from_its_file(
     again, *_ = runs_of(load_study("wear", scenario={"file": str(file)}), wear)
     assert again.outcome == runs.outcome
     n = int(np.count_nonzero(runs.trace.active)) + (outcome == COLLISION)
-    for name in ("position", "gap", "lateral"):
-        first, second = (getattr(one.trace, name)[:n, 0] for one in (runs, again))
+    for column in ("position", "gap", "lateral"):
+        first, second = (getattr(one.trace, column)[:n, 0] for one in (runs, again))
         assert (
-            np.abs(first - second - (first[0] - second[0]) * (name == "position")).max() < 1e-3
-        ), name
-    for name in ("collision_speed", "closing_speed"):
-        before = getattr(runs, name)
-        assert getattr(again, name) == pytest.approx(before, abs=1e-3, nan_ok=True), name
+            np.abs(first - second - (first[0] - second[0]) * (column == "position")).max() < 1e-3
+        ), column
+    for column in ("collision_speed", "closing_speed"):
+        before = getattr(runs, column)
+        found = getattr(again, column)
+        assert found == pytest.approx(before, abs=1e-3, nan_ok=True), column

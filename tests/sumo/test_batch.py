@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
@@ -64,16 +66,21 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(
     assert np.all(run.trace.speed.max(axis=0) > 1.0)
 
 
-def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool], float]:
-    """Outcome, active samples and collision speed of one vehicle; a sample is (speed, encounter has
-    ended, collision speed).
+def judged(
+    speeds: list[float], over: int | None = None, **crashes: float
+) -> tuple[str, list[bool], float]:
+    """Outcome, active samples and collision speed of one vehicle with a speed at each sample; the
+    encounter has ended at the sample `over`, and a collision at sample 2 is `at_2`, its speed.
     """
     outcomes = _Outcomes(1)
     active = []
-    for i, (speed, over, crash) in enumerate(samples):
-        collisions = {} if crash is None else {0: crash}
+    for i, speed in enumerate(speeds):
+        crash = crashes.get(f"at_{i}")
         verdicts = outcomes.note_sample(
-            np.array([speed]), np.array([over]), collisions, last=i == len(samples) - 1
+            np.array([speed]),
+            np.array([i == over]),
+            {} if crash is None else {0: crash},
+            last=i == len(speeds) - 1,
         )
         active.append(bool(verdicts[0]))
     assert not outcomes.is_open.any()
@@ -81,44 +88,38 @@ def judged(*samples: tuple[float, bool, float | None]) -> tuple[str, list[bool],
 
 
 @pytest.mark.parametrize(
-    ("samples", "outcome"),
+    ("speeds", "events", "outcome"),
     [
-        (((0, False, None), (2, False, None), (2, False, None)), Outcome.TIMEOUT),
-        (((0, False, None), (0, False, None), (0, False, None)), Outcome.NEVER_MOVED),
-        (((0, False, None), (0, False, None), (0, True, None)), Outcome.NEVER_MOVED),
-        (((0, False, None), (2, False, None), (0, False, None)), Outcome.STOPPED),
-        (((0, False, None), (2, False, None), (2, True, None), (2, False, None)), Outcome.PASSED),
-        (
-            ((0, False, None), (2, False, None), (2, False, 1.5), (0, False, None)),
-            Outcome.COLLISION,
-        ),
-        (((0, False, None), (0, False, 0.0), (0, False, None)), Outcome.COLLISION),
-        (((0, False, None), (0, False, None), (3, False, None), (3, False, None)), Outcome.TIMEOUT),
-        (((3, False, None), (0, False, None)), Outcome.STOPPED),
+        ([0, 2, 2], {}, Outcome.TIMEOUT),
+        ([0, 0, 0], {}, Outcome.NEVER_MOVED),
+        ([0, 0, 0], {"over": 2}, Outcome.NEVER_MOVED),
+        ([0, 2, 0], {}, Outcome.STOPPED),
+        ([0, 2, 2, 2], {"over": 2}, Outcome.PASSED),
+        ([0, 2, 2, 0], {"at_2": 1.5}, Outcome.COLLISION),
+        ([0, 0, 0], {"at_1": 0.0}, Outcome.COLLISION),
+        ([0, 0, 3, 3], {}, Outcome.TIMEOUT),
+        ([3, 0], {}, Outcome.STOPPED),
     ],
 )
 def test_the_last_samples_determine_the_outcome(
-    samples: tuple[tuple[float, bool, float | None], ...], outcome: Outcome
+    speeds: list[float], events: dict[str, Any], outcome: Outcome
 ) -> None:
-    assert judged(*samples)[0] == outcome
+    assert judged(speeds, **events)[0] == outcome
 
 
 def test_the_sample_of_a_collision_is_the_last_active_sample() -> None:
-    _, active, speed = judged((3, False, None), (3, False, 2.5), (1, False, 0.5), (0, False, None))
+    _, active, speed = judged([3, 3, 1, 0], at_1=2.5, at_2=0.5)
     assert active == [True, True, False, False]
     assert speed == 2.5, "the first report is the collision's"
 
 
 def test_the_sample_in_which_the_encounter_ends_is_active_only_at_a_collision() -> None:
-    assert judged((3, False, None), (3, True, None), (3, False, None))[1] == [True, False, False]
-    assert judged((3, False, None), (3, True, 3.0), (3, False, None))[1:] == (
-        [True, True, False],
-        3.0,
-    )
+    assert judged([3, 3, 3], over=1)[1] == [True, False, False]
+    assert judged([3, 3, 3], over=1, at_1=3.0)[1:] == ([True, True, False], 3.0)
 
 
 def test_the_last_sample_counts() -> None:
-    assert judged((3, False, None), (3, False, None))[1] == [True, True]
+    assert judged([3, 3])[1] == [True, True]
 
 
 STEP = 0.05
