@@ -43,6 +43,10 @@ def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
     assert solutions(OUT) == solutions(whole)
 
 
+def until_it_writes(process: Process) -> None:
+    until(lambda: written(OUT) > 0, process)
+
+
 def assert_ends_with_the_results(process: Process, whole: Path) -> None:
     """It leaves the bytes of a study that nothing has happened to, and no failed simulation."""
     ended(process, 0)
@@ -54,7 +58,7 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
 def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
     moments = random.Random(5)
     process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--quiet", batch=5)
-    until(lambda: written(OUT) > 0, process)
+    until_it_writes(process)
     for worker in workers_of(process):
         worker.kill()  # each share loses one
         time.sleep(moments.uniform(0.2, 0.6))
@@ -73,7 +77,7 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
             process,
         )
     else:
-        until(lambda: written(OUT) > 0, process)
+        until_it_writes(process)
         loaded = " ".join(one.path for one in workers_of(process)[0].memory_maps())
         assert "libsumo" in loaded
         assert not any(name in loaded for name in ("pandas", "pyarrow", "matplotlib")), (
@@ -94,7 +98,7 @@ def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path)
     process = started(
         "study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo", env=environment
     )
-    until(lambda: written(OUT) > 0, process)
+    until_it_writes(process)
     process.terminate()
     errors = ended(process, 130)
     assert "interrupted" in errors
@@ -190,7 +194,7 @@ def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(line: str, 
         ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
     )
     process = started("study", "deadly.toml", "--out", "out", "--jobs", "1", batch=1)
-    until(lambda: written(OUT) > 0, process)
+    until_it_writes(process)
     Path("now").touch()
     errors = ended(process, 2)
     place = "" if "exit(" in line else f" in {Path('my_ads.py').resolve()}, line 10"

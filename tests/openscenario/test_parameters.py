@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -195,21 +196,21 @@ def write_values(
     return file
 
 
+logs = partial(setting, "Logs", COLLISION)
+
+
 @pytest.mark.parametrize(
     ("events", "stops"),
     [
-        ([setting("Logs", COLLISION, "p")], []),
-        ([setting("Logs", COLLISION, "p")], [is_set("p")]),
-        ([setting("Logs", COLLISION, "V")], [is_set("V")]),
-        ([setting("Logs", COLLISION, "V")], [is_set("V", "notEqualTo", "3")]),
-        ([setting("Logs", COLLISION, "V", "W", "p")], [is_set("V"), is_set("W"), is_set("p")]),
-        ([setting("Logs", COLLISION, "V"), setting("Next", is_set("V"), "W")], [is_set("W")]),
-        ([setting("Logs", COLLISION, "V"), setting("Next", is_set("V"), "q")], [is_set("q")]),
-        (
-            [setting("Logs", COLLISION, "V"), setting("Next", ENDED.format("Logs"), "W")],
-            [is_set("W")],
-        ),
-        ([setting("Logs", COLLISION, "V")], [ENDED.format("Logs")]),
+        ([logs("p")], []),
+        ([logs("p")], [is_set("p")]),
+        ([logs("V")], [is_set("V")]),
+        ([logs("V")], [is_set("V", "notEqualTo", "3")]),
+        ([logs("V", "W", "p")], [is_set("V"), is_set("W"), is_set("p")]),
+        ([logs("V"), setting("Next", is_set("V"), "W")], [is_set("W")]),
+        ([logs("V"), setting("Next", is_set("V"), "q")], [is_set("q")]),
+        ([logs("V"), setting("Next", ENDED.format("Logs"), "W")], [is_set("W")]),
+        ([logs("V")], [ENDED.format("Logs")]),
     ],
 )
 def test_what_moves_nobody_may_wait_for_a_collision(

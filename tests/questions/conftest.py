@@ -123,6 +123,10 @@ def made_up_evaluator(n: int, region: Region) -> Evaluator:
     return Evaluator(study, Plant(study, region))
 
 
+def made_up_model(n: int, region: Region, fit: int = 0) -> Model:
+    return Model(fit, made_up_evaluator(n, region), Unsafe())
+
+
 def nowhere(settings: FloatArray) -> BoolArray:
     return np.zeros(len(settings), dtype=bool)
 
@@ -133,19 +137,17 @@ def everywhere(settings: FloatArray) -> BoolArray:
 
 def box(settings: FloatArray) -> BoolArray:
     """a above 7 and b below 3: 9 % of two domains."""
-    return np.asarray((settings[:, 0] > 7) & (settings[:, 1] < 3))
+    return (settings[:, 0] > 7) & (settings[:, 1] < 3)
 
 
 def two_islands(settings: FloatArray) -> BoolArray:
     """a from 6.5 to 7, and a above 9: 15 % of its domain."""
-    return np.asarray(((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9))
+    return ((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9)
 
 
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
-    return np.asarray(
-        (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
-    )
+    return (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
 
 
 def box_of(

@@ -44,9 +44,8 @@ AT_TESTS_ALONE = {
 
 
 @pytest.fixture
-def ahead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Study:
-    monkeypatch.chdir(tmp_path)
-    Path("ahead.toml").write_text(AHEAD)
+def ahead(in_tmp: Path) -> Study:
+    (in_tmp / "ahead.toml").write_text(AHEAD)
     return load_study("ahead.toml")
 
 

@@ -10,17 +10,16 @@ import pytest
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
-from safevar_sumo.questions.models import Model, judges_of
+from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic, region_of
 from tests.in_process import InlinePool
-from tests.questions.conftest import made_up_evaluator, made_up_study
+from tests.questions.conftest import made_up_model, made_up_study, nowhere
 
 
 def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> None:
@@ -29,9 +28,9 @@ def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_ou
     """
 
     def sliver(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] >= 7.13) & (rows[:, 0] <= 7.1302) & (rows[:, 0] != 7.13))
+        return (rows[:, 0] >= 7.13) & (rows[:, 0] <= 7.1302) & (rows[:, 0] != 7.13)
 
-    model = Model(0, made_up_evaluator(2, sliver), Unsafe())
+    model = made_up_model(2, sliver)
     unsafe = np.array([7.13005, 5.0])
     found = describe(model, {"a": unsafe, "b": np.array([7.5, 5.0])})
     assert [*found] == ["a"], "a setting that is safe is not described"
@@ -40,7 +39,7 @@ def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_ou
 
 def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     study = made_up_study(2)
-    model = Model(0, made_up_evaluator(2, lambda rows: rows[:, 0] > 7), Unsafe())
+    model = made_up_model(2, lambda rows: rows[:, 0] > 7)
     within = Box(region_of(study), np.array([5.0, 5.0]), np.array([7.1234, 5.0]))
     found = describe(model, {"": np.array([7.12339, 5.0])}, within)
     assert within.holds(found[""].setting[np.newaxis])[0]
@@ -56,27 +55,23 @@ def test_a_reach_ends_just_before_a_planted_boundary_at_its_start_or_nowhere(
     """
 
     def pocket(rows: FloatArray) -> BoolArray:
-        return np.asarray((side * (rows[:, 0] - 5) > edge) & (np.abs(rows[:, 1] - 8) < 0.4))
+        return (side * (rows[:, 0] - 5) > edge) & (np.abs(rows[:, 1] - 8) < 0.4)
 
-    evaluator = made_up_evaluator(2, pocket)
+    model = made_up_model(2, pocket)
     ends = np.sort([[5.0, 0.0], [5.0 + 5 * side, 10.0]], axis=0)
-    judges = judges_of([Model(0, evaluator, Unsafe())], "reach")
+    judges = judges_of([model], "reach")
     found = reach(
-        Box(evaluator.region, *ends), (int(side > 0), 0), 5.0, judges, LEAST_SIMULATIONS, (1,)
+        Box(model.evaluator.region, *ends), (int(side > 0), 0), 5.0, judges, LEAST_SIMULATIONS, (1,)
     )
     if edge < 0:
         assert found.value is None
         return
-    assert found.value is not None
     assert edge - 0.11 <= side * (found.value - 5) <= edge
     assert edge == 0 or found.falsification.simulated >= LEAST_SIMULATIONS  # type: ignore[union-attr]
 
 
 def test_a_falsification_names_the_model_that_fails() -> None:
-    models = [
-        Model(0, made_up_evaluator(2, lambda rows: np.zeros(len(rows), dtype=bool)), Unsafe()),
-        Model(1, made_up_evaluator(2, lambda rows: rows[:, 1] > 9.5), Unsafe()),
-    ]
+    models = [made_up_model(2, nowhere), made_up_model(2, lambda rows: rows[:, 1] > 9.5, 1)]
     box = Box(models[0].evaluator.region, np.zeros(2), np.full(2, 10.0))
     found = falsify_limits(box, judges_of(models, "falsification"), 2000, (1,))
     assert [*found.failures] == [1]

@@ -7,9 +7,7 @@ import pytest
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import falsify
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance.alone import AloneSearch
 from safevar_sumo.questions.tolerance.scans import scan
 from safevar_sumo.questions.tolerance.search import BoxSearch
@@ -17,19 +15,18 @@ from safevar_sumo.questions.tolerance.together import CONFIRMATIONS, LimitsToget
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
-from tests.questions.conftest import Plant, box_of, made_up_study, nowhere
+from tests.questions.conftest import box_of, made_up_model, made_up_study, nowhere
 
 LINEAR = np.array([1.0, 2.0, 3.0])
 """Weights of a region whose largest box has sides at 10, 7.5 and 5."""
 
 
 def relative_volume(found: LimitsTogether) -> float:
-    assert found.box is not None
     return float(np.prod(found.box.upper - found.box.lower)) / 10 ** len(found.box.lower)
 
 
 def linear(rows: FloatArray) -> BoolArray:
-    return np.asarray((rows - 5) @ LINEAR > 10)
+    return (rows - 5) @ LINEAR > 10
 
 
 @pytest.mark.parametrize(("limits", "largest"), [({}, 0.375), ({"c": Limit(at_most=7)}, 0.315)])
@@ -37,8 +34,6 @@ def test_the_box_with_limits_is_nearly_the_largest(
     limits: dict[str, Limit], largest: float
 ) -> None:
     found = box_of(3, linear, limits)
-    assert found.box is not None
-    assert found.proof is not None
     assert 0.97 * largest < relative_volume(found) <= largest
     assert (found.box.upper - 5) @ LINEAR <= 10
     assert found.proof.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / found.proof.samples))
@@ -51,23 +46,19 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
     """The largest box without the larger region has b up to 7, and needs no limit of a."""
 
     def pair(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 9) & (rows[:, 1] > 7))
+        return (rows[:, 0] > 9) & (rows[:, 1] > 7)
 
     def both(rows: FloatArray) -> BoolArray:
-        return np.asarray(pair(rows) | (rows[:, 1] > 7) & (rows[:, 2] > 5.5))
+        return pair(rows) | (rows[:, 1] > 7) & (rows[:, 2] > 5.5)
 
     outer = box_of(3, pair, {})
     alone, inner = box_of(3, both, {}), box_of(3, both, {}, outer=outer)
-    assert outer.box is not None
-    assert alone.box is not None
-    assert inner.box is not None
     ends = [outer.box.upper, alone.box.upper, inner.box.upper]
     assert (ends[1] > ends[0]).any()
     assert (ends[2] <= ends[0]).all()
     assert (inner.box.lower >= outer.box.lower).all()
     assert not both(inner.box.corners(0, 0)).any()
     again = box_of(3, pair, {}, outer=outer)
-    assert again.box is not None
     assert again.box.upper.tolist() == ends[0].tolist()
     assert again.beyond.keys() == outer.beyond.keys()
     assert box_of(3, pair, {}, outer=outer._replace(box=None)).box is None
@@ -76,7 +67,6 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
 def test_no_limit_of_the_box_can_move_out_alone() -> None:
     """By a 50th of its range, or it meets the failure that is named."""
     found = box_of(3, linear, {})
-    assert found.box is not None
     ends = [column for column in range(3) if found.box.upper[column] < 10]
     assert len(ends) >= 2
     for column in ends:
@@ -93,13 +83,9 @@ def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together
     """
 
     def pocket(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7.01) & (rows[:, 0] < 7.04))
+        return (rows[:, 0] > 7.01) & (rows[:, 0] < 7.04)
 
-    study = made_up_study(2)
-    own, other = (
-        Model(k, Evaluator(study, Plant(study, one)), Unsafe())
-        for k, one in enumerate((nowhere, pocket))
-    )
+    own, other = made_up_model(2, nowhere), made_up_model(2, pocket, 1)
     scans = scan(own.evaluator, [0, 1], Unsafe())
     alone = AloneSearch(scans, [0, 1], own)
     alone.add(own)
@@ -120,12 +106,9 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
     """
 
     def tooth(rows: FloatArray) -> BoolArray:
-        return np.asarray(
-            (np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1)
-        )
+        return (np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1)
 
     found = box_of(3, tooth, {"a": Limit(at_least=3, at_most=7)})
-    assert found.box is not None
     points = found.box.at(np.random.default_rng(1).random((20_000, 3)))
     assert not tooth(points).any()
     assert relative_volume(found) > 0.02
@@ -147,10 +130,9 @@ def test_the_box_holds_in_every_fit() -> None:
     """A second fit collides in one corner alone, between the corners of the first."""
 
     def second(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7) & (rows[:, 1] < 4) & (rows[:, 2] > 6))
+        return (rows[:, 0] > 7) & (rows[:, 1] < 4) & (rows[:, 2] > 6)
 
     found = box_of(3, linear, {}, [second])
-    assert found.box is not None
     assert [model.fit for model in found.members] == [0, 1]
     settings = np.concatenate(
         [found.box.corners(0, 0), found.box.at(np.random.default_rng(2).random((5000, 3)))]
@@ -169,7 +151,6 @@ def test_a_promise_that_a_fit_breaks_is_named_and_the_box_holds_in_the_others() 
     )
     assert [*found.broken] == [1]
     assert [model.fit for model in found.members] == [0, 2]
-    assert found.box is not None
     assert found.box.upper.tolist() == [9, pytest.approx(7, abs=0.11)]
 
 
@@ -187,11 +168,9 @@ def test_a_box_is_not_widened_through_what_fails_beside_it(gap: float) -> None:
     """
 
     def wall(rows: FloatArray) -> BoolArray:
-        return np.asarray((rows[:, 0] > 7) & (rows[:, 1] > 4))
+        return (rows[:, 0] > 7) & (rows[:, 1] > 4)
 
-    study = made_up_study(2)
-    model = Model(0, Evaluator(study, Plant(study, wall)), Unsafe())
-    search = BoxSearch(model, [0, 1], {}, np.zeros((0, 2)))
+    search = BoxSearch(made_up_model(2, wall), [0, 1], {}, np.zeros((0, 2)))
     search.corners.append(np.array([1.0, 1.0]))
     search.gap = gap
     sides = search.widened(np.ones((2, 2)))

@@ -29,6 +29,7 @@ from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, re
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import json_of, refused, run, searched
+from tests.manual import files_of
 from tests.questions.test_repair import planted as planted
 
 MINE = """
@@ -186,7 +187,6 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
         ]
         assert answer == json_of(*words), "the page's answer is the command's"
     shares = re.search(r"(\d+) different vehicles\.", page)
-    assert shares is not None
     assert int(shares[1]) == len(load(slippery).evaluations), "the page is about the whole search"
 
     claims = [
@@ -212,9 +212,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The example of CONTRIBUTING."""
-    manual = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
-    (code,) = re.findall(r'```python title="my_questions.py"\n(.*?)```', manual, re.DOTALL)
-    Path("my_questions.py").write_text(code)
+    Path("my_questions.py").write_text(files_of("CONTRIBUTING.md")["my_questions.py"])
     monkeypatch.syspath_prepend(str(in_tmp))
     run(
         "report", str(slippery), "--ask", "my_questions:ends --unsafe below=0.5", "--out", "it.html"

@@ -4,8 +4,6 @@ that contradict themselves.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -63,9 +61,9 @@ def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
 FAST = "impact at 35 km/h, speed 60, clear"
 
 
-def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_no_failure(
-    in_tmp: Path,
-) -> None:
+def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_no_failure() -> (
+    None
+):
     """Sensors that reach 15 m: the car hits at 60 km/h, where that is allowed, and stops short
     elsewhere.
     """
@@ -89,7 +87,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     )
 
 
-def test_a_point_fails_by_the_criterion_of_its_study(in_tmp: Path) -> None:
+def test_a_point_fails_by_the_criterion_of_its_study() -> None:
     """The limits page: 62 % of the brake torque keep 6.43 m/s^2, 61 % do not."""
     for share, told in ("0.61", "fails 1 of 1 test cases: type 0"), ("0.62", "fails no test case"):
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
