@@ -84,7 +84,6 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
         create(answer, **values)
         if answer.question in COMMANDS:
             declared = contents_of(command_function(answer.question))
-            assert declared is not None
             keys = Contents(
                 answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}
             ).keys

@@ -187,7 +187,7 @@ class NearForMany(Hold):
     """The ADS `Near` over arrays of vehicles."""
 
     def drive(self, seen: Any, memory: Any) -> tuple[Command, Any]:
-        self._near = np.asarray(seen.gap < 20)
+        self._near = seen.gap < 20
         return super().drive(seen, memory)
 
     def warns(self, memory: Any) -> Any:

@@ -136,7 +136,7 @@ def test_instances_begin_anew_in_each_run(small: Make) -> None:
         np.testing.assert_allclose(driven(system, [20.0] * 3)[:, 1, 0], [0.1, 0.2, 0.3])
 
 
-def test_an_acceleration_drives_as_the_same_law_in_python(small: Make, tmp_path: Path) -> None:
+def test_an_acceleration_drives_as_the_same_law_in_python(small: Make) -> None:
     table = TABLE.replace("25", "15").replace('"gap" }', '"gap", speed = "speed" }')
     fmu = small("self.wish = -9.0", table.replace('brake = "pedal"', 'acceleration = "wish"'))
     Path("law.py").write_text("""

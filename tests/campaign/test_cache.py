@@ -113,7 +113,6 @@ def test_results_in_the_cells_of_a_rating_are_kept_to_the_bit() -> None:
         cells=CellResults(impact, warning, rng.random((4, 9)) < 0.5),
     )
     kept = evaluations_in(content_of(evaluations))
-    assert kept is not None
     assert_equal(kept, evaluations)
 
 
@@ -315,7 +314,6 @@ def test_the_oldest_simulations_make_room(folder: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(cache, "SIZE_LIMIT", 300_000)
     with keep_simulations():
         kept = cache.cache_of(load_study("smoke"), Use({}, []))
-        assert kept is not None
         for number in range(100):
             kept.put(str(number).encode(), os.urandom(20_000))
         assert kept.get(b"99") is not None

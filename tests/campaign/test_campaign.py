@@ -77,9 +77,7 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
 
 
 @pytest.mark.slow
-def test_a_run_in_other_hands_is_left_to_them_and_named(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: Path) -> None:
     study = with_search(study, algorithms=["nsga2", "rs"])
     carried_out(study, tmp_path / "whole")
     carried_out(study, tmp_path / "out", keys=[RunKey("rs", 1)])

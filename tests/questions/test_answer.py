@@ -95,7 +95,6 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     assert len(text.splitlines()) <= MAX_LINES
     assert "constant" not in text
     left_out = re.search(r"^(\d+) more rows: --details\.$", text, re.MULTILINE)
-    assert left_out is not None
     last = 14 - int(left_out[1])
     assert f"{last} " in text
     assert f"│ {last + 1} " not in text

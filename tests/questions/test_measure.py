@@ -103,7 +103,6 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     )
     results = sv.load("results")
     solutions = results.solutions.drop_duplicates([*results.case.characteristics.names])
-    assert counts is not None
     assert (
         0
         < int(counts[2])

@@ -46,7 +46,7 @@ class Matrix:
         )
 
     def robustness_by(self, evaluations: Any) -> FloatArray:
-        return np.asarray(evaluations.left)
+        return evaluations.left
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         return self.robustness_by(self.evaluate(settings, stage))

@@ -134,7 +134,6 @@ def test_the_time_left_is_right_within_a_factor_of_two(
         if second > 0.1 * end:
             assert left is not None, f"none at {second} s of {end:.0f} s"
         if second > 0.5 * end:
-            assert left is not None
             is_near = abs(left - (end - second)) <= 5
             are_right.append(is_near or 0.5 <= left / (end - second) <= 2)
     assert sum(are_right) >= LEAST_RIGHT.get(command, 1.0) * len(are_right)

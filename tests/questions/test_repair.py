@@ -313,7 +313,6 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
         )
         settings = problem.promise.draw(20, np.random.default_rng(1))
         driver = problem.best_driver
-        assert driver is not None
         is_safe = (
             full_braking.robustness_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
         )

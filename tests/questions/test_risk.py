@@ -66,9 +66,7 @@ def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: flo
 
 def ishigami(settings: FloatArray) -> FloatArray:
     x = (settings - 5) / 5 * math.pi
-    return np.asarray(
-        np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
-    )
+    return np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
 
 
 class MeasuredPlant(Plant):

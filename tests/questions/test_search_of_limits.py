@@ -33,7 +33,7 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
     ]
 
     def judge(rows: FloatArray) -> FloatArray:
-        return np.asarray(
+        return (
             np.abs((rows - members.lower) / (members.upper - members.lower) - 0.7).sum(axis=1) - 0.5
         )
 

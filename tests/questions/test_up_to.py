@@ -63,7 +63,6 @@ def ahead(in_tmp: Path) -> Study:
 
 def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: Study) -> None:
     def over(study: Study) -> list[Any]:
-        assert study.matrix is not None
         return [test.over["speed"] for test in study.matrix.tests]
 
     wear, stop = load_study("wear"), load_study("stop")

@@ -186,8 +186,6 @@ def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_origin
         (0.4 * 0.3, 0.4 * 0.8125**0.5),
         strict=True,
     ):
-        assert here.lower is not None
-        assert here.upper is not None
         assert (wide.lower, wide.upper) == pytest.approx(
             (here.lower - more, here.upper + more), abs=1e-9
         )

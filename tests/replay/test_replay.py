@@ -39,7 +39,7 @@ from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.sumo.system import assemble
 
 
-def test_a_replay_that_differs_from_its_row_is_reported(slippery: Path, case: Case) -> None:
+def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
     comparison = comparison_of(
         simulate_with_original(
             case.study, assemble(case.study), case.characteristics.original, filtered=False

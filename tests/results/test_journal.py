@@ -290,7 +290,6 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     code += f"J = Journal(Path({str(path)!r}), {HEAD})\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert other.stdout is not None
     assert other.stdout.readline() == "locked\n"
     with pytest.raises(SafevarError, match=r"a\.jsonl: another process works on this run"):
         Journal(path, HEAD)

@@ -166,7 +166,6 @@ def turned(record: Any, key: str) -> Any:
 
 def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> None:
     wear, joint = load_study("wear"), load_study("wear_joint")
-    assert wear.matrix is not None
     tests = [turned(test, "over") for test in wear.matrix.tests]
     matrix = msgspec.structs.replace(wear.matrix, tests=tests)
     for study, order, changes in (

@@ -271,7 +271,6 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     )
     solutions = load_runs(searched(study, tmp_path / "out")).solutions
     limit = assemble(study).measuring.scoring.safe_original
-    assert limit is not None
     assert (solutions["original_safety_degree"] >= limit).all()
     assert (solutions["outcome"] == "collision").any()
 

@@ -112,7 +112,7 @@ def coasting_loss(start: float, duration: float) -> Callable[..., FloatArray]:
         run = drive(model, population, coasting_after(start), start + duration + 0.5)
         before = run.speed[run.at(start + 0.5)]
         after = run.speed[-1]
-        return np.asarray((before - after) / before)
+        return (before - after) / before
 
     return measured
 
