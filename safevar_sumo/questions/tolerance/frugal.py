@@ -15,6 +15,7 @@ from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import AT_ONE_PHASE
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.asked import Asked
@@ -186,7 +187,7 @@ def answer_roughly(asked: Asked) -> Answer:
         verdict=_verdict(search, alone, is_tested),
         tested=(
             f"{number_of(search.corners, 'corner')} and {search.tried:,} vehicles in search of a"
-            " counterexample."
+            f" counterexample. {AT_ONE_PHASE}"
         ),
         numbers={**_numbers(asked), "scope": scope_of(evaluator.study, between=False)},
         tables={"limits": limits},
