@@ -23,7 +23,7 @@ LEAST_RIGHT = {"repair wear": 0.85, "tolerance wear": 0.85}
 """The least share of the seconds in which the time left is right, where it is below 1."""
 Shown = list[tuple[str, int, int]]
 FAST: list[tuple[Callable[..., Any], Mapping[str, Any]]] = [
-    (sv.explain, {"limit": 2000, "fits": 2, "unsafe": "below=2.7"}),
+    (sv.explain, {"quick": True, "fits": 2, "unsafe": "below=2.7"}),
     (lambda study, **options: sv.compare(study, "smoke", **options), {"samples": 100}),
     (sv.risk, {"samples": 200}),
     (sv.rules, {"samples": 200}),

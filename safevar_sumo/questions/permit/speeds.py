@@ -157,16 +157,19 @@ class SpeedSearch:
         what fails.
         """
         encounters = self._ranges[number]
-        rows = np.concatenate([self._settings(car, places) for car in cars])
+        of_cars = [self._settings(car, places) for car in cars]
+        rows = np.concatenate(of_cars)
+        sizes = [len(of_car) for of_car in of_cars]
         # Values above a known failure of a car need not be met at other phases.
         known = [self.failures[car] for car in cars]
         most = [np.inf if failure is None else failure.value for failure in known]
         values = encounters.values_in(rows)
-        is_open = values <= np.repeat(most, len(rows) // len(cars))
+        is_open = values <= np.repeat(most, sizes)
         robustness = encounters.robustness(rows, self._stage)
         rows, robustness = encounters.at_worst_phases(rows, robustness, is_open, self._stage)
+        ends = np.cumsum(sizes)[:-1]
         for car, own, left in zip(
-            cars, np.split(rows, len(cars)), np.split(robustness, len(cars)), strict=True
+            cars, np.split(rows, ends), np.split(robustness, ends), strict=True
         ):
             self._note(car, encounters, own, left)
             self._met[car][number].append((own, left))
