@@ -300,7 +300,8 @@ class JointSearch:
         self.found = nothing._replace(boxes=number)
         self._note(search.models)
         # At the worst phases of encounters the own set cuts it, too.
-        self.cut(self.own, _nothing(self.own))
+        if self.own.in_phases is not None:
+            self.cut(self.own, _nothing(self.own))
 
     def cut(self, model: Model, unsafe_settings: FloatArray) -> None:
         """Cut the box until it holds with a further parameter set, too, and holds none of
