@@ -345,8 +345,8 @@ class Question:
         verdict = " ".join(
             filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )
-        following = self._following(subjects[0], evaluator, called)
-        return replace(answer, verdict=verdict, numbers=numbers, next=following or answer.next)
+        following = self._following(subjects[0], evaluator, called) or answer.next
+        return replace(answer, verdict=verdict, numbers=numbers, next=following)
 
     def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
@@ -355,8 +355,9 @@ class Question:
         from safevar_sumo.questions.answer import contents_of
 
         declared = contents_of(self.compute)
-        is_vain = evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion
-        if not (declared and declared.next and called) or is_vain:
+        if not (declared and declared.next and called) or (
+            evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion
+        ):
             return ""
         is_too_early = declared.next == "report" and isinstance(subject, Study)
         return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {quote(called)}"
