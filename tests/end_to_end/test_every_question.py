@@ -159,6 +159,7 @@ QUESTIONS = (
     "permit {0} --quick --fits 0 --others new --set {1}",
     "permit {0} --quick --fits 0 --others new --set {2}",
     "tables {0}",
+    "check kind.toml",
     "export {0} --solution rs:0:0 --to openscenario --out exported",
     'report {0} --ask "rules --samples 16" --out it.html',
 )
@@ -181,7 +182,6 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
     values = f"{first}={row.original!r}", worn
     questions = () if name == RATED else QUESTIONS
     assert_next_answers(*(answered(each.format("results", *values, few=few)) for each in questions))
-    assert answered("check kind.toml")
     # The usual questions where they take little time: a rating, and none that has an answer.
     ask = "" if name in (RATED, "stop") else '--ask "rules --samples 16"'
     answered(f"evidence results {ask} --out it.zip", must=True)
