@@ -42,7 +42,7 @@ SCOPE = "Scope: "
 NOTES = (
     *(SCOPE, "Remark: ", "Changed: ", "Criterion: ", "Not simulated: ", "Counted as unsafe: "),
     "Safe means: ",
-    *("Only encounters count", "Only vehicles that satisfy", "Left out"),
+    *("Only encounters count", "Only vehicles that satisfy", "Left out", "The fewest changes"),
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200

@@ -181,8 +181,7 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
     for item in case.characteristics:
         if item.name in leading["boundary"]:
             value = leading["boundary"][item.name]
-            side = "above" if value > item.original else "below"
-            assert float(re.search(rf"{item.short_name} {side} ([\d.]+)", verdict)[1]) == value  # type: ignore[index]
+            assert float(re.search(rf"{item.short_name} at ([\d.]+)", verdict)[1]) == value  # type: ignore[index]
     share = f"{100 * leading['robust_share']:.0f} % of vehicles with slightly different values"
     assert re.search(
         rf"^With .* the vehicle collides\. The cause d.* exact values: .*{share} are unsafe, too\.",
@@ -419,5 +418,4 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
     assert [
         len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")
     ] == [0, 0, 0]
-    assert len(answer.tables["solutions"]) == 1
     assert "Minimal causes" not in answer.render("text")

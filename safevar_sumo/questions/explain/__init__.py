@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
@@ -22,6 +23,7 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.combinations import COMBINATIONS
 from safevar_sumo.questions.explain.failures import (
     SAMPLED_SETTINGS,
     TO_EXPLAIN,
@@ -29,7 +31,16 @@ from safevar_sumo.questions.explain.failures import (
     choose_failures,
     gather_failures,
 )
-from safevar_sumo.questions.explain.robustness import robustness_in_words
+from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
+from safevar_sumo.questions.explain.smallest import (
+    MAX_SETTINGS,
+    SMALLEST_COLUMNS,
+    SMALLEST_NUMBERS,
+    STAIRCASE_COLUMNS,
+    Smallest,
+    draw_staircase,
+    tables_of,
+)
 from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
     CHARACTERISTIC_COLUMNS,
@@ -72,6 +83,10 @@ LIMIT, QUICK_LIMIT = 40_000, 4_000
 """Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
 if all would take more, a random sample is analysed.
 """
+OF_SAMPLE = 600
+"""Settings for the minimal causes of failures that were sampled over the domain, at least."""
+BEYOND = 256
+"""Number of vehicles beyond the values of a cause that are simulated."""
 FOR_ONE = 800
 """Settings for each failure that is explained, where few simulations are allowed."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
@@ -91,10 +106,11 @@ SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over t
         "original_outcome",
         "original_degree",
     ),
-    *("rough", "analysed", "explained", *COLLISION_NUMBERS),
+    *("rough", "analysed", "explained", *COLLISION_NUMBERS, *SMALLEST_NUMBERS),
     lead="causes",
     next="tolerance",
-    causes=CAUSE_COLUMNS,
+    causes=SMALLEST_COLUMNS | CAUSE_COLUMNS,
+    staircase=STAIRCASE_COLUMNS,
     solutions=SOLUTION_COLUMNS,
     characteristics=CHARACTERISTIC_COLUMNS,
     drivers=DRIVER_COLUMNS,
@@ -113,7 +129,8 @@ def explain(
     """Explain failures: which changes are necessary, how small they may be, and whether another
     driver would have avoided the collision in the same vehicle.
 
-    Of a study without results, failures among vehicles sampled over its whole domain are explained.
+    Of a study without results, all combinations of changes to an end of their domains are
+    simulated by their number, and then vehicles sampled over the whole domain.
 
     Parameters
     ----------
@@ -130,21 +147,32 @@ def explain(
     quick
         A rough answer: the study's own parameter set alone, and causes of few failures.
     """
-    limit = LIMIT
-    if quick:
-        fits, limit = 0, QUICK_LIMIT
+    of_study = isinstance(subject, Study)
+    limit = QUICK_LIMIT if quick or of_study else LIMIT
+    if of_study:
+        limit = max(limit, OF_SAMPLE * len(evaluator.system.points))
+    fits = 0 if quick else fits
     study = evaluator.study
     settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
-    evaluator.plan({TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)} | LATER)
+    planned = {TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)}
+    evaluator.plan(planned | ({COMBINATIONS: MAX_SETTINGS} if of_study else {}) | LATER)
 
-    # The failures, and the minimal causes of a sample of them, of a smaller one where few
-    # simulations are allowed.
+    # The failures.
     if evaluator.left is not None:
-        fits, limit = 0, evaluator.left // 4
+        fits = 0
         top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
-    reasons, sample, causes = choose_failures(population, evaluator, limit, top)
+
+    # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
+    # of a smaller one where few simulations are allowed.
+    smallest = None
+    if of_study and _has_causes(population, study):
+        smallest = Smallest.of(evaluator, population.unsafe, fits)
+    if evaluator.left is not None:
+        limit = evaluator.left // 4
+    top = 0 if of_study else top
+    reasons, sample, causes, complete = choose_failures(population, evaluator, limit, top)
     is_caused = _has_causes(population, study)
     of_chosen, of_sample = (
         [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
@@ -161,8 +189,13 @@ def explain(
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
+    if of_study:
+        leading = tables_of(smallest)
+    else:
+        found = causes_table(population, evaluator, fits, solutions, of_chosen, distinct)
+        leading = {"causes": found}
     tables = {
-        "causes": causes_table(population, evaluator, fits, solutions, of_chosen, distinct),
+        **leading,
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions),
         "distinct_causes": distinct_table(distinct),
@@ -170,10 +203,17 @@ def explain(
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
         **(_collision_numbers(verdicts, collisions) if has_drivers else NO_COLLISION_NUMBERS),
+        **(smallest.numbers if smallest is not None else {}),
     }
     kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
+    verdict = _verdict(evaluator, population, tables["causes"])
+    if smallest is not None:
+        verdict = smallest.sentences(evaluator, population.unsafe)
     sentences = [
-        *_verdict(evaluator, population, tables["causes"]),
+        *verdict,
+        f"All minimal causes of up to {number_of(complete, 'change')} are found."
+        if complete
+        else "",
         _avoided_in_words(verdicts),
         _number_in_words(population, kind),
         *_counted(study, population, kind),
@@ -184,7 +224,7 @@ def explain(
         verdict=" ".join(filter(None, sentences)),
         numbers=numbers,
         tables=tables,
-        draw=draw_needed,
+        draw=draw_staircase if smallest is not None else draw_needed,
     )
 
 
@@ -276,23 +316,46 @@ def _verdict(evaluator: Evaluator, population: Population, causes: pd.DataFrame)
         yield "The original vehicle itself is unsafe in this encounter: no change is necessary."
         return
 
-    # Its limits, its encounter, and how sure the cause is.
+    # Its values, its encounter, and how sure the cause is.
     members = evaluator.characteristics
     boundary = leading["boundary"]
-    limits = []
-    for item in members:
-        if item.name in boundary:
-            side = "above" if boundary[item.name] > item.original else "below"
-            limits.append(f"{item.short_name} {side} {limit_text(item, boundary[item.name])}")
+    values = [
+        f"{item.short_name} at {limit_text(item, boundary[item.name])}"
+        for item in members
+        if item.name in boundary
+    ]
     encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
     where = " in an encounter in which the original vehicle is safe" if encounter else ""
     verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    yield f"With {join_phrases(limits)} the vehicle {verb}{where}."
+    yield f"With {join_phrases(values)} the vehicle {verb}{where}."
     yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
+    yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
     yield robustness_in_words(leading["robust_share"])
     if pd.notna(leading["holds"]):
         holding = f"{leading['holds']} of {leading['fits']}"
         yield f"The cause holds in {holding} parameter sets of the vehicle model."
+
+
+def _beyond_in_words(
+    evaluator: Evaluator, unsafe: Unsafe, cause: dict[str, float], encounter: dict[str, float]
+) -> str:
+    """The share of vehicles beyond all values of a cause, all else as in the original, that are
+    unsafe, in a sentence; empty if there are none, or too few may be simulated.
+    """
+    members = evaluator.characteristics
+    number = evaluator.at_most(BEYOND, 4)
+    at_cause = members.setting(cause | encounter, beyond=True)
+    ends = np.where(at_cause > members.original, members.upper, members.lower)
+    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
+    if number < LEAST_NEIGHBOURS or not is_open.any():
+        return ""
+    shares = np.random.default_rng(evaluator.study.search.seed).random((number, len(members)))
+    vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
+    runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
+    share = share_in_words(float(np.mean(unsafe.of(runs))))
+    verbs = "collide" if str(unsafe) == Outcome.COLLISION else "are unsafe"
+    whose = "these values" if len(cause) > 1 else "this value"
+    return f"Of {number} vehicles beyond {whose}, all else as in the original, {share} {verbs}."
 
 
 def _avoided_in_words(verdicts: pd.DataFrame) -> str:

@@ -19,6 +19,7 @@ from safevar_sumo.questions.causes import (
     count_distinct_causes,
     directions,
     find_minimal_causes,
+    largest_complete,
     select_affordable_rows,
 )
 from safevar_sumo.questions.evaluator import Evaluator
@@ -42,6 +43,10 @@ DISTINCT_CAUSE = "a cause of its own"
 SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
 """Number of settings drawn from the whole domain if there are no results, in an unrated and in a
 rated study.
+"""
+SAMPLED_SIMULATIONS, LEAST_SAMPLED_SETTINGS = 40_000, 1024
+"""Number of simulations up to which they are as many, at all points of a matrix, and the least
+number.
 """
 
 
@@ -140,7 +145,10 @@ class _Candidates(NamedTuple):
 
 def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     """Settings drawn from a study's whole domain."""
-    number = RATED_SAMPLED_SETTINGS if is_rated(study) else SAMPLED_SETTINGS
+    affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
+    number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
+    if is_rated(study):
+        number = RATED_SAMPLED_SETTINGS
     number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
@@ -165,13 +173,14 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
 
 
 class Chosen(NamedTuple):
-    """Why failures are chosen, by row; the rows of a sample of all failures; and the minimal causes
-    of both, by row.
+    """Why failures are chosen, by row; the rows of a sample of all failures; the minimal causes of
+    both, by row; and the number of changes up to which these are all, None without a bound.
     """
 
     reasons: Reasons
     sample: list[int]
     causes: dict[int, list[Cause]]
+    complete: int | None
 
 
 def choose_failures(population: Population, evaluator: Evaluator, limit: int, top: int) -> Chosen:
@@ -185,16 +194,18 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
 
     # Named failures are explained all.
     settings = population.evaluations.settings
+    limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     if population.is_named:
-        found = find_minimal_causes(evaluator, settings[rows], population.unsafe)
-        return Chosen(dict.fromkeys(rows, REQUESTED), rows, dict(zip(rows, found, strict=True)))
+        found = find_minimal_causes(evaluator, settings[rows], population.unsafe, limit)
+        reasons = dict.fromkeys(rows, REQUESTED)
+        causes = dict(zip(rows, found, strict=True))
+        return Chosen(reasons, rows, causes, _complete(population, rows, limit))
 
     # Causes of a sample, and of failures that matter.
-    limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
     sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
     reasons = dict(list(_failures_that_matter(population).items())[:top])
     analysed = sorted({*sample, *reasons})
-    found = find_minimal_causes(evaluator, settings[analysed], population.unsafe)
+    found = find_minimal_causes(evaluator, settings[analysed], population.unsafe, 2 * limit)
     causes = dict(zip(analysed, found, strict=True))
     runs = population.evaluations
 
@@ -212,7 +223,14 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
                 of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row)
             )
             reasons[simplest] = DISTINCT_CAUSE
-    return Chosen(reasons, sample, causes)
+    return Chosen(reasons, sample, causes, _complete(population, analysed, 2 * limit))
+
+
+def _complete(population: Population, rows: list[int], limit: int) -> int | None:
+    """The number of changes up to which all minimal causes of some rows are found; None if all."""
+    numbers = population.evaluations.f_num_diff[rows].astype(int).tolist()
+    complete = largest_complete(numbers, limit)
+    return complete if complete < max(numbers, default=0) else None
 
 
 def _failures_that_matter(population: Population) -> Reasons:

@@ -192,7 +192,7 @@ def causes_table(
         robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
 
     # With how many parameter sets it is one.
-    holding = _holding(evaluator, fits, causes, unsafe)
+    holding = causes_holding(evaluator, fits, causes, unsafe)
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -271,7 +271,7 @@ def printed_limits(
     ]
 
 
-def _holding(
+def causes_holding(
     evaluator: Evaluator, sets: int, causes: Sequence[Cause], unsafe: Unsafe
 ) -> list[BoolArray]:
     """Whether each cause is one, with each of the first `sets` parameter sets."""

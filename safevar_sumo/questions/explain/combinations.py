@@ -1,0 +1,201 @@
+"""The smallest changes that are unsafe, by enumeration: each characteristic is as in the original
+vehicle or at an end of its domain, and combinations are simulated by size, without those that
+contain a smaller cause.
+
+Nothing is inferred from other combinations, as a further change may make a vehicle safe again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, product
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.causes import Cause
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.records import FloatArray
+from safevar_sumo.vehicles import CharacteristicSet
+
+COMBINATIONS = "combinations of changes"
+"""The stage of progress."""
+SHARES = tuple(percent / 100 for percent in range(100, 0, -10))
+"""Shares of the way to the ends of the domain at which the fewest changes are sought."""
+MAX_COMBINATIONS = 200_000
+"""Largest number of combinations of a size that is begun, as the likely ones come first."""
+
+Change = tuple[int, float]
+"""A column, and its value."""
+Combination = frozenset[Change]
+
+
+class Enumeration(NamedTuple):
+    """The combinations of changes that are unsafe while all smaller ones within them are safe.
+
+    Attributes
+    ----------
+    share
+        The share of the way to the end of the domain at which each change is.
+    causes
+        The unsafe combinations, the smallest first.
+    simulated, existing
+        How many combinations of each size were simulated, and how many there are that contain no
+        smaller cause and violate no constraint.
+    """
+
+    share: float
+    causes: list[Cause]
+    simulated: dict[int, int]
+    existing: dict[int, int]
+
+    @property
+    def tried(self) -> int:
+        return sum(self.simulated.values())
+
+    @property
+    def complete_up_to(self) -> int:
+        """The largest size up to which all combinations were simulated."""
+        sizes = range(len(self.existing) + 1)
+        return max(size for size in sizes if self._is_complete(size))
+
+    def _is_complete(self, largest: int) -> bool:
+        sizes = range(1, largest + 1)
+        return all(self.simulated[size] == self.existing[size] for size in sizes)
+
+    @property
+    def size(self) -> int:
+        """The fewest changes that are unsafe; 0 if none was found."""
+        return len(self.causes[0].changes) if self.causes else 0
+
+    @property
+    def fewest(self) -> list[Cause]:
+        """The causes with the fewest changes."""
+        return [one for one in self.causes if len(one.changes) == self.size]
+
+
+def enumerate_causes(
+    evaluator: Evaluator,
+    unsafe: Unsafe,
+    limit: int,
+    share: float = 1.0,
+    *,
+    only_fewest: bool = False,
+) -> Enumeration:
+    """All causes of changes at a `share` of the way to the ends of their domains, with at most
+    `limit` simulated settings. The last size may be begun only, with the combinations whose single
+    changes add up to the worst; with `only_fewest` the first size with a cause is the last, and a
+    size is simulated as a whole or not at all.
+
+    In a study that searches its scenario a combination is simulated in the original encounter and
+    in the critical ones, as `Evaluator.evaluate_over_encounters` says.
+    """
+    # The changes, and what one combination costs.
+    members = evaluator.characteristics
+    changes = _changes(members, share)
+    columns = {column for column, _ in changes}
+    room = limit // (1 + len(evaluator.critical_encounters))
+    effects = dict.fromkeys(changes, np.inf)  # what each leaves by itself
+    found = Enumeration(share, [], {}, {})
+    unsafe_ones = list[Combination]()
+
+    for size in range(1, len(columns) + 1):
+        # A size is begun while all its combinations can be put in order.
+        if comb(len(columns), size) * 2**size > MAX_COMBINATIONS:
+            break
+        candidates = [
+            each for each in _of_size(changes, size) if not any(one <= each for one in unsafe_ones)
+        ]
+        if candidates:
+            is_feasible = evaluator.region.feasible(_settings(members, candidates))
+            candidates = [each for each, flag in zip(candidates, is_feasible, strict=True) if flag]
+        if only_fewest and (found.causes or len(candidates) > room):
+            break
+
+        # Those whose single changes are worst come first.
+        candidates.sort(key=lambda each: sum(effects[change] for change in each))
+        chosen = candidates[:room]
+        room -= len(chosen)
+        if candidates and not chosen:
+            break
+        found.existing[size] = len(candidates)
+        found.simulated[size] = len(chosen)
+        left, causes = _robustness(evaluator, unsafe, chosen)
+        if size == 1:
+            effects |= {change: value for (change,), value in zip(chosen, left, strict=True)}
+        for index in np.flatnonzero(left < 0).tolist():
+            found.causes.append(causes[index])
+            unsafe_ones.append(chosen[index])
+    return found
+
+
+def staircase(
+    evaluator: Evaluator, unsafe: Unsafe, at_ends: Enumeration, limit: int
+) -> list[Enumeration]:
+    """The fewest changes that are unsafe while no change goes beyond a share of the way to its end,
+    for each of `SHARES`, down to the first without any; with at most `limit` simulated settings.
+    """
+    steps = [at_ends]
+    while steps[-1].causes and len(steps) < len(SHARES):
+        share = SHARES[len(steps)]
+        step = enumerate_causes(evaluator, unsafe, limit, share, only_fewest=True)
+        if not step.tried:
+            break
+        limit -= step.tried * (1 + len(evaluator.critical_encounters))
+        steps.append(step)
+    return steps
+
+
+def _changes(members: CharacteristicSet, share: float) -> list[Change]:
+    """The changes of one characteristic."""
+    return [
+        (column, end if share == 1 else item.original + share * (end - item.original))
+        for column, item in enumerate(members)
+        for end in (item.lower, item.upper)
+        if not item.is_scenario and end != item.original
+    ]
+
+
+def _of_size(changes: list[Change], size: int) -> Iterator[Combination]:
+    """All combinations of changes of so many different characteristics."""
+    sides: dict[int, list[Change]] = {}
+    for change in changes:
+        sides.setdefault(change[0], []).append(change)
+    for columns in combinations(sides.values(), size):
+        yield from map(frozenset, product(*columns))
+
+
+def _settings(members: CharacteristicSet, chosen: list[Combination]) -> FloatArray:
+    """The original vehicle with each of M combinations, shape (M, n)."""
+    settings = np.tile(members.original, (len(chosen), 1))
+    for setting, combination in zip(settings, chosen, strict=True):
+        for column, value in combination:
+            setting[column] = value
+    return settings
+
+
+def _robustness(
+    evaluator: Evaluator, unsafe: Unsafe, chosen: list[Combination]
+) -> tuple[FloatArray, list[Cause]]:
+    """What each of M combinations leaves to the limit, shape (M,), below 0 where it is unsafe; and
+    each as a cause, in its worst encounter.
+    """
+    members = evaluator.characteristics
+    names = members.names
+    if not chosen:
+        return np.zeros(0), []
+    runs = evaluator.evaluate_over_encounters(_settings(members, chosen), unsafe, COMBINATIONS)
+    causes = [
+        Cause(
+            changes={names[column]: value for column, value in sorted(combination)},
+            outcome=str(outcome),
+            safety_degree=float(degree),
+            encounter={item.name: members.named(setting)[item.name] for item in members.scenario},
+        )
+        for combination, outcome, degree, setting in zip(
+            chosen, runs.outcome, runs.f_safe, runs.settings, strict=True
+        )
+    ]
+    return np.where(runs.valid, unsafe.robustness(runs), np.inf), causes
