@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -242,11 +242,11 @@ over = { speed = [40, 60] }
 """
 
 
-def own_search(study: Study) -> PermitSearch:
+def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     span = span_of(study, None)
     own = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
     values = np.arange(span.low, span.high + 1)
-    return PermitSearch(Models((own,), ()), span, values, LEAST_SIMULATIONS)
+    return PermitSearch(Models((own,), ()), span, values, budget)
 
 
 def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
@@ -264,6 +264,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     assert permit(study, cars={"a": {}}, others="new", fits=0, quick=True, by="impact_location")
 
 
+@settings(max_examples=25)
 @given(
     begin=st.floats(10.1, 58),
     width=st.floats(1.1, 20),
@@ -276,13 +277,15 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     study = load_study("wear_joint")
 
     def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
-        speed, location = self.as_printed(settings)[:, -2:].T
+        members = self.model.evaluator.characteristics
+        columns = members.columns(self.as_printed(settings))
+        speed, location = columns["speed"], columns["impact_location"]
         fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
         return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EncounterRange, "robustness", robustness)
-        search = own_search(study)
+        search = own_search(study, 2 * LEAST_SIMULATIONS)
         (found,) = search.reach(
             [Cars.one(assemble(study).characteristics.vehicle.original)], [None]
         )
