@@ -93,7 +93,7 @@ def permit(
     need
         A speed that the cars have to drive, with its unit; exit code 3 if one of them may not.
     by
-        Another searched parameter, or axis of the matrix, in place of the speed.
+        Another speed that the study varies, such as that of the target.
     step
         Distance of the speeds that are tried, to which the answer is rounded down.
     margin
