@@ -192,8 +192,10 @@ def test_all_cars_within_limits(short: Study) -> None:
 
 def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
     cars = {"new": {}, "worn": {"treadDepth": 3}}
-    answer = permit(short, cars=cars, others="new", fits=0, quick=True)
+    answer = permit(short, cars=cars, others="new", quick=True)
     assert answer.numbers["rough"]
+    assert answer.numbers["fits"] == 1
+    assert "the study's own parameter set alone" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
     assert set(answer.table()["verdict"]) == {"up to"}
 
