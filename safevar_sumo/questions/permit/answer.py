@@ -168,7 +168,7 @@ class PermitAnswer:
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
             may = "may not drive" if pd.isna(up_to) else f"may drive up to {up_to:g}{unit}"
-            sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
+            sentences[0] = f"{name} {may}; {new_car}."
             sentences.append(because_of)
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")

@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
@@ -18,6 +19,8 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
 from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
+from safevar_sumo.questions.tables import as_given
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
@@ -26,7 +29,7 @@ CAR = "car"
 """Natural header of the column that names the cars, which the answer has, too."""
 NEW = "new"
 """Value of `--others`: a characteristic without a value is as in the original vehicle."""
-TYPED, THIS_CAR = "--set", "this car"
+TYPED, THIS_CAR = "--set", "This car"
 """The option of typed values, and the name of the car that has them."""
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma"}
 """Separators of columns: the first one that the header has outside of quotation marks is meant."""
@@ -37,6 +40,8 @@ NUMBERS = {
     ",": re.compile(NUMBER_PATTERN.replace(r"\.", ","), re.ASCII),
 }
 """Numbers by their decimal mark."""
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
+"""Where a comma may be the decimal mark, 1.250 means 1250 as often as 1.25."""
 
 
 class Fleet(NamedTuple):
@@ -128,13 +133,14 @@ def read_fleet(
     # An answer beside the list that it is about, which may have had semicolons and decimal commas.
     written = {*answer_columns} - {CAR}
     if is_answer := written <= {text.strip() for text in cells.header}:
-        cells = cells._replace(separator=";")
+        header, *rows = [[*map(as_given, row)] for row in (cells.header, *cells.rows)]
+        cells = cells._replace(header=header, rows=rows)
         ignore, answer_columns = [*ignore, *written], ()
 
     # The columns, the names in the first one, and the values.
     naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
     names = _names(cells, naming)
-    settings, measured = _values(cells, columns, vehicle)
+    settings, measured = _values(cells, columns, vehicle, has_commas=is_answer)
     settings = _completed(cells, settings, study, vehicle, others)
     _check_constraints(cells, settings, study, vehicle)
     table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
@@ -201,10 +207,11 @@ def _cells_of_file(path: Path) -> _Cells:
     header = records[0][1]
     for line, record in records:
         if len(record) != len(header):
-            expected = f"{len(header)} fields, as in the header"
+            of_header = f"separated by a {SEPARATORS[separator]}, as in the header"
+            expected = f"{number_of(len(header), 'field')} {of_header}"
             if len(record) > len(header) and separator == ",":
                 expected += "; a decimal comma is read only with semicolons between the columns"
-            raise InputError(f"{path}, line {line}", f"{len(record)} fields", expected)
+            raise InputError(f"{path}, line {line}", number_of(len(record), "field"), expected)
     places = [f"{path}, line {line}" for line, _ in records[1:]]
     return _Cells(place, header, places, [record for _, record in records[1:]], separator)
 
@@ -301,21 +308,28 @@ def _names(cells: _Cells, naming: int) -> list[str]:
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
             if not name or not name.isprintable():
                 raise InputError("", f"{name!r} is no name of a car", "a text of one line")
-            if name in places:
-                first = f"a name that no other car has ({places[name]})"
+            # Names that differ in case, blanks or the form of their characters are one.
+            key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+            if key in places:
+                first = f"a name that no other car has ({places[key]})"
                 raise InputError("", f"the car {name!r} is there twice", first)
-        places[name] = place
-    return list(places)
+        places[key] = place
+    return [row[naming].strip() for row in cells.rows]
 
 
 def _values(
-    cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet
+    cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet, *, has_commas: bool
 ) -> tuple[FloatArray, BoolArray]:
     """The values of all cells, nan where one is empty, and which cells have one."""
-    # Commas are decimal marks of the whole file where semicolons separate its columns.
+    # Commas are decimal marks of the whole file where semicolons separate its columns, and in an
+    # answer about such a file.
     stated = [row[column].strip() for row in cells.rows for column in columns]
-    has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
-    mark = "," if cells.separator == ";" and has_commas else "."
+    has_commas |= cells.separator == ";"
+    has_commas &= any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
+    mark = "," if has_commas else "."
+    with_points = [text for text in stated if "." in text]
+    if cells.separator == ";" and mark == "." and all(map(THOUSANDS.fullmatch, with_points)):
+        mark = ""
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
     for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
         for column, number in columns.items():
@@ -325,19 +339,26 @@ def _values(
     return settings, ~np.isnan(settings)
 
 
-def _number(text: str, mark: str, characteristic: Characteristic) -> float:
+def _number(text: str, mark: str, item: Characteristic) -> float:
     """The value of a cell; refuses what is no number with the decimal mark, or outside of the
     domain.
     """
+    if not mark and "." in text:
+        legal = f"{text.replace('.', '')} or {text.replace('.', ',')}, as a comma is a decimal mark"
+        raise InputError("", f"{text!r} may have a decimal point or one of thousands", legal)
+    mark = mark or "."
     if not NUMBERS[mark].fullmatch(text):
-        domain = f"[{characteristic.lower:g}, {characteristic.upper:g}]{characteristic.suffix}"
+        domain = f"[{item.lower:g}, {item.upper:g}]{item.suffix}"
         marks = "a decimal comma, as others of the file" if mark == "," else "a decimal point"
         if "," in text and mark != ",":
             marks += "; a decimal comma is read only with semicolons between the columns"
         problem = f"{text!r} is no number with {marks.partition(';')[0]}"
         raise InputError("", problem, f"a number in {domain}, with {marks}")
     value = float(text.replace(",", "."))
-    characteristic.check(value, switch="")
+    # A part may be better than that of a new car, where that is an end of the domain.
+    side, end = ("most", item.upper) if value > item.upper else ("least", item.lower)
+    hint = f"; at {side} {end:g}: enter {end:g}" if end == item.original else ""
+    item.check(value, otherwise=hint, switch="")
     return value
 
 
