@@ -161,7 +161,7 @@ def render(answer: Answer, form: str, table: str | None = None, *, details: bool
     """
     if form == "csv":
         frame = answer.table(table) if table or answer.listing is None else answer.listing
-        return frame.map(csv_cell).rename(columns=csv_cell).to_csv(index=False, lineterminator="\n")
+        return frame.map(csv_cell).to_csv(index=False, lineterminator="\n")
     if table is not None:
         answer = answer.only(table)
     if form == "json":

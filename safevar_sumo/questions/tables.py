@@ -19,8 +19,6 @@ from safevar_sumo.terminal import WholeTable
 LOW = "_low"
 HIGH = "_high"
 """Ends of the names of two columns that hold the ends of the interval of a third column."""
-FORMULA = re.compile(r"'*[=@+-](?![\d.,]*$)")
-"""The beginning of a text that a spreadsheet computes, also behind apostrophes, and no number."""
 LONG_TEXT = 60
 """Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room
 [characters].
@@ -130,7 +128,8 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:{number_format}}"
+        text = f"{value:{number_format}}"
+        return f"{value:,.0f}" if "e+" in text else text
     if isinstance(value, dict):
         return (
             ", ".join(f"{name} {cell_text(inner, number_format)}" for name, inner in value.items())
@@ -144,16 +143,8 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
 
 
 def csv_cell(value: Any) -> Any:
-    """A value as CSV has it: a list as words, and a text that a spreadsheet would take for a
-    formula behind an apostrophe.
-    """
-    value = " ".join(map(str, value)) if isinstance(value, list) else value
-    return f"'{value}" if isinstance(value, str) and FORMULA.match(value) else value
-
-
-def as_given(text: str) -> str:
-    """The text of a cell that `csv_cell` wrote."""
-    return text[1:] if text[:1] == "'" and FORMULA.match(text) else text
+    """A value as CSV has it: a list as words."""
+    return " ".join(map(str, value)) if isinstance(value, list) else value
 
 
 def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:

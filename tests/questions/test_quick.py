@@ -71,7 +71,7 @@ def test_on_a_terminal_the_rough_answer_comes_first(
         assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal
 
 
-@pytest.mark.parametrize("command", ["permit", "tolerance", "repair", "explain", "report"])
-def test_rough_means_the_same_everywhere(command: str) -> None:
-    said = " ".join(run(command, "--help").stdout.split())
-    assert "the study's own parameter set alone, and a short search." in said
+def test_rough_means_the_same_everywhere() -> None:
+    for command in ("permit", "tolerance", "repair", "explain", "report"):
+        said = " ".join(run(command, "--help").stdout.split())
+        assert "the study's own parameter set alone, and a short search." in said

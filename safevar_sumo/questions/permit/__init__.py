@@ -208,13 +208,9 @@ def read_cars(
             f"All cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
         }
     written = [*CARS, DIGEST]
-    fleet = read_fleet(
+    return read_fleet(
         study, members, cars, values, others=others, ignore=ignore, answer_columns=written
     )
-    # Limits are no measured values of a list.
-    table = fleet.table
-    empty = dict.fromkeys(table.columns[1:], "")
-    return fleet._replace(table=table.assign(**empty)) if limits else fleet
 
 
 def _check_forms(

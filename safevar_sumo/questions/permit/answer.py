@@ -209,7 +209,10 @@ class PermitAnswer:
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""
         manifest = manifest_now(self.study, assemble(self.study))
-        listing = pd.concat([fleet.table.reset_index(drop=True), cars.drop(columns="car")], axis=1)
+        given = fleet.table.reset_index(drop=True)
+        # Limits are no measured values of a car.
+        given = given[given.columns[:1]] if self.is_box else given
+        listing = pd.concat([given, cars.drop(columns="car")], axis=1)
         listing[DIGEST] = identity_digest(manifest)[:12]
         return listing
 

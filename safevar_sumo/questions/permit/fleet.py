@@ -19,7 +19,6 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
 from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
-from safevar_sumo.questions.tables import as_given
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
@@ -38,10 +37,15 @@ SEPARATOR_LINE = re.compile(r"sep=(.)\r?\n", re.IGNORECASE)
 NUMBERS = {
     ".": re.compile(NUMBER_PATTERN, re.ASCII),
     ",": re.compile(NUMBER_PATTERN.replace(r"\.", ","), re.ASCII),
+    ";": re.compile(rf"(?![+-]?[1-9]\d{{0,2}}\.\d{{3}}$){NUMBER_PATTERN}", re.ASCII),
 }
-"""Numbers by their decimal mark."""
-THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(\.\d{3})+", re.ASCII)
-"""Where a comma may be the decimal mark, 1.250 means 1250 as often as 1.25."""
+"""Numbers by their decimal mark; between semicolons 1.250 means 1250 as often as 1.25."""
+MARKS = {
+    ".": "a decimal point (a decimal comma is read only with semicolons between the columns)",
+    ",": "a decimal comma, as others of the file",
+    ";": "a decimal comma, or with a point that cannot be one of thousands",
+}
+"""These marks in words."""
 
 
 class Fleet(NamedTuple):
@@ -133,14 +137,13 @@ def read_fleet(
     # An answer beside the list that it is about, which may have had semicolons and decimal commas.
     written = {*answer_columns} - {CAR}
     if is_answer := written <= {text.strip() for text in cells.header}:
-        header, *rows = [[*map(as_given, row)] for row in (cells.header, *cells.rows)]
-        cells = cells._replace(header=header, rows=rows)
+        cells = cells._replace(separator=",;")
         ignore, answer_columns = [*ignore, *written], ()
 
     # The columns, the names in the first one, and the values.
     naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
     names = _names(cells, naming)
-    settings, measured = _values(cells, columns, vehicle, has_commas=is_answer)
+    settings, measured = _values(cells, columns, vehicle)
     settings = _completed(cells, settings, study, vehicle, others)
     _check_constraints(cells, settings, study, vehicle)
     table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
@@ -207,10 +210,7 @@ def _cells_of_file(path: Path) -> _Cells:
     header = records[0][1]
     for line, record in records:
         if len(record) != len(header):
-            of_header = f"separated by a {SEPARATORS[separator]}, as in the header"
-            expected = f"{number_of(len(header), 'field')} {of_header}"
-            if len(record) > len(header) and separator == ",":
-                expected += "; a decimal comma is read only with semicolons between the columns"
+            expected = f"{len(header)} fields with a {SEPARATORS[separator]} between them"
             raise InputError(f"{path}, line {line}", number_of(len(record), "field"), expected)
     places = [f"{path}, line {line}" for line, _ in records[1:]]
     return _Cells(place, header, places, [record for _, record in records[1:]], separator)
@@ -306,8 +306,9 @@ def _names(cells: _Cells, naming: int) -> list[str]:
     for row, place in zip(cells.rows, cells.places, strict=True):
         name = row[naming].strip()
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
-            if not name or not name.isprintable():
-                raise InputError("", f"{name!r} is no name of a car", "a text of one line")
+            if not name or not name.isprintable() or name[0] in "=+-@":
+                legal = "a text of one line that does not begin with =, +, - or @, as formulas do"
+                raise InputError("", f"{name!r} is no name of a car", legal)
             # Names that differ in case, blanks or the form of their characters are one.
             key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
             if key in places:
@@ -318,18 +319,15 @@ def _names(cells: _Cells, naming: int) -> list[str]:
 
 
 def _values(
-    cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet, *, has_commas: bool
+    cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet
 ) -> tuple[FloatArray, BoolArray]:
     """The values of all cells, nan where one is empty, and which cells have one."""
     # Commas are decimal marks of the whole file where semicolons separate its columns, and in an
     # answer about such a file.
     stated = [row[column].strip() for row in cells.rows for column in columns]
-    has_commas |= cells.separator == ";"
-    has_commas &= any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
-    mark = "," if has_commas else "."
-    with_points = [text for text in stated if "." in text]
-    if cells.separator == ";" and mark == "." and all(map(THOUSANDS.fullmatch, with_points)):
-        mark = ""
+    has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
+    mark = ";" if cells.separator == ";" else "."
+    mark = "," if ";" in cells.separator and has_commas else mark
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
     for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
         for column, number in columns.items():
@@ -343,22 +341,14 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
     """The value of a cell; refuses what is no number with the decimal mark, or outside of the
     domain.
     """
-    if not mark and "." in text:
-        legal = f"{text.replace('.', '')} or {text.replace('.', ',')}, as a comma is a decimal mark"
-        raise InputError("", f"{text!r} may have a decimal point or one of thousands", legal)
-    mark = mark or "."
     if not NUMBERS[mark].fullmatch(text):
-        domain = f"[{item.lower:g}, {item.upper:g}]{item.suffix}"
-        marks = "a decimal comma, as others of the file" if mark == "," else "a decimal point"
-        if "," in text and mark != ",":
-            marks += "; a decimal comma is read only with semicolons between the columns"
-        problem = f"{text!r} is no number with {marks.partition(';')[0]}"
-        raise InputError("", problem, f"a number in {domain}, with {marks}")
+        domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
+        raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
     # A part may be better than that of a new car, where that is an end of the domain.
-    side, end = ("most", item.upper) if value > item.upper else ("least", item.lower)
-    hint = f"; at {side} {end:g}: enter {end:g}" if end == item.original else ""
-    item.check(value, otherwise=hint, switch="")
+    most = f"{item.upper:g}"
+    is_better = value > item.upper == item.original
+    item.check(value, otherwise=f"; at most {most}: enter {most}" if is_better else "", switch="")
     return value
 
 
