@@ -84,8 +84,11 @@ def values_as_printed(
 
 def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
     """The evaluation of the unsafe solution with the fewest changes, of which as many as possible
-    are undone; its values are those that are printed. None if the solution is safe here.
+    are undone; its values are those that are printed. None if no solution is unsafe, or it is safe
+    here.
     """
+    if not case.unsafe.rows(case.solutions).any():
+        return None
     handle = choose_handle(case.solutions, case.unsafe, "fewest")
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[[*case.characteristics.names]].to_numpy(dtype=float)

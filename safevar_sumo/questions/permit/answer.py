@@ -168,7 +168,7 @@ class PermitAnswer:
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
             may = "may not drive" if pd.isna(up_to) else f"may drive up to {up_to:g}{unit}"
-            sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
+            sentences[0] = f"{name} {may}; {new_car}."
             sentences.append(because_of)
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
@@ -209,7 +209,10 @@ class PermitAnswer:
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""
         manifest = manifest_now(self.study, assemble(self.study))
-        listing = pd.concat([fleet.table.reset_index(drop=True), cars.drop(columns="car")], axis=1)
+        given = fleet.table.reset_index(drop=True)
+        # Limits are no measured values of a car.
+        given = given[given.columns[:1]] if self.is_box else given
+        listing = pd.concat([given, cars.drop(columns="car")], axis=1)
         listing[DIGEST] = identity_digest(manifest)[:12]
         return listing
 

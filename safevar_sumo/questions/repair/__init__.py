@@ -169,8 +169,7 @@ def repair(
         A repair for the points of the study's tests alone: nothing is simulated between the values
         of a matrix.
     quick
-        A rough answer: the study's own parameter set alone, and a short search for counterexamples.
-        Not with `out`.
+        A rough answer: the study's own parameter set alone, and a short search. Not with `out`.
     """
     study = evaluator.study
     evaluator.system.refuse_simulator("nothing of its driving system can be changed here")
