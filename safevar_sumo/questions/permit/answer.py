@@ -152,7 +152,7 @@ class PermitAnswer:
         unit = unit_text(span.unit)
         top = f"{span.high:g}{unit}"
         number = len(cars)
-        new_car = f"the new car may drive up to {self.new_car.up_to:g}{unit}"
+        new_car = f"the new car may drive {span.up_to(self.new_car.order)}"
         goal = top if self.need is None else f"{self.need:g}{unit}"
         phrases = {
             DRIVE: f"may drive {goal} or as fast as the new car",
@@ -167,7 +167,7 @@ class PermitAnswer:
         sentences = [f"{join_phrases(parts)}; {new_car}.", *self.assumed]
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
-            may = "may not drive" if pd.isna(up_to) else f"may drive up to {up_to:g}{unit}"
+            may = "may not drive" if pd.isna(up_to) else f"may drive {span.up_to(up_to)}"
             sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
             sentences.append(because_of)
         if self.need is not None:
