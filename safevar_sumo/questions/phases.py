@@ -140,14 +140,17 @@ def at_worst_phases(
     return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
 
 
-def remark_on_phases(model: Model, place: FloatArray) -> str:
-    """What to know of a model without phases, or in which the original vehicle ends otherwise in an
-    encounter at a place, shape (1, searched parameters), that begins a whole step later; else "".
+def remark_on_phases(claim: Model | None, place: FloatArray | None = None) -> str:
+    """What to know of claims without phases, or in whose model the original vehicle ends otherwise
+    in an encounter that begins a whole step later: its own one, or that at a place, shape (1,
+    searched parameters); else "".
     """
-    members = model.evaluator.characteristics
-    if members.names[-1] != PHASE:
+    if claim is None or claim.evaluator.characteristics.names[-1] != PHASE:
         return AT_ONE_PHASE
-    rows = np.repeat(np.hstack([members.vehicle.original_settings, place]), 2, axis=0)
+    members = claim.evaluator.characteristics
+    rows = np.repeat(members.original_settings, 2, axis=0)
+    if place is not None:
+        rows[:, ~members.of_vehicle] = place
     rows[1, -1] = 1.0
-    at_begin, at_end = model.robustness(rows, "phases of the original")
+    at_begin, at_end = claim.robustness(rows, "phases of the original")
     return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS
