@@ -140,17 +140,13 @@ def at_worst_phases(
     return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
 
 
-def remark_on_phases(claim: Model | None, place: FloatArray | None = None) -> str:
+def remark_on_phases(claim: Model | None) -> str:
     """What to know of claims without phases, or in whose model the original vehicle ends otherwise
-    in an encounter that begins a whole step later: its own one, or that at a place, shape (1,
-    searched parameters); else "".
+    in its own encounter, if that begins a whole step later; else "".
     """
-    if claim is None or claim.evaluator.characteristics.names[-1] != PHASE:
+    if claim is None:
         return AT_ONE_PHASE
-    members = claim.evaluator.characteristics
-    rows = np.repeat(members.original_settings, 2, axis=0)
-    if place is not None:
-        rows[:, ~members.of_vehicle] = place
+    rows = np.repeat(claim.evaluator.characteristics.original_settings, 2, axis=0)
     rows[1, -1] = 1.0
     at_begin, at_end = claim.robustness(rows, "phases of the original")
     return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS

@@ -73,8 +73,6 @@ MAX_RIVALS = 3
 NO_PROBABILITY = (
     " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
 )
-VEHICLES_PER_CALL = 50_000
-"""Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
 """What varies, by the beginning of the names of its columns; another measure may stand in place of
 the safety degree.
@@ -94,9 +92,9 @@ COLUMNS = [
         for end in ("", LOW, HIGH)
     ),
 ]
-Indices = Mapping[str, FloatArray]
-"""SALib's results: by key, an index of each characteristic, shape (n,), or half of its confidence
-interval.
+Indices = Mapping[str, FloatArray | float]
+"""As SALib's results: by key, an index of each characteristic, shape (n,), or half of its
+confidence interval; R2 is what a regression explains.
 """
 
 
@@ -134,10 +132,11 @@ def risk(
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
     evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
     criterion = evaluator.choose_criterion(unsafe, subject)
-    drawn = _sampled(evaluator, model, samples)
+    samples = evaluator.at_most(samples)
+    vehicles = model.draw(samples, np.random.default_rng(study.search.seed))
+    drawn = evaluator.evaluate(vehicles, SAMPLING)
 
     # How many are unsafe.
-    samples = len(drawn)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures = int(criterion.of(simulated).sum())
     total = len(simulated)
@@ -181,18 +180,6 @@ def risk(
         numbers=numbers,
         tables={"sensitivity": table},
         folded=() if has_shares else ("sensitivity",),
-    )
-
-
-def _sampled(evaluator: Evaluator, model: VariationModel, samples: int) -> Evaluations:
-    """Sampled vehicles, as many as are allowed."""
-    samples = evaluator.at_most(samples)
-    rng = np.random.default_rng(evaluator.study.search.seed)
-    return Evaluations.concatenate(
-        [
-            evaluator.evaluate(model.draw(min(VEHICLES_PER_CALL, samples - start), rng), SAMPLING)
-            for start in range(0, samples, VEHICLES_PER_CALL)
-        ]
     )
 
 
@@ -330,7 +317,7 @@ def regression_indices(
         error, _, best = min(
             (fit(output, kind, rows)[0], number, kind) for number, kind in enumerate(kinds)
         )
-        explained = 1 - error / np.var(output)
+        explained = float(1 - error / np.var(output))
         if explained < LEAST_EXPLAINED:
             return {"R2": explained}
         samples = [rows, *rng.integers(0, len(rows), (RESAMPLES, len(rows)))]

@@ -28,6 +28,7 @@ from safevar_sumo.questions.permit.rows import (
     verdict_of,
 )
 from safevar_sumo.questions.permit.search import Permit, PermitSearch
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.up_to import study_up_to
@@ -172,8 +173,7 @@ class PermitAnswer:
             sentences.append(because_of)
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
-        if remark := self.search.remark_on_phases():
-            sentences.append(remark)
+        sentences.append(remark_on_phases(self.models.own.in_phases))
         if span.ending:
             tests = join_phrases(span.ending)
             sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")
