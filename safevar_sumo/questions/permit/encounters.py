@@ -22,7 +22,7 @@ from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
-from safevar_sumo.study import PHASE, Study
+from safevar_sumo.study import PHASE, Study, unit_text
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
@@ -53,6 +53,11 @@ class Span(NamedTuple):
     high: float
     ending: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    def up_to(self, value: float) -> str:
+        """What is driven up to a value: `from 10 up to 35 km/h`."""
+        reached = f"{value:g}{unit_text(self.unit)}"
+        return f"from {self.low:g} up to {reached}" if value > self.low else f"at {reached} alone"
 
 
 class EncounterRange(NamedTuple):

@@ -33,6 +33,7 @@ from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
@@ -314,7 +315,10 @@ def _answer_of(
     tested = ""
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
-        tested = f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
+        tested = (
+            f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
+            f" {remark_on_phases(models.own.in_phases)}".strip()
+        )
     return Answer(
         question="repair",
         study=problem.study,

@@ -12,7 +12,7 @@ from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
 from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
-from safevar_sumo.questions.phases import AT_ONE_PHASE
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
@@ -94,8 +94,10 @@ def tested_sentences(models: Models, together: LimitsTogether | None, budget: in
         yield validation_in_words(together, budget)
         if together.proof is not None:
             yield _bound_in_words(together.proof)
-        if models.own.in_phases is None and not models.own.unsafe.is_of_points:
-            yield AT_ONE_PHASE
+        if not models.own.unsafe.is_of_points and (
+            remark := remark_on_phases(models.own.in_phases)
+        ):
+            yield remark
 
 
 def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
