@@ -12,12 +12,12 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, update_wrapper
+from functools import cached_property, update_wrapper, wraps
 from importlib import import_module, invalidate_caches
 from numbers import Integral, Real
 from pathlib import Path
 from shlex import quote, split
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from rich.console import Console
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
     from safevar_sumo.questions.evaluator import Evaluator
 
+AnyResult = TypeVar("AnyResult")
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
     for name in ("compare", "explain", "permit", "rating", "repair", "risk", "rules", "tolerance")
@@ -224,7 +225,7 @@ class Question:
 
     def __call__(
         self,
-        source: StudyLike | Results,
+        source: StudyLike | Results | None = None,
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
@@ -239,8 +240,11 @@ class Question:
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
             raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
-        if len(others) != len(self.others):
-            raise TypeError(f"{self.name}() takes {1 + len(self.others)} positional arguments")
+        names = ["source", *self.others]
+        if source is None or len(others) != len(self.others):
+            missing = names[len(others) + 1 if source is not None else 0 :]
+            problem = f"the argument {missing[0]} is missing" if missing else "too many arguments"
+            raise InputError(f"{self.name}()", problem, f"{self.name}({', '.join(names)})")
         values = {name: known[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Study | Case:
@@ -441,6 +445,21 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
                 _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
             )
     return options
+
+
+def with_legal_options(function: Callable[..., AnyResult]) -> Callable[..., AnyResult]:
+    """Decorator: refuses options of a function of the library, as the command line does, if they
+    have another type or are outside their ranges.
+    """
+
+    @wraps(function)
+    def checked(*arguments: Any, **values: Any) -> AnyResult:
+        for option in options_of(function):
+            if option.name in values:
+                option.check(values[option.name])
+        return function(*arguments, **values)
+
+    return checked
 
 
 def parse_question(text: str) -> tuple[Question, JsonObject]:

@@ -234,7 +234,8 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
 ) -> None:
     """A run finds (1, 0) in the square of the two objectives that differ, with the reference point
     (1.1, 1.1): worth 0.11. Then it finds the collision (0, 1): both are worth 0.21. The third
-    objective adds a length of 1.1. By Noether, 7.849 / (6 * 0.25^2) = 20.9 runs show 0.75.
+    objective adds a length of 1.1. By Noether, (2.935 + 0.842)^2 / (6 * 0.25^2) = 38.04 runs show
+    0.75 at 0.01 / 3, for the three tests of fronts.
     """
     monkeypatch.setattr(budgets, "BUDGETS", (10, 20))
     points = {"a": row(sd=1.0, f_diff=0.1), "b": row(sd=-1.0, f_diff=0.5), "-": row(sd=9.0)}
@@ -253,12 +254,37 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
     assert table[[*names, "unsafe"]].to_numpy() == pytest.approx(
         np.array(
             [
-                (10, 0.75, 21, 0.121, 0.0605, 0),
-                (20, 0.875, 10, 0.176, 0.0605, 0.5),
-                (100, 0.75, 21, 0.176, 0.121, 0.5),
+                (10, 0.75, 39, 0.121, 0.0605, 0),
+                (20, 0.875, 17, 0.176, 0.0605, 0.5),
+                (100, 0.75, 39, 0.176, 0.121, 0.5),
             ]
         )
     )
+
+
+@pytest.mark.parametrize("alpha", [0.01, 0.05])
+def test_a_run_without_a_valid_setting_within_a_budget_counts_in_all_columns(
+    monkeypatch: pytest.MonkeyPatch, alpha: float
+) -> None:
+    """Five of eight runs begin with twelve settings without an objective: within 10 settings three
+    runs of eight win, so A12 is (3 + 5 / 2) / 8; two of the three collide.
+    """
+    monkeypatch.setattr(budgets, "BUDGETS", (10,))
+    first = [row(run=run, sd=-0.5 if run < 2 else 0.5) for run in range(3)]
+    late = [row(run=run, f_diff=math.nan) for run in range(3, 8) for _ in range(12)]
+    rows = [*first, *late, *(row(run=run) for run in range(3, 8))]
+    rows += [row("rs", run, f_diff=math.nan) for run in range(8)]
+    seen = [{**one, "evaluation": number} for number, one in enumerate(rows)]
+    case = made_up(
+        *first, row(sd=1.0), evaluations=seen, finished=[*product(("nsga2", "rs"), range(8))]
+    )
+    answer = answer_questions([case], Choices(alpha=alpha), names=["budget"])
+    found = only(answer.tables["budget"], simulations=10)
+    z = scipy.stats.norm.isf(alpha / 3 / 2) + scipy.stats.norm.isf(0.2)
+    expected = [0.6875, math.ceil(z**2 / 6 / 0.1875**2), 0, 0, 0.25, 8, 8]
+    names = ["effect_size", "runs_needed", "hypervolume", "hypervolume_baseline", "unsafe"]
+    assert [found[name] for name in (*names, "n1", "n2")] == pytest.approx(expected)
+    assert f"; {100 - 100 * alpha:g} % intervals)" in answer.render("text", "budget")
 
 
 @pytest.mark.slow
