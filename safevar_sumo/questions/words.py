@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
+from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -133,6 +134,13 @@ def percentage(share: float) -> str:
     """A share as a percentage with the digits that decide, without its sign: `37`, `0.043`."""
     value = 100 * share
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def bound_in_words(at_most: float) -> str:
+    """An upper bound of a share, one-sided, rounded up."""
+    digits = 1 - math.floor(math.log10(at_most))
+    rounded = math.ceil(round(at_most * 10**digits, 6)) / 10**digits
+    return f"with {100 * CONFIDENCE:g} % confidence at most {percentage(rounded)} %"
 
 
 def two_decimals(value: float | None) -> str:
