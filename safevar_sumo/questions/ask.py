@@ -12,12 +12,12 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, update_wrapper, wraps
+from functools import cached_property, update_wrapper
 from importlib import import_module, invalidate_caches
 from numbers import Integral, Real
 from pathlib import Path
 from shlex import quote, split
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from rich.console import Console
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
     from safevar_sumo.questions.evaluator import Evaluator
 
-AnyResult = TypeVar("AnyResult")
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
     for name in ("compare", "explain", "permit", "rating", "repair", "risk", "rules", "tolerance")
@@ -240,11 +239,9 @@ class Question:
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
             raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
-        names = ["source", *self.others]
         if source is None or len(others) != len(self.others):
-            missing = names[len(others) + 1 if source is not None else 0 :]
-            problem = f"the argument {missing[0]} is missing" if missing else "too many arguments"
-            raise InputError(f"{self.name}()", problem, f"{self.name}({', '.join(names)})")
+            names = ["source", *self.others]
+            raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: known[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Study | Case:
@@ -445,21 +442,6 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
                 _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
             )
     return options
-
-
-def with_legal_options(function: Callable[..., AnyResult]) -> Callable[..., AnyResult]:
-    """Decorator: refuses options of a function of the library, as the command line does, if they
-    have another type or are outside their ranges.
-    """
-
-    @wraps(function)
-    def checked(*arguments: Any, **values: Any) -> AnyResult:
-        for option in options_of(function):
-            if option.name in values:
-                option.check(values[option.name])
-        return function(*arguments, **values)
-
-    return checked
 
 
 def parse_question(text: str) -> tuple[Question, JsonObject]:

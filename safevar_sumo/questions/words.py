@@ -137,10 +137,8 @@ def percentage(share: float) -> str:
 
 
 def bound_in_words(at_most: float) -> str:
-    """An upper bound of a share, one-sided, rounded up."""
-    digits = 1 - math.floor(math.log10(at_most))
-    rounded = math.ceil(round(at_most * 10**digits, 6)) / 10**digits
-    return f"with {100 * CONFIDENCE:g} % confidence at most {percentage(rounded)} %"
+    """The upper bound of a share, which is one-sided."""
+    return f"with {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.3g} %"
 
 
 def two_decimals(value: float | None) -> str:

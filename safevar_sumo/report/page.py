@@ -28,7 +28,6 @@ from safevar_sumo.questions.ask import (
     parse_question,
     quick_questions,
     with_criterion,
-    with_legal_options,
 )
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
@@ -60,7 +59,6 @@ TAG = re.compile(r"<[^>]*>")
 SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
 
 
-@with_legal_options
 def report(
     *results: Results | str | Path,
     out: str | Path = "report.html",

@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Fraction, Jobs, Range, with_legal_options
+from safevar_sumo.questions.ask import Fraction, Jobs, Range, options_of
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -61,7 +61,6 @@ if TYPE_CHECKING:
 REMARKS: Columns = {"table": "table", "remark": "what is missing or left out there, and why"}
 
 
-@with_legal_options
 @contents(
     "cases",
     "solutions",
@@ -102,7 +101,8 @@ def tables(
     table
         `budget` or `diversity`: compute this table alone.
     """
-    # The cases, the table, and the algorithm that is compared.
+    # The options, the cases, and the algorithm that is compared.
+    {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
     if table:
         check_name("table", f"there is no table {table!r}", table, {**TABLES, "remarks": REMARKS})
     cases = _cases_of(results)

@@ -86,14 +86,19 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
     tests = rq2_runs(case, choices)["p_value"].count()  # raises if there is a single algorithm
     reference = reference_front(case)
     within = within_budgets(case)
-    of_runs = dict(list(within.solutions.groupby(["algorithm", "run", "simulations"])))
-    budgets = {budget for _, budget in within.finished_runs}
-    runs = []
-    for run, budget in product(case.finished_runs, sorted(budgets)):
-        rows = of_runs.get((*run, budget), within.solutions[:0])
-        points = normalised(minimised_values(case, rows), reference)
-        volume = hypervolume(points, case.study.search.reference_point)
-        runs.append((*run, budget, volume, within.unsafe.rows(rows).sum()))
+    runs = [
+        (
+            *run,
+            budget,
+            hypervolume(
+                normalised(minimised_values(case, rows), reference),
+                case.study.search.reference_point,
+            ),
+            within.unsafe.rows(rows).sum(),
+        )
+        for budget, valid in within.solutions.groupby("simulations")
+        for run, rows in frames_of_runs(case, valid)
+    ]
     growth = pd.DataFrame(runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"])
 
     # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
