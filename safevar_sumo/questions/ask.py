@@ -226,7 +226,7 @@ class Question:
 
     def __call__(
         self,
-        source: StudyLike | Results,
+        source: StudyLike | Results | None = None,
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
@@ -241,8 +241,9 @@ class Question:
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
             raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
-        if len(others) != len(self.others):
-            raise TypeError(f"{self.name}() takes {1 + len(self.others)} positional arguments")
+        if source is None or len(others) != len(self.others):
+            names = ["source", *self.others]
+            raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: known[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Study | Case:

@@ -38,7 +38,7 @@ from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
-from safevar_sumo.questions.words import encounter_in_words, join_phrases, percentage
+from safevar_sumo.questions.words import bound_in_words, encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
@@ -454,8 +454,8 @@ def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, 
     """The validation of a change, without a full stop."""
     return (
         f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
-        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe: with"
-        f" {100 * CONFIDENCE:g} % confidence at most {percentage(at_most)} % are"
+        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe:"
+        f" {bound_in_words(at_most)} are"
     )
 
 
