@@ -1,17 +1,16 @@
-"""Minimal causes: the smallest subsets of a setting's changes that are unsafe by themselves; their
-limits; and which changes failures need.
+"""Minimal causes: the subsets of a setting's changes that are unsafe by themselves while all their
+own subsets are safe; their limits; and which changes failures need.
 
-Outcomes need not be monotone: a change may undo the effect of another change. So all subsets of a
-size are simulated, size by size, until some are unsafe. These are minimal, as no smaller subset is
-unsafe.
+Outcomes need not be monotone: a change may undo the effect of another change. So nothing is
+inferred: all subsets are simulated, size by size, except those that contain a cause.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from itertools import combinations, islice, pairwise
+from itertools import combinations, islice, pairwise, takewhile
 from math import comb
 from typing import NamedTuple
 
@@ -33,12 +32,14 @@ BOUNDARIES = "boundaries"
 OTHER_SETS = "other parameter sets"
 """Stages of progress."""
 MAX_SUBSETS = 20_000
-"""Maximum number of subsets simulated in one call, which bounds the memory."""
+"""Maximum number of subsets simulated in one call, which bounds the memory; and, unless another
+number is stated, of all subsets.
+"""
 
 
 class Cause(NamedTuple):
-    """A smallest subset of a failure's changes that is unsafe by itself, all else as in the
-    original vehicle: the values of these characteristics in their units; outcome and safety degree
+    """A minimal subset of a failure's changes that is unsafe by itself, all else as in the original
+    vehicle: the values of these characteristics in their units; outcome and safety degree
     [m, or -m/s] of a vehicle with these changes only. `encounter` are the failure's parameters of
     the scenario, in a study that searches them.
     """
@@ -50,10 +51,11 @@ class Cause(NamedTuple):
 
 
 def find_minimal_causes(
-    evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe
+    evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe, limit: int = MAX_SUBSETS
 ) -> list[list[Cause]]:
-    """All smallest unsafe subsets of the changes of each of M settings, shape (M, n); an empty list
-    if no subset is unsafe.
+    """The minimal causes of each of M settings, shape (M, n); an empty list if no subset of its
+    changes is unsafe. Up to the size `largest_complete` of `limit` simulated settings they are all;
+    beyond it a setting has only the smallest, if it has no smaller cause.
 
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
@@ -65,17 +67,19 @@ def find_minimal_causes(
     of_scenario = np.flatnonzero(~characteristics.of_vehicle).tolist()
     originals = characteristics.with_original_vehicle(settings)
     causes: list[list[Cause]] = [[] for _ in settings]
+    found: list[list[set[int]]] = [[] for _ in settings]
+    complete = largest_complete([*map(len, changed)], limit)
 
-    # Subsets by size, those of all settings together.
-    with evaluator.stage(SUBSETS, sum(_subset_counts(map(len, changed)))) as expect:
+    # Subsets by size, those of all settings together, without those that contain a cause.
+    expected = sum(_subset_counts([*map(len, changed)], complete))
+    with evaluator.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
-            # Where a smaller subset is a cause, no larger one is minimal.
-            rows_left = [row for row, of_row in enumerate(causes) if not of_row]
-            expect(sum(_subset_counts((len(changed[row]) for row in rows_left), size)))
             subsets = (
                 (row, list(columns))
-                for row in rows_left
+                for row, of_row in enumerate(found)
+                if size <= complete or not of_row
                 for columns in combinations(changed[row], size)
+                if not any(cause.issubset(columns) for cause in of_row)
             )
             while chunk := list(islice(subsets, MAX_SUBSETS)):
                 partial_settings = originals[[row for row, _ in chunk]]
@@ -92,7 +96,17 @@ def find_minimal_causes(
                         encounter={names[column]: values[column] for column in of_scenario},
                     )
                     causes[row].append(cause)
+                    found[row].append({*columns})
     return causes
+
+
+def largest_complete(numbers: Sequence[int], limit: int) -> int:
+    """The largest size of which all subsets of each number of changes are simulated, with at most
+    about `limit` settings altogether; at least 1.
+    """
+    sizes = range(2, max(numbers, default=1) + 1)
+    affordable = takewhile(lambda size: sum(_subset_counts(numbers, size)) <= limit, sizes)
+    return max(affordable, default=1)
 
 
 def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> BoolArray:
@@ -113,12 +127,10 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
 
 
-def _subset_counts(numbers: Iterable[int], least: int = 0) -> list[int]:
-    """About how many subsets of at least so many of each number of changes are tried: up to half of
-    them, as in the shipped studies.
-    """
+def _subset_counts(numbers: Sequence[int], most: int | None = None) -> list[int]:
+    """How many subsets of at most so many of each number of changes there are; of all of them."""
     return [
-        sum(comb(number, size) for size in range(least, (number + 1) // 2 + 1))
+        sum(comb(number, size) for size in range((number if most is None else most) + 1))
         for number in numbers
     ]
 
@@ -129,9 +141,8 @@ def select_affordable_rows(
     """All rows of `settings`, or a random sample of them, so that finding their minimal causes
     takes at most about `max_evaluations`.
     """
-    costs = np.array(
-        _subset_counts(evaluator.characteristics.number_changed(settings).astype(int).tolist())
-    )
+    changes = evaluator.characteristics.number_changed(settings).astype(int).tolist()
+    costs = np.array(_subset_counts(changes), dtype=float)
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
