@@ -335,7 +335,7 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[
     )
     remarks = filter(None, [case.unsafe.remark])
     counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
-    found = fewest_changes(case, jobs) if number else None
+    found = fewest_changes(case, jobs)
     if found is None:
         return counts, []
 

@@ -25,6 +25,7 @@ from safevar_sumo.campaign.runs import (
     random_generator_of,
 )
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError, about
+from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import MANIFEST, Journal, identity_digest, journal_file, journal_head
 
@@ -109,6 +110,7 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     path = journal_file(share.directory, str(key))
     head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
     problem = problem_of(study, system, share.original)
-    search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
+    with user_errors(study.source):
+        search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
     journal = Journal(path, head, retry_failed=share.retry_failed)
     return Run(key, search, journal, study.search.evaluations, problem.scoring)

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
+from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import FloatArray, ResultColumns, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
@@ -112,7 +113,9 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     one in a simulator of the user's own; and the time that they take [s].
     """
     timed = settings[: 1 if system.has_simulator else TIMED]
-    drive_and_score(system, timed)  # loads what any first simulation loads
+    # The first simulation loads what any does, and ends a driving system that does not end.
+    longest = system.time_limit if system.has_simulator else min(system.time_limit, LONGEST)
+    drive_and_score(replace(system, time_limit=longest), timed[:1])
     start = time.perf_counter()
     drive_and_score(system, timed)
     seconds = RUNS_OF_ALL * (time.perf_counter() - start) / len(timed)
@@ -234,7 +237,8 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         algorithm = instance_of(
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
-        search = algorithm.search(problem, np.random.default_rng(seed))
+        with user_errors(study.source):  # of a method that is no generator
+            search = algorithm.search(problem, np.random.default_rng(seed))
         settings = []
         try:
             settings.append(next(search))

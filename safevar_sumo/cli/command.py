@@ -30,6 +30,7 @@ from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.study import study_names
 
 GATE_EXIT_CODE = 3
+DECIDE_EXIT_CODE = 4
 """Exit code of a command if a condition of --fail-if holds, or a limit is not kept."""
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 LIBRARY_ONLY = ("pool", "progress")
@@ -144,17 +145,19 @@ def _check_names(
 
 
 def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float]]) -> None:
-    """End with an exit code if a limit is not kept, a condition holds, or a check has findings."""
+    """End with an exit code if a limit is not kept, a condition holds, a check has findings, or a
+    person has to decide; the verdict's reasons are not said again.
+    """
     failures = [
         *answer.failures,
         *(text for condition in conditions for text in _fulfilments(answer, *condition)),
     ]
     for sentence in failures:
-        click.echo(f"failed: {sentence}", err=True)
-    if failures:
-        click.get_current_context().exit(GATE_EXIT_CODE)
-    if answer.numbers.get("passed") is False:
-        click.get_current_context().exit(1)
+        if sentence.removeprefix("limit of ") not in answer.verdict:
+            click.echo(f"failed: {sentence}", err=True)
+    code = DECIDE_EXIT_CODE if answer.numbers.get("decision") == "decide" else 0
+    code = 1 if answer.numbers.get("passed") is False else code
+    click.get_current_context().exit(GATE_EXIT_CODE if failures else code)
 
 
 def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:

@@ -172,7 +172,7 @@ def run_command_line() -> None:
     """Run the program.
 
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a
-    limit is not kept) or 130 (interrupted).
+    limit is not kept), 4 (a person has to decide) or 130 (interrupted).
     """
     # A warning is a line, without its place in the code; a signal to end is an interruption; a
     # crash has its line.

@@ -159,7 +159,8 @@ class Answer:
     folded
         Names of tables that readers see only by name; JSON and CSV have all.
     is_whole
-        Whether readers see all of it, not one screen.
+        Whether readers see all of it, not one screen; of the lead alone, as many rows as one screen
+        has.
     next
         The command that comes next.
     command
@@ -235,7 +236,7 @@ class Answer:
                 remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
             )
             tables["remarks"] = remarks[is_about_it]
-        return replace(self, tables=tables, folded=(), is_whole=True)
+        return replace(self, tables=tables, folded=(), lead=name, is_whole=True)
 
     def render(self, form: str, table: str | None = None, *, details: bool = False) -> str:
         """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default

@@ -84,9 +84,11 @@ Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
-ROUGH = "Rough answer (--quick: {}a short search; it proves nothing):"
-OWN_SET = "the study's own parameter set alone, and "
-"""The beginning of such an answer, and what it says where one parameter set was tried."""
+ROUGH = (
+    "Rough answer (--quick: the study's own parameter set alone, and a short search; it proves"
+    " nothing):"
+)
+"""The beginning of such an answer."""
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
@@ -224,7 +226,7 @@ class Question:
 
     def __call__(
         self,
-        source: StudyLike | Results,
+        source: StudyLike | Results | None = None,
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
@@ -239,8 +241,9 @@ class Question:
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
             raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
-        if len(others) != len(self.others):
-            raise TypeError(f"{self.name}() takes {1 + len(self.others)} positional arguments")
+        if source is None or len(others) != len(self.others):
+            names = ["source", *self.others]
+            raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: known[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Study | Case:
@@ -333,15 +336,12 @@ class Question:
             reason = about.no_verdict
             evaluator.end()
         numbers = {"driven": not reason, **answer.numbers}
-        rough = limited = ""
+        rough = ROUGH if values.get(QUICK) else ""
         if account.most is not None:
             numbers |= {"rough": True, "simulations": account.spent}
-            limited = f"Rough answer (--simulations {account.most}):"
+            rough = f"Rough answer (--simulations {account.most}):"
         if self.has_rough_answer:
-            is_of_own_set = numbers.get("fits", 1) in (None, 1)
-            rough = ROUGH.format(OWN_SET if is_of_own_set else "") if values.get(QUICK) else ""
             numbers["rough"] = bool(rough or numbers.get("rough"))
-        rough = limited or rough
         verdict = " ".join(
             filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
         )

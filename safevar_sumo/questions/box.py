@@ -139,7 +139,9 @@ def prove(
     earlier samples alone, so given box k the bound fails with probability at most alpha_k. So the
     probability that any bound is wrong, and with it the bound of the box that passes, is at most
     sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `share` if all of
-    them are safe.
+    them are safe. If all settings of the first test are safe, its bound is the one-sided one at
+    `CONFIDENCE`: it is smaller than `share`, and a box between both passes as safe by no later
+    test, whose bound is `share`.
     """
     import scipy  # takes longer to load than a simulation
 
@@ -154,5 +156,7 @@ def prove(
     failures = int(np.count_nonzero(is_unsafe))
     not_simulated = int(np.count_nonzero(judgement.failed & judgement.counted))
     safe = samples - failures - not_simulated
+    if attempt == 1 and safe == len(settings):
+        error = 1 - CONFIDENCE
     at_most = float(scipy.special.betaincinv(samples - safe + 1, safe, 1 - error)) if safe else 1.0
     return Proof(samples, failures, at_most, not_simulated), settings[is_unsafe]

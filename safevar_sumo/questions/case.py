@@ -169,6 +169,8 @@ class Case:
         """Raise `UnanswerableError` if there is no solution."""
         if reason := self.why_no_solution:
             expected = "results with at least one solution"
+            if self.has_runs and not self.finished_runs:
+                expected = "at least one finished run: `study` goes on where it was interrupted"
             raise UnanswerableError(self.name, f"has no solution: {reason}", expected)
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:

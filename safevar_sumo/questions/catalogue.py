@@ -60,7 +60,7 @@ VEHICLES: Columns = {
 }
 CHARACTERISTICS: Columns = {
     **NAME,
-    "short_name": "its name in sentences",
+    "short_name": Column("", "its name in sentences", is_detail=True),
     **DOMAINS,
     "measurement": Column("", "how a workshop measures it", is_shown=False),
     "remedy": Column("", "what to do with a vehicle beyond its limit", is_shown=False),
@@ -184,7 +184,6 @@ def _list_characteristics(name: str | None) -> Answer:
     title = f"Characteristics of {study.name}"
     return Answer(
         question="list",
-        is_whole=True,
         study=study,
         verdict=f"{study.name} varies {number_of(len(rows), 'characteristic')}.",
         numbers={"passed": True},

@@ -5,6 +5,7 @@ with these values.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -47,13 +48,17 @@ class Failure(NamedTuple):
 
 
 def describe(
-    model: Model, settings: Mapping[str, FloatArray], within: Box | None = None
+    model: Model,
+    settings: Mapping[str, FloatArray],
+    within: Box | None = None,
+    only: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Failure]:
     """How unsafe settings of a model fail at their worst points, by the same names.
 
     Values are rounded as they are printed, away from the original, and simulated again; where the
     rounded vehicle is safe, with further digits. A setting that is safe with all of them is left
-    out. A value that lies `within` a box stays there.
+    out. A value that lies `within` a box stays there; of a setting that has a name in `only`, this
+    characteristic alone is rounded.
     """
     failures = dict[str, Failure]()
     waiting = dict(settings)
@@ -62,7 +67,10 @@ def describe(
             break
         members = model.evaluator.characteristics
         rows = np.array(
-            [as_printed(members, setting, further, within) for setting in waiting.values()]
+            [
+                as_printed(members, setting, further, within, only.get(name, ""))
+                for name, setting in waiting.items()
+            ]
         )
         found = failures_at(model, rows)
         failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
@@ -71,21 +79,25 @@ def describe(
 
 
 def values_as_printed(
-    model: Model, vehicles: Sequence[Mapping[str, float]]
+    model: Model, vehicles: Sequence[Mapping[str, float]], only: Sequence[str] = ()
 ) -> list[dict[str, float]]:
     """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
-    are where it prints none.
+    are where it prints none, and but for one characteristic of each if `only` names them.
     """
     members = model.evaluator.characteristics
     settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
-    settings |= {name: failure.setting for name, failure in describe(model, settings).items()}
+    printed = describe(model, settings, only=dict(zip(settings, only, strict=False)))
+    settings |= {name: failure.setting for name, failure in printed.items()}
     return [members.named(one) for one in settings.values()]
 
 
 def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
     """The evaluation of the unsafe solution with the fewest changes, of which as many as possible
-    are undone; its values are those that are printed. None if the solution is safe here.
+    are undone; its values are those that are printed. None if no solution is unsafe, or it is safe
+    here.
     """
+    if not case.unsafe.rows(case.solutions).any():
+        return None
     handle = choose_handle(case.solutions, case.unsafe, "fewest")
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
     setting = row[[*case.characteristics.names]].to_numpy(dtype=float)
@@ -106,10 +118,14 @@ def limit_text(item: Characteristic, value: float) -> str:
 
 
 def as_printed(
-    members: CharacteristicSet, setting: FloatArray, further: int, within: Box | None = None
+    members: CharacteristicSet,
+    setting: FloatArray,
+    further: int,
+    within: Box | None = None,
+    only: str = "",
 ) -> FloatArray:
-    """A setting with its values rounded to the digits of limits and some further ones: the
-    vehicle's away from the original, those of the encounter to the nearest.
+    """A setting with its values, or `only` one, rounded to the digits of limits and some further
+    ones: the vehicle's away from the original, those of the encounter to the nearest.
     """
     printed = setting.copy()
     for column, item in enumerate(members):
@@ -119,7 +135,7 @@ def as_printed(
         if within is not None and within.lower[column] <= value <= within.upper[column]:
             lower = within.lower[column]
             upper = within.upper[column]
-        if value not in (item.original, lower, upper):
+        if value not in (item.original, lower, upper) and only in ("", item.name):
             scale = 10.0 ** (item.digits + further)
             away = np.round if item.is_scenario else np.ceil if value > item.original else np.floor
             # What is a rounding error of the scaled value is none of the value.

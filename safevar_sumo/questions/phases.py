@@ -140,14 +140,13 @@ def at_worst_phases(
     return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
 
 
-def remark_on_phases(model: Model, place: FloatArray) -> str:
-    """What to know of a model without phases, or in which the original vehicle ends otherwise in an
-    encounter at a place, shape (1, searched parameters), that begins a whole step later; else "".
+def remark_on_phases(claim: Model | None) -> str:
+    """What to know of claims without phases, or in whose model the original vehicle ends otherwise
+    in its own encounter, if that begins a whole step later; else "".
     """
-    members = model.evaluator.characteristics
-    if members.names[-1] != PHASE:
+    if claim is None:
         return AT_ONE_PHASE
-    rows = np.repeat(np.hstack([members.vehicle.original_settings, place]), 2, axis=0)
+    rows = np.repeat(claim.evaluator.characteristics.original_settings, 2, axis=0)
     rows[1, -1] = 1.0
-    at_begin, at_end = model.robustness(rows, "phases of the original")
+    at_begin, at_end = claim.robustness(rows, "phases of the original")
     return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS

@@ -28,6 +28,7 @@ from safevar_sumo.records import CellResults, FloatArray
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import MatrixTable, Study
+from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -225,6 +226,7 @@ def rate(
             "cells": tabulate("Cells", CELLS, _cells(protocol, scores, cells, names)),
         },
         draw=partial(_draw, protocol, scores),
+        tested=" ".join(vehicle_remarks(assemble(study))),
     )
 
 

@@ -119,28 +119,40 @@ def _more(answer: Answer, screen: Screen) -> str:
 
 
 def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
-    """Print one screen; with `details`, or if the answer is whole, all tables and numbers."""
-    if not (details or answer.is_whole):
-        # As many rows of the table as there are lines for.
-        for max_rows in range(MAX_LEAD_ROWS, 0, -1):
-            screen = screen_of(answer, max_rows)
-            draft = Console(width=console.width, no_color=True, force_terminal=False)
-            with draft.capture() as capture:
-                _print_screen(answer, screen, draft)
-            lines = capture.get().splitlines()
-            if sum(max(1, -(-len(line) // draft.width)) for line in lines) <= MAX_LINES:
-                break
-        _print_screen(answer, screen, console)
+    """Print one screen, also of a table alone; with `details`, or of another answer that is whole,
+    all tables and numbers.
+    """
+    if details or (answer.is_whole and answer.lead not in answer.tables):
+        _print_whole(answer, MAX_ROWS, console)
         return
 
+    # As many rows of the table as there are lines for.
+    show = _print_whole if answer.is_whole else _print_screen
+    for max_rows in range(MAX_LINES if answer.is_whole else MAX_LEAD_ROWS, 0, -1):
+        draft = Console(width=console.width, no_color=True, force_terminal=False)
+        with draft.capture() as capture:
+            show(answer, max_rows, draft)
+        lines = capture.get().splitlines()
+        if sum(max(1, -(-len(line) // draft.width)) for line in lines) <= MAX_LINES:
+            break
+    show(answer, max_rows, console)
+
+
+def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
     print_text(console, answer.verdict.replace(f" {SCOPE}", f"\n{SCOPE}"))
     for frame in _short_tables(answer).values():
-        _print_table(console, frame)
+        cut = len(frame) - max_rows
+        shown = frame[:max_rows] if cut > 0 else frame
+        shown.attrs = {**frame.attrs, "bars": frame.attrs.get("bars", ())[:max_rows]}
+        _print_table(console, shown)
+        if cut > 0:
+            print_text(console, f"{cut} more rows: --details.")
     for text in _details_in_words(answer):
         print_text(console, text)
 
 
-def _print_screen(answer: Answer, screen: Screen, console: Console) -> None:
+def _print_screen(answer: Answer, max_rows: int, console: Console) -> None:
+    screen = screen_of(answer, max_rows)
     print_text(console, " ".join(screen.sentences))
     _print_table(console, screen.lead)
     for text in (*screen.notes, _more(answer, screen)):

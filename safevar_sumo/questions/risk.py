@@ -13,13 +13,13 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from itertools import compress
+from itertools import combinations, combinations_with_replacement, compress
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
+from scipy.stats import norm, zscore
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import F_SAFE, Unsafe
@@ -38,7 +38,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
-from safevar_sumo.records import Evaluations, FloatArray, IntArray, JsonObject
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
 
@@ -49,14 +49,16 @@ SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
 """Phases of progress."""
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
-LEAST_BASE_POINTS = 20
-"""Least number of base points, where few simulations are allowed; with fewer, a linear regression
-says what decides.
-"""
 FEWEST = 3
 """Number of vehicles for each characteristic with which a sample says what decides; fewer say
 nothing about it.
 """
+LEAST_EXPLAINED = 0.5
+"""Share of the variance that a regression has to explain to say what decides [-]."""
+PENALTY = 1e-3
+"""Penalty of a ridge regression for each vehicle [-]."""
+REGRESSED = 4096
+"""Number of vehicles over which the variance of a regression is known."""
 RESAMPLES = 200
 """Number of bootstrap samples for the intervals of indices."""
 MIN_OUTCOMES = 100
@@ -71,14 +73,14 @@ MAX_RIVALS = 3
 NO_PROBABILITY = (
     " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
 )
-VEHICLES_PER_CALL = 50_000
-"""Maximum number of vehicles evaluated in one call; bounds the memory of a process."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
 """What varies, by the beginning of the names of its columns; another measure may stand in place of
 the safety degree.
 """
-OF_WHAT = "of_what"
-"""The attribute of the table that says what varies, as `OUTPUTS` does."""
+OF_WHAT, EXPLAINED = "of_what", "explained"
+"""The attributes of the table that say what varies, as `OUTPUTS` does, and which share of its
+variance a regression explains; None without a regression.
+"""
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 COLUMNS = [
@@ -90,9 +92,9 @@ COLUMNS = [
         for end in ("", LOW, HIGH)
     ),
 ]
-Indices = Mapping[str, FloatArray]
-"""SALib's results: by key, an index of each characteristic, shape (n,), or half of its confidence
-interval.
+Indices = Mapping[str, FloatArray | float]
+"""As SALib's results: by key, an index of each characteristic, shape (n,), or half of its
+confidence interval; R2 is what a regression explains.
 """
 
 
@@ -125,16 +127,16 @@ def risk(
     """
     # Vehicles as the study says that they vary.
     study = evaluator.study
-    model = VariationModel(evaluator.study)
+    model = VariationModel(study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
     evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
     criterion = evaluator.choose_criterion(unsafe, subject)
-    is_limited = evaluator.left is not None
-    drawn, design = _sampled(evaluator, model, samples, block if has_design else 0)
+    samples = evaluator.at_most(samples)
+    vehicles = model.draw(samples, np.random.default_rng(study.search.seed))
+    drawn = evaluator.evaluate(vehicles, SAMPLING)
 
     # How many are unsafe.
-    samples = len(drawn)
     simulated = drawn.take(np.flatnonzero(drawn.valid))
     failures = int(criterion.of(simulated).sum())
     total = len(simulated)
@@ -145,12 +147,12 @@ def risk(
 
     # With which probability, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
-    indices = given_data_indices
-    if design is not None:
-        indices = sobol_indices
-    elif is_limited and not model.is_correlated:
+    indices, of_whom = given_data_indices, simulated
+    if evaluator.left is not None and not model.is_correlated:
         indices = regression_indices
-    table = indices(evaluator, simulated if design is None else design, criterion, confidence)
+    elif has_design:
+        indices, of_whom = sobol_indices, _design(evaluator, model)
+    table = indices(evaluator, of_whom, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
     numbers |= {"probability": failures / total, "interval": [low, high], "confidence": confidence}
 
@@ -163,13 +165,11 @@ def risk(
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
-    base = 0 if design is None else len(design) // block
     least = FEWEST * len(evaluator.characteristics)
-    if design is None and total < least:
+    if of_whom is simulated and total < least:
         verdict += f" What decides is unknown: that needs {least} vehicles."
     else:
         verdict += deciding_in_words(table, failures)
-        verdict += _in_place_of_design(base, block) if is_limited and base < BASE_POINTS else ""
     verdict += "" if failures else _bound_in_words(high, total, confidence)
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
@@ -181,30 +181,6 @@ def risk(
         tables={"sensitivity": table},
         folded=() if has_shares else ("sensitivity",),
     )
-
-
-def _sampled(
-    evaluator: Evaluator, model: VariationModel, samples: int, block: int
-) -> tuple[Evaluations, Evaluations | None]:
-    """Sampled vehicles, and Saltelli's design with blocks of this size, None without one.
-
-    Where few simulations are allowed, half of them are those of the design, whose own vehicles
-    count, too: of each block the first and the last.
-    """
-    base = BASE_POINTS if block else 0
-    if (left := evaluator.left) is not None:
-        is_enough = base and left >= LEAST_BASE_POINTS * block
-        base = min(base, max(LEAST_BASE_POINTS, left // (2 * block))) if is_enough else 0
-        samples = evaluator.at_most(min(samples, left - base * block))
-    rng = np.random.default_rng(evaluator.study.search.seed)
-    batches = []
-    for start in range(0, samples, VEHICLES_PER_CALL):
-        vehicles = model.draw(min(VEHICLES_PER_CALL, samples - start), rng)
-        batches.append(evaluator.evaluate(vehicles, SAMPLING))
-    design = _design(evaluator, model, base) if base else None
-    if design is not None and left is not None:
-        batches.append(design.take(np.arange(len(design)) % block % (block - 1) == 0))
-    return Evaluations.concatenate(batches), design
 
 
 def _bound_in_words(high: float, total: int, confidence: float) -> str:
@@ -233,6 +209,14 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
     in_words = table.attrs[OF_WHAT]
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
+    explained = table.attrs.get(EXPLAINED)
+    by = ""
+    if explained is not None:
+        by = (
+            f" A regression with squares and products explains {100 * max(explained, 0):.0f} % of"
+            " the variance (R^2, cross-validated)."
+        )
+        words = f"{by} As this is less than half, what decides is unknown."
     if np.isfinite(share):
         name = first["characteristic"]
         causes = (
@@ -246,6 +230,7 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
                 f" What decides most is uncertain: {name} {causes}, and the interval of"
                 f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
             )
+        words += by
 
     # Without the outcome's own shares, what decides it is unknown.
     if failures and table[f"unsafe_{index}"].isna().all():
@@ -277,65 +262,72 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total:
     return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"
 
 
-def _in_place_of_design(base: int, block: int) -> str:
-    """How the shares were found with few simulations."""
-    if base:
-        points = f"{base} base points in place of {BASE_POINTS}"
-        return f" The shares are rough: they come from Saltelli's design with {points}."
-    return (
-        " The shares are those that a linear regression explains, without interactions: Sobol"
-        f" indices need {LEAST_BASE_POINTS * block:,} settings."
-    )
-
-
 def _problem(evaluator: Evaluator) -> JsonObject:
     """SALib's problem: each characteristic by its quantile."""
     names = list(evaluator.characteristics.names)
     return {"num_vars": len(names), "names": names, "bounds": [[0.0, 1.0]] * len(names)}
 
 
-def _design(evaluator: Evaluator, model: VariationModel, base: int) -> Evaluations:
-    """Saltelli's design of `base` points, in which each characteristic varies alone and with all
-    others.
-    """
+def _design(evaluator: Evaluator, model: VariationModel) -> Evaluations:
+    """Saltelli's design, in which each characteristic varies alone and with all others."""
     from SALib.sample import sobol as design
 
     seed = evaluator.study.search.seed % 2**32
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its properties hold for powers of 2
-        points = design.sample(_problem(evaluator), base, calc_second_order=False, seed=seed)
+    points = design.sample(_problem(evaluator), BASE_POINTS, calc_second_order=False, seed=seed)
     return evaluator.evaluate(model.settings(points), SENSITIVITY)
 
 
 def regression_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> pd.DataFrame:
-    """The share of the variance that each of the independent characteristics has in a linear
-    regression: the square of its standardised coefficient (Saltelli et al. 2008, Global Sensitivity
-    Analysis, 1.2.5), with its bootstrap interval.
+    """The total share of the variance that each of the independent characteristics has in a ridge
+    regression with squares and products, with bootstrap intervals; undefined where it explains less
+    than `LEAST_EXPLAINED` of the variance of vehicles that were left out.
     """
     names = list(evaluator.characteristics.names)
-    spread = np.std(evaluations.settings, axis=0)
-    inputs = (evaluations.settings - evaluations.settings.mean(axis=0)) / np.where(
-        spread > 0, spread, 1.0
+    rng = np.random.default_rng(evaluator.study.search.seed)
+    others = VariationModel(evaluator.study).draw(REGRESSED, rng)
+    inputs = np.nan_to_num(zscore(np.vstack([evaluations.settings, others])))
+
+    # Characteristics, and products of two or of one with itself; they vary as in other vehicles.
+    columns = range(len(names))
+    factors = [*combinations(columns, 1), *combinations_with_replacement(columns, 2)]
+    terms = np.stack([inputs[:, factor].prod(axis=1) for factor in factors], axis=1)
+    seen, covariance = terms[: len(evaluations)], np.cov(terms[len(evaluations) :].T)
+    has = np.array(
+        [*([column in factor for factor in factors] for column in columns), [True] * len(factors)]
     )
 
-    def shares(rows: IntArray, output: FloatArray) -> FloatArray:
-        design = np.column_stack([np.ones(len(rows)), inputs[rows]])
-        slopes, *_ = np.linalg.lstsq(design, output[rows], rcond=None)
-        varies = np.ptp(output[rows]) > 0  # of equal values nothing causes a share
-        return np.asarray(slopes[1:] ** 2 / np.var(output[rows]) if varies else 0 * slopes[1:])
+    def fit(output: FloatArray, is_used: BoolArray, rows: IntArray) -> tuple[float, FloatArray]:
+        """The mean square of what each vehicle differs from the regression of all others (Allen
+        1974, Technometrics 16, 125-127), and the shares of the characteristics.
+        """
+        x, y = seen[rows] * is_used, output[rows]
+        x, y = x - x.mean(axis=0), y - y.mean()
+        solve = np.linalg.solve(x.T @ x + PENALTY * len(y) * np.eye(len(factors)), x.T)
+        left_out = (y - x @ solve @ y) / (1 - 1 / len(y) - np.sum(x.T * solve, axis=0))
+        weights = has * (solve @ y)
+        variances = np.sum(weights @ covariance * weights, axis=1)
+        return float(np.mean(left_out**2)), variances[:-1] / (variances[-1] or 1.0)
 
     def indices_of(output: FloatArray) -> Indices:
-        rng = np.random.default_rng(evaluator.study.search.seed)
-        n = len(output)
-        resampled = [shares(rng.integers(0, n, n), output) for _ in range(RESAMPLES)]
-        half = norm.ppf(0.5 + confidence / 2) * np.std(resampled, axis=0, ddof=1)
-        return {"S1": shares(np.arange(n), output), "S1_conf": half}
+        # With products if they help to predict left-out vehicles.
+        rows = np.arange(len(output))
+        kinds = [has.sum(axis=0) == 2, has[-1]]  # a single characteristic, and all
+        error, _, best = min(
+            (fit(output, kind, rows)[0], number, kind) for number, kind in enumerate(kinds)
+        )
+        explained = float(1 - error / np.var(output))
+        if explained < LEAST_EXPLAINED:
+            return {"R2": explained}
+        samples = [rows, *rng.integers(0, len(rows), (RESAMPLES, len(rows)))]
+        shares, *others = [explained * fit(output, best, sample)[1] for sample in samples]
+        half = norm.ppf(0.5 + confidence / 2) * np.std(others, axis=0, ddof=1)
+        return {"R2": explained, "ST": shares, "ST_conf": half}
 
-    kinds = {"first": ("S1", "linear, of a regression"), "total": UNDEFINED}
+    kinds = {"first": UNDEFINED, "total": ("ST", "total, in a quadratic regression")}
     table = _table(names, evaluations, criterion, indices_of, kinds)
-    table.attrs["title"] = "What decides: shares of the variance (linear regression)"
+    table.attrs["title"] = "What decides: shares of the variance (quadratic regression)"
     return table
 
 
@@ -450,5 +442,5 @@ def _table(
     last = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
     table = tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
-    table.attrs[OF_WHAT] = output_names
+    table.attrs |= {OF_WHAT: output_names, EXPLAINED: found.get("degree", {}).get("R2")}
     return table

@@ -197,7 +197,8 @@ def _boxes(
     remark = (
         f" A region cannot be found: of the {len(settings):,} vehicles that are used for this,"
         f" {int(is_unsafe.sum()):,} are unsafe, and at least {MIN_SETTINGS} unsafe and"
-        f" {MIN_SETTINGS} safe ones are necessary. Ask for more with --samples."
+        f" {MIN_SETTINGS} safe ones are necessary. Ask for more with"
+        " --samples, or with --simulations where that is given."
     )
     return [], remark
 

@@ -128,7 +128,8 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:{number_format}}"
+        text = f"{value:{number_format}}"
+        return f"{value:,.0f}" if "e+" in text else text
     if isinstance(value, dict):
         return (
             ", ".join(f"{name} {cell_text(inner, number_format)}" for name, inner in value.items())

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
+from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -133,6 +134,11 @@ def percentage(share: float) -> str:
     """A share as a percentage with the digits that decide, without its sign: `37`, `0.043`."""
     value = 100 * share
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def bound_in_words(at_most: float) -> str:
+    """The upper bound of a share, which is one-sided."""
+    return f"with {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.3g} %"
 
 
 def two_decimals(value: float | None) -> str:

@@ -29,7 +29,7 @@ def why_safer(simulation: Simulation) -> list[str]:
     gaps = [float(trace.gap[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
     speeds = [float(trace.speed[onset, row]) for onset, row in zip(onsets, rows, strict=True)]
     brakes = [float(np.max(trace.brake[trace.active[:, row], row])) for row in rows]
-    if brakes[-1] > brakes[0]:
+    if round(100 * brakes[-1]) > round(100 * brakes[0]):
         return [
             "The driving system brakes the changed vehicle harder: with up to"
             f" {100 * brakes[-1]:.0f} instead of {100 * brakes[0]:.0f} % of the pedal."

@@ -60,7 +60,7 @@ from safevar_sumo.report.pack import (
 )
 from safevar_sumo.report.page import usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
-from safevar_sumo.study import Study, tables_of
+from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
@@ -191,13 +191,13 @@ def _files_of_user(
     # Files by the names that the results give them.
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
-    for name in names:
-        if Path(name).is_absolute():
-            raise InputError(
-                name,
-                "lies outside the study's folders, so that no pack can hold it",
-                "a copy beside the study",
-            )
+    # What a study names beside itself is there in a pack, too.
+    beside = [*data_files(study), *(name for _, name in fmus_of(study))]
+    paths_beside = [os.path.abspath(Path(places[0], name)) for name in beside]
+    outside = [path for path in paths_beside if not Path(path).is_relative_to(places[0])]
+    for name in [*outside, *filter(os.path.isabs, names)]:
+        problem = "lies outside the study's folders, so that no pack can hold it"
+        raise InputError(name, problem, "a copy beside the study, which then names the copy")
 
     # Views without which SUMO does not start.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:

@@ -101,7 +101,7 @@ def report(
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
-        Rough answers, without a line to sign.
+        Rough answers: the study's own parameter set alone, and a short search. No line to sign.
 
     Returns
     -------

@@ -24,6 +24,7 @@ from safevar_sumo.errors import warn
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
+from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.words import change_texts, counted_in_words, number_of, question_command
 from safevar_sumo.records import FloatArray, JsonObject, Outcome
@@ -39,11 +40,7 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES
 
-FIRST_CHOICES = {
-    "fewest": "fewest changes",
-    "smallest": "smallest changes",
-    "most_severe": "most severe",
-}
+FIRST_CHOICES = {"smallest": "smallest changes", "most_severe": "most severe"}
 """Choices that select the solutions to replay, as the flags of `simulate` do, in words."""
 MAX_CAUSES = 6
 """Maximum number of replays of settings that answers name by their changes."""
@@ -335,9 +332,12 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
     each set of changed characteristics.
     """
-    # The chosen solutions.
+    # The fewest changes, as `study` names them, and the chosen solutions.
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
+    fewest = fewest_changes(study.case, jobs=1)
+    if fewest is not None:
+        settings["Fewest changes"] = fewest.settings[0]
     for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
         settings[handle] = setting
 

@@ -178,7 +178,7 @@ def _greatest_speed(
     below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
     greatest = min([*speed.tables["cars"]["up_to"].astype(float), *below])
     if greatest >= span.low:
-        return f"{greatest:g} {span.unit}", ""
+        return f"{greatest:g} {span.unit} (simulated from {span.low:g} {span.unit} on)", ""
     return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."
 
 

@@ -132,8 +132,8 @@ def _expected_in_words(place: _Place, expected: str) -> str:
 
 
 def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
-    """The error for an unknown key, with the nearest key of its own table, or of another table in
-    the whole one.
+    """The error for an unknown key, with the place of a key of this name, else with the nearest key
+    of its own table, else of another table in the whole one.
     """
     own = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = dict[str, str]()
@@ -143,7 +143,8 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
             inner_keys = getattr(kind_of_field, "__struct_fields__", ())
             places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
     places |= {name: name for name in own}
-    nearest = [key] if key in places else get_close_matches(key, places, n=1)
+    nearest = [key] if key in places else get_close_matches(key, own, n=1)
+    nearest = nearest or get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
     return InputError("", f"{path}: there is no such key{hint}", one_of(own))
 

@@ -262,3 +262,8 @@ def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
     )
     results = sv.run("mine.toml", jobs=1)
     assert "My own search" in sv.tables(results).render("text", "rq1")
+    for option, error in (("table", "'rq9'.*\n.*rq3.1"), ("alpha", "expected: .* between 0 and 1")):
+        with pytest.raises(sv.InputError, match=f"(?s)^{option}: .*{error}"):
+            sv.tables(results, **{option: "rq9"})
+    with pytest.raises(sv.InputError, match=r"^compare\(\): takes exactly source and other$"):
+        sv.compare("smoke")

@@ -319,6 +319,18 @@ def test_what_is_shipped_passes(study: str) -> None:
     assert not check_study(load_study(study))
 
 
+def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
+    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trials, "LONGEST", 0.5)
+    Path("mine.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
+        "    def drive(self, seen):\n        while True:\n            pass\n"
+    )
+    output = run("check", "mine:Mine", expect=1).stdout
+    assert "took longer than the time limit of 0.5 s" in " ".join(output.split())
+
+
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])

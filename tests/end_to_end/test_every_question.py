@@ -109,7 +109,10 @@ def test_every_shipped_study_has_answers_or_reasons(name: str) -> None:
     ("typed", "told"),
     [
         ("permit autoware_july --quick --set brakeTorque=0.5 --others new", "may not drive"),
-        ("permit autoware_july --quick --set brakeTorque=0.9 --others new", "may drive up to"),
+        (
+            "permit autoware_july --quick --set brakeTorque=0.9 --others new",
+            "may drive from 30 up to",
+        ),
         (
             "permit autoware_july --quick --limits 'brakeTorque >= 0.5' --others new",
             "may not drive",
@@ -197,7 +200,7 @@ def test_the_speed_of_a_packed_sheet_is_that_of_its_own_limits() -> None:
     asked = f'--ask "{limits}" --ask "permit --quick --set brakeTorque=0.5 --others new"'
     answered(f"evidence results {asked} --out it.zip", must=True)
     with ZipFile("it.zip") as pack:
-        assert b"<dt>Greatest speed</dt><dd>Safe up to 60 km/h" in pack.read(
+        assert b"<dt>Greatest speed</dt><dd>Safe from 30 up to 60 km/h" in pack.read(
             "1-autoware_july/report.html"
         )
     assert json_of("verify", "it.zip")["numbers"]["passed"]

@@ -145,7 +145,9 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     refused("tables", "part", "--table", "rq9", message=("no table 'rq9'", "rq3.3-safety"))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
-    refused("tables", "part", message=("no run is finished",))
+    for option in ((), ("--table", "diversity")):
+        told = ("no run is finished", "`study` goes on where it was interrupted")
+        refused("tables", "part", *option, message=told)
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")

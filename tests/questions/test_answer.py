@@ -99,6 +99,9 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     assert f"{last} " in text
     assert f"│ {last + 1} " not in text
     assert "same" in answer.render("text", details=True)
+    alone = answer.render("text", "long").splitlines()
+    assert len(alone) <= MAX_LINES < len(answer.render("text", "long", details=True).splitlines())
+    assert alone[-1].endswith("more rows: --details.")
 
 
 @pytest.mark.parametrize(("number", "shown"), [(13, 13), (50, 50), (51, 12)])

@@ -15,6 +15,7 @@ import tomli_w
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.research_questions.statistics import compare_samples
+from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -291,3 +292,12 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
         message=("--ask: compare cannot be asked about 1",),
     )
     refused("report", dry, dry, "--out", "it.html", message=("twice",))
+
+
+def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    decided = {"decision": "decide", "better_in": 1, "worse_in": 1}, "DECIDE: B is both."
+    monkeypatch.setattr("safevar_sumo.questions.compare._decide", lambda *_: decided)
+    run("compare", "smoke", "smoke", "--samples", "8", "--jobs", "1", expect=4)
+    assert cell_text(1259.0, ".3g") == "1,259"

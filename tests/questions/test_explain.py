@@ -292,6 +292,22 @@ def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_need
         assert low < values["a"] < high
 
 
+def test_a_boundary_of_a_single_change_is_unsafe_when_typed_with_the_others() -> None:
+    """From 7.45 on `a` is unsafe beside 8.55 of `b`, but at 7.5 it is not; beside 8.6, it is."""
+
+    def region(rows: FloatArray) -> BoolArray:
+        total = rows[:, 0] + rows[:, 1]
+        return ((total > 16) & (total < 16.04)) | (total > 16.08)
+
+    evaluator = made_up_evaluator(2, region)
+    (causes,) = find_minimal_causes(evaluator, np.array([[9.0, 8.55]]), COLLISION)
+    found = find_cause_limits(evaluator, causes, COLLISION)
+    (printed,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
+    for name, value in printed["single_boundary"].items():
+        typed = causes[0].changes | {name: value}
+        assert region(np.array([[typed["a"], typed["b"]]])).all()
+
+
 def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > 8.996)
     assert limits(evaluator, 9.0).boundary["a"] == pytest.approx(8.996, abs=4 * RESOLUTION)

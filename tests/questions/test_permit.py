@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -175,8 +175,9 @@ def test_a_speed_that_is_needed(short: Study) -> None:
 
 def test_all_cars_within_limits(short: Study) -> None:
     limits = ("brakeTorque >= 0.7", "payload <= 525", "treadDepth >= 3")
-    answer = permit(short, limits=limits, others="new", fits=2)
+    answer = permit(short, limits=limits, others="new", fits=2, out="out.csv")
     (row,) = answer.table().to_dict("records")
+    assert [*pd.read_csv("out.csv")][:2] == ["car", "up_to"], "no value of a car"
     assert row["repair_first"] is None
     assert row["up_to"] <= 37, "a worn car of another test"
     assert "brakeTorque 1 -> 0.7" in row["because"]
@@ -192,8 +193,9 @@ def test_all_cars_within_limits(short: Study) -> None:
 
 def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
     cars = {"new": {}, "worn": {"treadDepth": 3}}
-    answer = permit(short, cars=cars, others="new", fits=0, quick=True)
+    answer = permit(short, cars=cars, others="new", quick=True)
     assert answer.numbers["rough"]
+    assert "the study's own parameter set alone" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
     assert set(answer.table()["verdict"]) == {"up to"}
 
@@ -204,6 +206,7 @@ def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study)
     told = permit(short, cars={"a": stated}, **options).verdict
     words = r"the car, (.*) [a-z]+ lowers the speed most: the car is unsafe already at (\d+) km/h"
     ((worst, failing),) = re.findall(words, told)
+    assert " a may drive up to" in told, "as given"
 
     # Each of the ends as a car of a list, which has no such sentence.
     cars = {
@@ -242,11 +245,11 @@ over = { speed = [40, 60] }
 """
 
 
-def own_search(study: Study) -> PermitSearch:
+def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     span = span_of(study, None)
     own = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
     values = np.arange(span.low, span.high + 1)
-    return PermitSearch(Models((own,), ()), span, values, LEAST_SIMULATIONS)
+    return PermitSearch(Models((own,), ()), span, values, budget)
 
 
 def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
@@ -261,9 +264,10 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
     assert "CPLA" in answer.verdict
     assert "Above 30 km/h nothing was driven" in answer.verdict
-    assert permit(study, cars={"a": {}}, others="new", fits=0, quick=True, by="impact_location")
+    assert span_of(load_study("alks_joint"), "lateral_speed").unit == "m/s"
 
 
+@settings(max_examples=25)
 @given(
     begin=st.floats(10.1, 58),
     width=st.floats(1.1, 20),
@@ -276,13 +280,15 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     study = load_study("wear_joint")
 
     def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
-        speed, location = self.as_printed(settings)[:, -2:].T
+        members = self.model.evaluator.characteristics
+        columns = members.columns(self.as_printed(settings))
+        speed, location = columns["speed"], columns["impact_location"]
         fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
         return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EncounterRange, "robustness", robustness)
-        search = own_search(study)
+        search = own_search(study, 2 * LEAST_SIMULATIONS)
         (found,) = search.reach(
             [Cars.one(assemble(study).characteristics.vehicle.original)], [None]
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import phases
+from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import COUNTS_STEPS, at_worst_phases, in_phases
@@ -193,19 +196,33 @@ def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
         Careless().tracks_begun(times, np.array([0.0, 0.01]))
 
 
-def test_an_answer_says_that_a_driving_system_counts_steps(in_tmp: Path) -> None:
+@pytest.mark.parametrize(
+    ("question", "options"),
+    [
+        (sv.permit, {"set": ("brakeTorque=1",), "others": "new", "step": 30}),
+        (sv.tolerance, {"characteristics": ("brakeTorque",), "attack": 1000, "at_tests": True}),
+        pytest.param(sv.repair, {"promise": ("brakeTorque >= 0.9",)}, marks=pytest.mark.slow),
+    ],
+)
+def test_an_answer_says_that_a_driving_system_counts_steps(
+    question: Callable[..., Answer], options: dict[str, Any], in_tmp: Path
+) -> None:
     Path("slow_ads.py").write_text(
         "from safevar_sumo.ads import ScalarAds\n"
         "class Slow(ScalarAds):\n"
-        "    def __init__(self):\n"
-        "        self.calls, self.brake = 0, 0.0\n"
+        "    def __init__(self, near=25.0):\n"
+        "        self.near, self.calls, self.brake = near, 0, 0.0\n"
         "    def drive(self, seen):\n"
-        "        if self.calls % 4 == 0 and seen.gap < 25:\n"
+        "        if self.calls % 4 == 0 and seen.gap < self.near:\n"
         "            self.brake = 1.0\n"
         "        self.calls += 1\n"
         "        return 0.0, self.brake\n"
     )
-    study = {"extends": "autoware_july", "name": "slow", "ads": {"model": "slow_ads:Slow"}}
-    options = {"others": "new", "quick": True, "fits": 0, "unsafe": "below=-30", "step": 30}
-    answer = sv.permit(study, set=("brakeTorque=1",), jobs=1, **options)
-    assert COUNTS_STEPS in answer.verdict
+    near = {"lower": 10.0, "upper": 50.0, "unit": "m", "meaning": "gap at which it brakes"}
+    parts = {
+        "ads": {"model": "slow_ads:Slow", "parameters": {"near": 25.0}},
+        "repair": {"near": near},
+    }
+    study = {"extends": "autoware_july", "name": "slow", **parts}
+    answer = question(study, quick=True, fits=0, unsafe="below=-30", jobs=1, **options)
+    assert COUNTS_STEPS in f"{answer.verdict} {answer.tested}"

@@ -69,3 +69,9 @@ def test_on_a_terminal_the_rough_answer_comes_first(
         answer = sv.explain("smoke", fits=0, progress=True)
         assert answer.numbers["rough"] is False
         assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal
+
+
+def test_rough_means_the_same_everywhere() -> None:
+    for command in ("permit", "tolerance", "repair", "explain", "report"):
+        said = " ".join(run(command, "--help").stdout.split())
+        assert "the study's own parameter set alone, and a short search." in said

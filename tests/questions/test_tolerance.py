@@ -25,6 +25,7 @@ from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.words import one_set_in_words
+from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import run
@@ -179,6 +180,15 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
                 wrong += proof.at_most < q
                 break
     assert 0 < wrong <= 0.05 * seeds
+
+
+def test_the_bound_of_a_first_test_without_failure_is_one_sided() -> None:
+    none = np.zeros(1228, dtype=bool)
+    proof, _ = prove(
+        lambda number: np.zeros((number, 2)), lambda _: Judgement(none, none, ~none), 0.003, 1
+    )
+    assert (1 - proof.at_most) ** 1228 == pytest.approx(0.05)
+    assert bound_in_words(proof.at_most) == "with 95 % confidence at most 0.244 %"
 
 
 def share_of_domain(answer: Answer) -> float:

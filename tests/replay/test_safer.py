@@ -56,6 +56,8 @@ def test_a_gain_of_less_than_a_frame_does_not_show_that_the_change_helps(
 def test_pedals_and_speeds_come_before_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     (harder,) = safer.why_safer(drives(monkeypatch, (20.0, 20.6), brakes=(0.5, 0.8)))
     assert "with up to 80 instead of 50 % of the pedal" in harder
+    alike = drives(monkeypatch, (20.0, 21.4), brakes=(0.381, 0.384))
+    assert not safer.why_safer(alike), "both are 38 %"
     (slower,) = safer.why_safer(drives(monkeypatch, (20.0, 20.6), speeds=(10.0, 9.5)))
     assert "it begins to brake at 9.50 instead of 10.00 m/s" in slower
 

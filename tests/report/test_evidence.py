@@ -25,6 +25,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.subject import load
 from safevar_sumo.report import claims
+from safevar_sumo.report.evidence import _files_of_user
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
@@ -76,6 +77,7 @@ def named(subject, evaluator, *, cars: str | None = None, ignore: tuple[str, ...
         question="of_cars:named", study=evaluator.study, verdict=verdict, numbers={}, tables={}
     )
 """
+SCENES = Path(__file__).parent.parent / "openscenario" / "files"
 DAMAGES = tomllib.loads(Path(__file__).with_name("damages.toml").read_text())["damage"]
 
 
@@ -407,6 +409,27 @@ def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(
     without = {name: texts[name] for name in texts if not name.endswith("mine.py")}
     told = ("mine.py, on which the results depend",)
     refused("verify", written(Path("it.zip"), without), "--run-code", message=told)
+
+
+@pytest.mark.parametrize(
+    "named",
+    [
+        {"scenario": {"file": "../files/cut_in.xosc"}},
+        {"ads": {"model": "../files/it.fmu", "kind": "fmu"}},
+        {"vehicle": {"files": ["../files/it.fmu"]}},
+    ],
+    ids=["scenario", "fmu", "data"],
+)
+def test_a_file_outside_the_folder_of_the_study_is_refused(
+    named: dict[str, Any], in_tmp: Path
+) -> None:
+    shutil.copytree(SCENES, "files")
+    Path("files/it.fmu").write_bytes(b"")
+    Path("own").mkdir()
+    Path("own/it.toml").write_text('extends = "smoke"')
+    study = load_study("own/it.toml", **named)
+    with pytest.raises(InputError, match=r"files/.*: lies outside the study's folders"):
+        _files_of_user(study, {}, [])
 
 
 class Careless(NamedTuple):

@@ -227,7 +227,7 @@ def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_c
     assert "Greatest speed" not in sheet_with(answer_of(), speed_of(30.0))
     sheet = sheet_with(answer_of(), speed_of(30.0), speed=speed_of())
     foreman, _, engineer = sheet.partition("For the manufacturer's engineer")
-    assert "Greatest speed: 40 km/h. Up to this speed every simulated vehicle within" in foreman
+    assert "Greatest speed: 40 km/h (simulated from 10 km/h on). Up to this speed every" in foreman
     assert not re.search("CP[FNL]|parameter set", foreman)
     assert "in CPFA. 12 parameter sets; 120,000 simulations that search" in engineer
 
@@ -237,7 +237,7 @@ def test_a_failure_in_a_wider_study_lowers_the_greatest_speed() -> None:
     row = ("wear_joint", "up to 60 km/h", False, "A child is hit.", {"speed": 36.2})
     answer.tables["wider"] = tabulate("Wider", WIDER, [row])
     sheet = sheet_with(answer, speed=speed_of())
-    assert "Greatest speed: 36 km/h." in sheet
+    assert "Greatest speed: 36 km/h (simulated" in sheet
     assert "a vehicle within these limits fails above the greatest speed." in sheet
 
 

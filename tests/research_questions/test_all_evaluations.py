@@ -108,13 +108,13 @@ def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far
     low = front.min(axis=0)
     width = front.max(axis=0) - low
     rows = answer.to_dict()["tables"]["convergence"]["rows"]
-    for name, count in product(("nsga2", "FiveWorst"), (40, 400)):
-        so_far = case.evaluations.query(f"algorithm == '{name}' and evaluation < {count}").groupby(
-            "run"
-        )
-        points = [(group[OBJECTIVES].to_numpy(float) - low) / width for _, group in so_far]
+    for name, number in product(("nsga2", "FiveWorst"), (4, -1)):
+        found = [one for one in rows if one["algorithm"] == name][number]
+        count = found["evaluations"]
+        runs = case.evaluations.query(f"algorithm == '{name}'").groupby("run")
+        different = [group[:count] for _, group in runs]  # a journal has each setting once
+        points = [(group[OBJECTIVES].to_numpy(float) - low) / width for group in different]
         volumes = [moocore.hypervolume(run, ref=[1.1] * 3) for run in points]
-        (found,) = [one for one in rows if (one["algorithm"], one["evaluations"]) == (name, count)]
         assert found["case"] == "mine"
         expected = np.percentile(volumes, [50, 25, 75])
         assert [found[key] for key in ("hypervolume", "low", "high")] == pytest.approx(expected)

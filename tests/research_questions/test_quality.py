@@ -83,7 +83,7 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
         "".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures
     ]
     assert all("My search" in label and "mine" not in label for label in labels)
-    assert "My search (2 runs)\nmean: 26 evaluations" in labels[0]
+    assert "My search (2 runs)\nmean: 26 simulations" in labels[0]
 
 
 SAMPLES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=20)

@@ -234,11 +234,14 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
 ) -> None:
     """A run finds (1, 0) in the square of the two objectives that differ, with the reference point
     (1.1, 1.1): worth 0.11. Then it finds the collision (0, 1): both are worth 0.21. The third
-    objective adds a length of 1.1. By Noether, 7.849 / (6 * 0.25^2) = 20.9 runs show 0.75.
+    objective adds a length of 1.1. The third runs have no valid setting within 10. By Noether,
+    (2.394 + 0.842)^2 / (6 * 0.1667^2) = 62.8 runs show 0.6667 at 0.05 / 3, for three tests.
     """
     monkeypatch.setattr(budgets, "BUDGETS", (10, 20))
     points = {"a": row(sd=1.0, f_diff=0.1), "b": row(sd=-1.0, f_diff=0.5), "-": row(sd=9.0)}
-    journals = {"nsga2": ["-----a--------b", "a----"], "rs": [f"{'-' * 20}a", "a"]}
+    points["x"] = row(f_diff=math.nan)
+    journals = {"nsga2": ["-----a--------b", "a----", "xxxxxxxxxxb"]}
+    journals["rs"] = [f"{'-' * 20}a", "a", "x"]
     seen = [
         {**points[point], "algorithm": name, "run": run, "evaluation": 2 * number}
         for name in journals
@@ -246,16 +249,18 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
         for number, point in enumerate(journal)
     ]
     case = made_up(
-        points["a"], points["b"], evaluations=seen, finished=[*product(journals, (0, 1))]
+        points["a"], points["b"], evaluations=seen, finished=[*product(journals, (0, 1, 2))]
     )
-    table = answer_questions([case], names=["budget"]).tables["budget"]
+    answer = answer_questions([case], Choices(alpha=0.05), ["budget"])
+    table = answer.tables["budget"]
+    assert "; 95 % intervals)" in table.attrs["title"]
     names = ["simulations", "effect_size", "runs_needed", "hypervolume", "hypervolume_baseline"]
     assert table[[*names, "unsafe"]].to_numpy() == pytest.approx(
         np.array(
             [
-                (10, 0.75, 21, 0.121, 0.0605, 0),
-                (20, 0.875, 10, 0.176, 0.0605, 0.5),
-                (100, 0.75, 21, 0.176, 0.121, 0.5),
+                (10, 6 / 9, 63, 0.121, 0, 0),
+                (20, 8 / 9, 12, 0.121, 0, 2 / 3),
+                (100, 7 / 9, 23, 0.121, 0.121, 2 / 3),
             ]
         )
     )

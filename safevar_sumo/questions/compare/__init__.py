@@ -124,9 +124,9 @@ def compare(
 
     A version B that is less safe must not be released, and the command ends with exit code 3: its
     original vehicle collides where that of A does not, or something that concerns safety is worse,
-    and at most needless braking is better. The same criterion counts for both. Where the original
-    vehicles differ, the same changes of each original are compared. Small changes are not filtered
-    out.
+    and at most needless braking is better. Exit code 4 says that a person has to decide. The same
+    criterion counts for both. Where the original vehicles differ, the same changes of each original
+    are compared. Small changes are not filtered out.
 
     Parameters
     ----------

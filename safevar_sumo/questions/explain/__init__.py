@@ -145,7 +145,8 @@ def explain(
         Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
         checked again; 0 leaves this out.
     quick
-        A rough answer: the study's own parameter set alone, and causes of few failures.
+        A rough answer: the study's own parameter set alone, and a short search. It has causes of
+        few failures.
     """
     of_study = isinstance(subject, Study)
     limit = QUICK_LIMIT if quick or of_study else LIMIT

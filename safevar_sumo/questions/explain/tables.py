@@ -254,13 +254,14 @@ def printed_limits(
         for rounded, values, fails in zip(printed, exact, is_unsafe, strict=True)
     ]
 
-    # Each change alone at its boundary, in the printed encounter.
+    # Each change alone at its boundary, with the others as they are, in the printed encounter.
     alone = [
         values | cause.changes | {name: value}
         for values, (cause, limit) in zip(printed, pairs, strict=True)
         for name, value in limit.single_boundary.items()
     ]
-    found = iter(values_as_printed(model, alone))
+    names = [name for limit in limits for name in limit.single_boundary]
+    found = iter(values_as_printed(model, alone, names))
     return [
         {
             "encounter": {name: values[name] for name in cause.encounter},

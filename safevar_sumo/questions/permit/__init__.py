@@ -93,7 +93,7 @@ def permit(
     need
         A speed that the cars have to drive, with its unit; exit code 3 if one of them may not.
     by
-        Another searched parameter, or axis of the matrix, in place of the speed.
+        Another speed that the study varies, such as that of the target.
     step
         Distance of the speeds that are tried, to which the answer is rounded down.
     margin
@@ -107,8 +107,8 @@ def permit(
         Number of simulations for each car and parameter set that search for an unsafe encounter up
         to the speed found.
     quick
-        A rough answer: the speeds of the grid alone, without this search and without repairs. No
-        car may drive without a limit.
+        A rough answer: the study's own parameter set alone, and a short search. The grid alone is
+        driven, no car may drive without a limit, and no repair is named.
     out
         A file for the list of cars, in the order of the input and with all its columns as they are
         given, beside those of the answer; `assumed` names the values that were not measured.
@@ -121,7 +121,7 @@ def permit(
     _check_forms(cars, set, limits, out)
     fleet = read_cars(study, cars, set, limits, others, ignore)
     criterion = _criterion(evaluator, unsafe, margin)
-    models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
+    models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
     budget = max(attack, USUAL_BUDGET) if limits else attack
     search = PermitSearch(models, span, values, 0 if quick else budget)
@@ -205,7 +205,7 @@ def read_cars(
         with about("limits"):
             names = limits_of(limits, rows)
         cars = {
-            f"all cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
+            f"All cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
         }
     written = [*CARS, DIGEST]
     return read_fleet(

@@ -28,6 +28,7 @@ from safevar_sumo.questions.permit.rows import (
     verdict_of,
 )
 from safevar_sumo.questions.permit.search import Permit, PermitSearch
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.tolerance.up_to import study_up_to
@@ -152,7 +153,7 @@ class PermitAnswer:
         unit = unit_text(span.unit)
         top = f"{span.high:g}{unit}"
         number = len(cars)
-        new_car = f"the new car may drive up to {self.new_car.up_to:g}{unit}"
+        new_car = f"the new car may drive {span.up_to(self.new_car.order)}"
         goal = top if self.need is None else f"{self.need:g}{unit}"
         phrases = {
             DRIVE: f"may drive {goal} or as fast as the new car",
@@ -167,13 +168,12 @@ class PermitAnswer:
         sentences = [f"{join_phrases(parts)}; {new_car}.", *self.assumed]
         if number == 1:
             name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
-            may = "may not drive" if pd.isna(up_to) else f"may drive up to {up_to:g}{unit}"
-            sentences[0] = f"{name[:1].upper()}{name[1:]} {may}; {new_car}."
+            may = "may not drive" if pd.isna(up_to) else f"may drive {span.up_to(up_to)}"
+            sentences[0] = f"{name} {may}; {new_car}."
             sentences.append(because_of)
         if self.need is not None:
             sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
-        if remark := self.search.remark_on_phases():
-            sentences.append(remark)
+        sentences.append(remark_on_phases(self.models.own.in_phases))
         if span.ending:
             tests = join_phrases(span.ending)
             sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")
@@ -209,7 +209,10 @@ class PermitAnswer:
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""
         manifest = manifest_now(self.study, assemble(self.study))
-        listing = pd.concat([fleet.table.reset_index(drop=True), cars.drop(columns="car")], axis=1)
+        given = fleet.table.reset_index(drop=True)
+        # Limits are no measured values of a car.
+        given = given[given.columns[:1]] if self.is_box else given
+        listing = pd.concat([given, cars.drop(columns="car")], axis=1)
         listing[DIGEST] = identity_digest(manifest)[:12]
         return listing
 

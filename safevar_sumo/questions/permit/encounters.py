@@ -22,13 +22,15 @@ from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
-from safevar_sumo.study import PHASE, Study
+from safevar_sumo.study import PHASE, Study, unit_text
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
 """Number of Sobol points over the other parameters that a vehicle meets at each speed."""
 MOST_ENDS = 4
 """Number of them of whose ends all combinations are met, too, each with ends of the others."""
+SPEED_UNITS = ("km/h", "m/s", "")
+"""Units of parameters that may be a speed."""
 MOST_VEHICLES = 16
 """Number of vehicles that stand for a box at each of these places."""
 
@@ -51,6 +53,11 @@ class Span(NamedTuple):
     high: float
     ending: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+
+    def up_to(self, value: float) -> str:
+        """What is driven up to a value: `from 10 up to 35 km/h`."""
+        reached = f"{value:g}{unit_text(self.unit)}"
+        return f"from {self.low:g} up to {reached}" if value > self.low else f"at {reached} alone"
 
 
 class EncounterRange(NamedTuple):
@@ -180,12 +187,12 @@ def unit_places(dimensions: int, value: float) -> FloatArray:
 
 
 def span_of(study: Study, by: str | None) -> Span:
-    """The parameter that is chosen, by default the speed, and the range that all tests share.
+    """The speed that is chosen, and the range that all tests share.
 
     Raises
     ------
     InputError
-        If the study has no such parameter; the candidates are named.
+        If the study varies no such speed; those that it varies are named.
     """
     matrix = study.matrix
     if matrix is not None and matrix.protocol:
@@ -197,13 +204,20 @@ def span_of(study: Study, by: str | None) -> Span:
         test.name: {name: values for name, values in test.over.items() if _are_numbers(values)}
         for test, _ in tests
     }
-    of_axes = [name for over in axes.values() for name in over]
-    candidates = [*dict.fromkeys([*study.scenario.search, *of_axes])]
+    # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
+    units = {name: domain.unit for name, domain in study.scenario.search.items()}
+    for test, own in tests:
+        searchable = searchable_in(own[0].scenario)
+        for axis in axes[test.name]:
+            if axis in searchable or SPEED_DIMENSION in axis:
+                units[axis] = searchable[axis].unit if axis in searchable else ""
+    speeds = [name for name, unit in units.items() if unit in SPEED_UNITS]
     name = by or SPEED_DIMENSION
-    if by is None and name not in candidates:
-        problem = f"study {study.name!r} varies no {name}, so a parameter has to be chosen by --by"
-        raise InputError("by", problem, ", ".join(candidates) or "a study that varies a speed")
-    check_name("by", f"study {study.name!r} varies no {name}", name, candidates)
+    problem = f"study {study.name!r} varies no {'speed' if by is None or not speeds else by}"
+    if not speeds:
+        problem += ", and permit asks up to which speed a car is safe"
+        raise InputError("permit", problem, "a study that varies a speed")
+    check_name("by", problem, name, speeds)
 
     # A searched parameter has one range for all tests.
     domain = study.scenario.search.get(name)
@@ -217,12 +231,10 @@ def span_of(study: Study, by: str | None) -> Span:
         if name in over
     }
     high = min(last for _, last in ends.values())
-    scenario = next(own[0].scenario for test, own in tests if name in axes[test.name])
-    searchable = searchable_in(scenario)
     goes_on = any(last > high for _, last in ends.values())
     return Span(
         name=name,
-        unit=searchable[name].unit if name in searchable else "",
+        unit=units[name],
         low=min(low for low, _ in ends.values()),
         high=high,
         ending=tuple(test for test, (_, last) in ends.items() if goes_on and last == high),

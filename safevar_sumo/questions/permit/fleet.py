@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
@@ -18,6 +19,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
 from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
@@ -26,7 +28,7 @@ CAR = "car"
 """Natural header of the column that names the cars, which the answer has, too."""
 NEW = "new"
 """Value of `--others`: a characteristic without a value is as in the original vehicle."""
-TYPED, THIS_CAR = "--set", "this car"
+TYPED, THIS_CAR = "--set", "This car"
 """The option of typed values, and the name of the car that has them."""
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma"}
 """Separators of columns: the first one that the header has outside of quotation marks is meant."""
@@ -35,8 +37,15 @@ SEPARATOR_LINE = re.compile(r"sep=(.)\r?\n", re.IGNORECASE)
 NUMBERS = {
     ".": re.compile(NUMBER_PATTERN, re.ASCII),
     ",": re.compile(NUMBER_PATTERN.replace(r"\.", ","), re.ASCII),
+    ";": re.compile(rf"(?![+-]?[1-9]\d{{0,2}}\.\d{{3}}$){NUMBER_PATTERN}", re.ASCII),
 }
-"""Numbers by their decimal mark."""
+"""Numbers by their decimal mark; between semicolons 1.250 means 1250 as often as 1.25."""
+MARKS = {
+    ".": "a decimal point (a decimal comma is read only with semicolons between the columns)",
+    ",": "a decimal comma, as others of the file",
+    ";": "a decimal comma, or with a point that cannot be one of thousands",
+}
+"""These marks in words."""
 
 
 class Fleet(NamedTuple):
@@ -128,7 +137,7 @@ def read_fleet(
     # An answer beside the list that it is about, which may have had semicolons and decimal commas.
     written = {*answer_columns} - {CAR}
     if is_answer := written <= {text.strip() for text in cells.header}:
-        cells = cells._replace(separator=";")
+        cells = cells._replace(separator=",;")
         ignore, answer_columns = [*ignore, *written], ()
 
     # The columns, the names in the first one, and the values.
@@ -201,10 +210,8 @@ def _cells_of_file(path: Path) -> _Cells:
     header = records[0][1]
     for line, record in records:
         if len(record) != len(header):
-            expected = f"{len(header)} fields, as in the header"
-            if len(record) > len(header) and separator == ",":
-                expected += "; a decimal comma is read only with semicolons between the columns"
-            raise InputError(f"{path}, line {line}", f"{len(record)} fields", expected)
+            expected = f"{len(header)} fields with a {SEPARATORS[separator]} between them"
+            raise InputError(f"{path}, line {line}", number_of(len(record), "field"), expected)
     places = [f"{path}, line {line}" for line, _ in records[1:]]
     return _Cells(place, header, places, [record for _, record in records[1:]], separator)
 
@@ -299,23 +306,28 @@ def _names(cells: _Cells, naming: int) -> list[str]:
     for row, place in zip(cells.rows, cells.places, strict=True):
         name = row[naming].strip()
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
-            if not name or not name.isprintable():
-                raise InputError("", f"{name!r} is no name of a car", "a text of one line")
-            if name in places:
-                first = f"a name that no other car has ({places[name]})"
+            if not name or not name.isprintable() or name[0] in "=+-@":
+                legal = "a text of one line that does not begin with =, +, - or @, as formulas do"
+                raise InputError("", f"{name!r} is no name of a car", legal)
+            # Names that differ in case, blanks or the form of their characters are one.
+            key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+            if key in places:
+                first = f"a name that no other car has ({places[key]})"
                 raise InputError("", f"the car {name!r} is there twice", first)
-        places[name] = place
-    return list(places)
+        places[key] = place
+    return [row[naming].strip() for row in cells.rows]
 
 
 def _values(
     cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet
 ) -> tuple[FloatArray, BoolArray]:
     """The values of all cells, nan where one is empty, and which cells have one."""
-    # Commas are decimal marks of the whole file where semicolons separate its columns.
+    # Commas are decimal marks of the whole file where semicolons separate its columns, and in an
+    # answer about such a file.
     stated = [row[column].strip() for row in cells.rows for column in columns]
     has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
-    mark = "," if cells.separator == ";" and has_commas else "."
+    mark = ";" if cells.separator == ";" else "."
+    mark = "," if ";" in cells.separator and has_commas else mark
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
     for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
         for column, number in columns.items():
@@ -325,19 +337,18 @@ def _values(
     return settings, ~np.isnan(settings)
 
 
-def _number(text: str, mark: str, characteristic: Characteristic) -> float:
+def _number(text: str, mark: str, item: Characteristic) -> float:
     """The value of a cell; refuses what is no number with the decimal mark, or outside of the
     domain.
     """
     if not NUMBERS[mark].fullmatch(text):
-        domain = f"[{characteristic.lower:g}, {characteristic.upper:g}]{characteristic.suffix}"
-        marks = "a decimal comma, as others of the file" if mark == "," else "a decimal point"
-        if "," in text and mark != ",":
-            marks += "; a decimal comma is read only with semicolons between the columns"
-        problem = f"{text!r} is no number with {marks.partition(';')[0]}"
-        raise InputError("", problem, f"a number in {domain}, with {marks}")
+        domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
+        raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
-    characteristic.check(value, switch="")
+    # A part may be better than that of a new car, where that is an end of the domain.
+    most = f"{item.upper:g}"
+    is_better = value > item.upper == item.original
+    item.check(value, otherwise=f"; at most {most}: enter {most}" if is_better else "", switch="")
     return value
 
 

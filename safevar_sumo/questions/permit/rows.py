@@ -128,13 +128,13 @@ def because(
         return f"Not even at {span.low:g}{unit}: {words.sentence}."
     if not words.sentence:
         name = span.name.replace("_", " ")
-        return f"Safe up to {up_to:g}{unit}, the greatest {name} that was driven."
+        return f"Safe {span.up_to(up_to)}, the greatest {name} that was driven."
     sentence = words.sentence[:1].upper() + words.sentence[1:]
     if verdict != DRIVE:
         return f"{sentence}."
     if need is not None and up_to >= need:
-        return f"Safe up to {up_to:g}{unit}, and {need:g}{unit} is needed."
-    return f"As fast as the new car, which is safe up to {new_car:g}{unit}: {words.sentence}."
+        return f"Safe {span.up_to(up_to)}, and {need:g}{unit} is needed."
+    return f"As fast as the new car, which is safe {span.up_to(new_car)}: {words.sentence}."
 
 
 def set_rows(

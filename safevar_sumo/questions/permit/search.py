@@ -11,7 +11,6 @@ import numpy as np
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit.encounters import EncounterRange, Span, ranges_of
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
-from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.records import BoolArray, FloatArray
 
 REPAIR_STAGE = "cars with one part as new"
@@ -137,11 +136,6 @@ class PermitSearch:
                 failure = search.failures[number]
                 found[car].append(Reached(model.fit, search.up_to(number), failure))
         return [Permit(reached) for reached in found]
-
-    def remark_on_phases(self) -> str:
-        """What to know where not all phases of encounters were met, in a sentence; else ""."""
-        first, *_ = next(iter(self._ranges.values()))
-        return remark_on_phases(first.model, first.places(first.high)[:1])
 
     def repair_first(
         self,

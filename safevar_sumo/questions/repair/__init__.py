@@ -33,11 +33,12 @@ from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
-from safevar_sumo.questions.words import encounter_in_words, join_phrases, percentage
+from safevar_sumo.questions.words import bound_in_words, encounter_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
@@ -169,8 +170,7 @@ def repair(
         A repair for the points of the study's tests alone: nothing is simulated between the values
         of a matrix.
     quick
-        A rough answer: the study's own parameter set alone, and a short search for counterexamples.
-        Not with `out`.
+        A rough answer: the study's own parameter set alone, and a short search. Not with `out`.
     """
     study = evaluator.study
     evaluator.system.refuse_simulator("nothing of its driving system can be changed here")
@@ -315,7 +315,10 @@ def _answer_of(
     tested = ""
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
-        tested = f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
+        tested = (
+            f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
+            f" {remark_on_phases(models.own.in_phases)}".strip()
+        )
     return Answer(
         question="repair",
         study=problem.study,
@@ -451,8 +454,8 @@ def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, 
     """The validation of a change, without a full stop."""
     return (
         f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
-        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe: with"
-        f" {100 * CONFIDENCE:g} % confidence at most {percentage(at_most)} % are"
+        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe:"
+        f" {bound_in_words(at_most)} are"
     )
 
 

@@ -86,7 +86,7 @@ def _survivors_in(
             failures = find_failures(problems, between, change, search.settings, attacks)
             if not failures:
                 phases.expect(proof + left)
-                proved, failures = prove_change(problems, change, attacks, failed_proofs)
+                proved, failures = prove_change(problems, change, attacks, failed_proofs + 1)
                 if failures:
                     failed_proofs += 1
                 else:

@@ -73,7 +73,7 @@ def prove_change(
     only without them the change is proved.
 
     As many settings again each meet one of the other sets, at random. `number` counts the searches,
-    for the random numbers, and `attempt` the proofs that failed before.
+    for the random numbers, and `attempt` the proofs, from 1 on.
     """
     own = problems[0]
     seed = problems[0].study.search.seed

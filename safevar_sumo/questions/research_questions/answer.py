@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Fraction, Jobs, Range
+from safevar_sumo.questions.ask import Fraction, Jobs, Range, options_of
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -30,11 +30,7 @@ from safevar_sumo.questions.research_questions.comparisons import (
     describe_runs_without_solutions,
     titles_of,
 )
-from safevar_sumo.questions.research_questions.figures import (
-    draw_change_counts,
-    draw_figures,
-    save_figures,
-)
+from safevar_sumo.questions.research_questions.figures import draw_figures, save_figures
 from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     describe_evaluations,
@@ -105,7 +101,10 @@ def tables(
     table
         `budget` or `diversity`: compute this table alone.
     """
-    # The cases, and the algorithm that is compared.
+    # The options, the cases, and the algorithm that is compared.
+    {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
+    if table:
+        check_name("table", f"there is no table {table!r}", table, {**TABLES, "remarks": REMARKS})
     cases = _cases_of(results)
     if algorithm:
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
@@ -179,6 +178,7 @@ def answer_questions(
     errors = []
     for name in names:
         title, compute, columns, wide = TABLES[name]
+        title = title.format(level=f"{100 - 100 * choices.alpha:g}")
         label = next(iter(columns))  # of the case
         if name == CAUSES and not choices.causes:
             continue
@@ -222,7 +222,7 @@ def answer_questions(
             "alpha": choices.alpha,
         },
         tables=frames,
-        draw=lambda answer: draw_change_counts(cases),
+        draw=lambda answer: next(iter(draw_figures(cases).values())),
     )
 
 

@@ -12,13 +12,10 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.research_questions.comparisons import (
-    Choices,
-    opponents_of,
-    with_intervals,
-)
+from safevar_sumo.questions.research_questions.comparisons import Choices, rq2_runs, with_intervals
 from safevar_sumo.questions.research_questions.fronts import (
     frames_of_runs,
     hypervolume,
@@ -30,10 +27,8 @@ from safevar_sumo.questions.research_questions.fronts import (
 
 BUDGETS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000, 200_000, 500_000)
 """Numbers of simulations of a run after which algorithms are compared, besides its whole budget."""
-PLANNED_QUANTILES = 2.801585
-"""Sum of the quantiles of the normal distribution at 0.975, for a two-sided test at 0.05, and at
-0.8, for a power of 80 %.
-"""
+POWER = 0.8
+"""Probability with which a planned number of runs shows an effect."""
 DRAWN = 20
 """Usual number of failures of an algorithm whose minimal causes are simulated, at each budget."""
 
@@ -71,35 +66,40 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
     """Every pair of algorithms within each budget.
 
     `effect_size` is A12 of the hypervolume of the runs, above 0.5 where the algorithm is better.
-    `hypervolume` is the median, `unsafe` the mean number of unsafe settings over the runs that have
-    settings within the budget. The reference front is the same for all budgets.
+    `hypervolume` is the median, `unsafe` the mean number of unsafe settings over all finished runs;
+    a run without a valid setting within the budget has 0 of both. The reference front is the same
+    for all budgets.
 
     With `runs_needed` runs of each algorithm, N / 2, a Mann-Whitney test shows the effect: N =
-    (z_{1 - alpha / 2} + z_{power})^2 / (12 c (1 - c) (A12 - 0.5)^2) with c = 1 / 2, for many runs
+    (z_{1 - level / 2} + z_{power})^2 / (12 c (1 - c) (A12 - 0.5)^2) with c = 1 / 2, for many runs
     without ties (Noether 1987: Sample size determination for some common nonparametric tests.
-    Journal of the American Statistical Association 82, 645-647). It is infinite for 0.5.
+    Journal of the American Statistical Association 82, 645-647). It is infinite for 0.5. The level
+    is alpha, divided by the number of tests of `rq2_runs`, as Holm's method does with the smallest
+    p-value.
 
     Raises
     ------
     UnanswerableError
         If there are no evaluations or no solutions, or a single algorithm.
     """
-    # Every run within each budget.
-    opponents_of(case)  # raises if there is a single algorithm
+    # Every run within each budget, also if it has no valid setting there.
+    tests = rq2_runs(case, choices)["p_value"].count()  # raises if there is a single algorithm
     reference = reference_front(case)
     within = within_budgets(case)
     runs = [
         (
-            *key,
+            *run,
+            budget,
             hypervolume(
                 normalised(minimised_values(case, rows), reference),
                 case.study.search.reference_point,
             ),
             within.unsafe.rows(rows).sum(),
         )
-        for key, rows in within.solutions.groupby(["algorithm", "simulations", "run"])
+        for budget, valid in within.solutions.groupby("simulations")
+        for run, rows in frames_of_runs(case, valid)
     ]
-    growth = pd.DataFrame(runs, columns=["algorithm", "simulations", "n1", "hypervolume", "unsafe"])
+    growth = pd.DataFrame(runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"])
 
     # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
     others = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
@@ -121,5 +121,6 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
             "unsafe_baseline": "mean",
         }
     )
-    frame["runs_needed"] = np.ceil((PLANNED_QUANTILES / (frame["effect_size"] - 0.5)) ** 2 / 6)
+    quantiles = scipy.stats.norm.isf([choices.alpha / 2 / max(tests, 1), 1 - POWER]).sum()
+    frame["runs_needed"] = np.ceil((quantiles / (frame["effect_size"] - 0.5)) ** 2 / 6)
     return with_intervals(frame, choices.alpha)

@@ -257,7 +257,7 @@ def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
         raise UnanswerableError(
             case.name,
             f"only {first} has finished runs",
-            "results of another algorithm to compare with, such as rs",
+            f"results of another algorithm, such as {'rs' if first != 'rs' else NSGA2}",
         )
     return first, others
 

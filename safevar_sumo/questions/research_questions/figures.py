@@ -128,20 +128,20 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of all settings that a run has evaluated so far, over the number of
-    evaluations, as median and quartiles over the runs. A line ends with the longest run of its
-    algorithm; a mark there is the median of what the runs return. The legend says how many
-    evaluations a run has on average: less than its budget if it ends early.
+    """The hypervolume of all settings that a run has simulated so far, over their number, as
+    median and quartiles over the runs. A line ends with the longest run of its algorithm; a mark
+    there is the median of what the runs return. The legend says how many settings a run simulates
+    on average: fewer than its budget if it repeats some or ends early.
     """
     import seaborn as sns
 
     # Growth over all evaluations, as median and quartiles.
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
-    means = count_evaluations(case).groupby("algorithm")["requested"].mean().to_dict()
+    means = count_evaluations(case).groupby("algorithm")["simulated"].mean().to_dict()
     labels = {
         algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)\n"
-        f"mean: {means[algorithm]:,.0f} evaluations"
+        f"mean: {means[algorithm]:,.0f} simulations"
         for algorithm, count in runs.items()
     }
     figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
@@ -156,6 +156,7 @@ def draw_convergence(case: Case) -> Figure:
         palette=COLOURS[: len(labels)],
         ax=axis,
     )
+    axis.set_xlabel("simulations of different settings")
     axis.set_ylabel(
         "normalised hypervolume of all settings so far\n(line: median, band: quartiles over runs;\n"
         f"mark: of what a run returns; reference point {case.study.search.reference_point:g})"

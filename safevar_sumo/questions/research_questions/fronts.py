@@ -111,6 +111,8 @@ def frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    if not runs:
+        case.require_solutions()  # says that no run is finished
     if not groups.keys() & set(runs):
         raise UnanswerableError(
             case.name, "has no evaluations", "results with the journals of their runs"
@@ -226,8 +228,8 @@ def few_evaluations(case: Case) -> str:
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of all that each run has evaluated after a number of evaluations; columns
-    algorithm, run, evaluations, hypervolume.
+    """The hypervolume of all that each run has simulated after a number of evaluations, which are
+    different settings; columns algorithm, run, evaluations, hypervolume.
 
     Objectives are normalised as in `compute_indicators`. The numbers end with the longest run of
     the algorithm. The hypervolume is 0 as long as no evaluation dominates the reference point.
@@ -241,12 +243,12 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     reference = reference_front(case)
     frames = []
     counts = np.linspace(0, case.study.search.evaluations, CURVE_POINTS + 1, dtype=int)
-    ends = count_evaluations(case).groupby("algorithm")["requested"].max()
+    ends = count_evaluations(case).groupby("algorithm")["simulated"].max()
     for (algorithm, run), group in frames_of_runs(case, case.evaluations):
         # The front grows by what each stretch adds.
-        valid = valid_evaluations(case, group)
+        valid = valid_evaluations(case, group.assign(number=range(len(group))))
         points = normalised(minimised_values(case, valid), reference)
-        numbers = valid["evaluation"].to_numpy()
+        numbers = valid["number"].to_numpy()
         counts_of_run = np.unique(np.minimum(counts, ends[algorithm]))
         front = points[:0]
         volumes = []

@@ -96,8 +96,8 @@ def tolerance(
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.
     quick
-        A rough answer: the study's own parameter set, and the shortest search for counterexamples.
-        No limit is called kept, and with limits the exit code is 3.
+        A rough answer: the study's own parameter set alone, and a short search. No limit is called
+        kept, and with limits the exit code is 3.
     """
     whole = evaluator
     if up_to is not None:

@@ -8,17 +8,16 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.box import MET_BY_CORNERS, Proof
+from safevar_sumo.questions.box import MET_BY_CORNERS
 from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
-from safevar_sumo.questions.phases import AT_ONE_PHASE
-from safevar_sumo.questions.sampling import CONFIDENCE
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.words import join_phrases, number_of, percentage, share_in_words
+from safevar_sumo.questions.words import bound_in_words, join_phrases, number_of, share_in_words
 from safevar_sumo.study import unit_text
 
 
@@ -93,9 +92,12 @@ def tested_sentences(models: Models, together: LimitsTogether | None, budget: in
     if together is not None and together.box is not None:
         yield validation_in_words(together, budget)
         if together.proof is not None:
-            yield _bound_in_words(together.proof)
-        if models.own.in_phases is None and not models.own.unsafe.is_of_points:
-            yield AT_ONE_PHASE
+            bound = bound_in_words(together.proof.at_most).capitalize()
+            yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
+        if not models.own.unsafe.is_of_points and (
+            remark := remark_on_phases(models.own.in_phases)
+        ):
+            yield remark
 
 
 def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
@@ -233,13 +235,6 @@ def _sampled_in_words(together: LimitsTogether) -> str:
     failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
     unsafe = "none" if not proof.failures else f"{proof.failures}"
     return f"{proof.samples:,} random vehicles, {unsafe} unsafe{failed}"
-
-
-def _bound_in_words(proof: Proof) -> str:
-    return (
-        f"With {100 * CONFIDENCE:.0f} % confidence at most {percentage(proof.at_most)} % of"
-        " uniformly sampled vehicles within the limits are unsafe."
-    )
 
 
 def _without_room(models: Models, together: LimitsTogether) -> list[str]:
