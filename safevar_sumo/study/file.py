@@ -280,11 +280,12 @@ def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stu
     dropped = [
         f"[{key}]"
         for key, value in base.tables.items()
-        if parts
-        and isinstance(value, dict)
+        if isinstance(value, dict)
         and key not in {*tables, *keys_with(OF_STUDY, Study)}  # which no study inherits
     ]
-    if dropped:
+    lost = _set_in(base.tables.get("scenario")) - _set_in(tables.get("scenario"))
+    dropped += [f"{name} of [scenario]" for name in sorted(lost)]
+    if parts and dropped:
         differences = " and a different ".join("ADS" if key == "ads" else key for key in parts)
         of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
         remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
@@ -299,6 +300,12 @@ def _names_scenario(table: object, base_table: object) -> bool:
         return False
     base_model = base_table.get("model") if isinstance(base_table, dict) else None
     return "file" in table or table.get("model", base_model) != base_model
+
+
+def _set_in(scenario: object) -> set[str]:
+    """The parameters that a table [scenario] sets or searches."""
+    inner_tables = scenario.values() if isinstance(scenario, dict) else ()
+    return {name for table in inner_tables if isinstance(table, dict) for name in table}
 
 
 def _model_and_network(table: object) -> object:

@@ -172,13 +172,29 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
     study, remarks = with_remarks("mine.toml")
     assert study.matrix is None
-    assert remarks == ["mine.toml: has a different scenario than 'wear', so not its [matrix]"]
-    own, remarks = with_remarks("wear", scenario=scenario, matrix={"tests": [{"name": "own"}]})
-    assert ([test.name for test in own.matrix.tests], remarks) == (["own"], [])
+    text = "mine.toml: has a different scenario than 'wear', so not its [matrix]"
+    assert remarks == [f"{text}, vut_length of [scenario], vut_width of [scenario]"]
+    own, _ = with_remarks("wear", scenario=scenario, matrix={"tests": [{"name": "own"}]})
+    assert [test.name for test in own.matrix.tests] == ["own"]
     same, remarks = with_remarks(
         "wear", scenario={"model": "crossing", "parameters": {"speed": 30}}
     )
     assert (same.matrix, remarks) == (read_study("wear").matrix, [])
+
+
+def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit() -> None:
+    scenario = {"model": "car_to_car", "parameters": {"vut_length": 4.7, "speed": 30}}
+    _, (remark,) = with_remarks("wear_joint", scenario=scenario)
+    lost = "[matrix], impact_location of [scenario], vut_width of [scenario]"
+    assert remark.endswith(f"has a different scenario than 'wear_joint', so not its {lost}")
+
+
+@pytest.mark.parametrize(
+    "name", ["alks", "alks_joint", "alks_joint_cut_out", "alks_joint_following"]
+)
+def test_the_worn_car_has_one_size_in_all_studies_of_un_r157(name: str) -> None:
+    for point in assemble(read_study(name)).points:
+        assert (point.scenario.vut_length, point.scenario.vut_width) == (4.7, 1.85)
 
 
 def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -> None:
