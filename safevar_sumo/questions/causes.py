@@ -256,13 +256,14 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
     examined = failures.sort_values(order, kind="stable").groupby(keys).head(limit)
     settings = examined[[*names, F_NUM_DIFF.name]].drop_duplicates()
-    price = sum(_subset_counts(settings.pop(F_NUM_DIFF.name)))
+    price = sum(_subset_counts(settings.pop(F_NUM_DIFF.name).astype(int).tolist()))
     print_text(
-        Console(stderr=True), f"{case.name}: the minimal causes take about {price:,} simulations."
+        Console(stderr=True), f"{case.name}: the minimal causes take at most {price:,} simulations."
     )
 
     # Kinds of causes: which characteristics change, and in which direction.
-    causes = find_minimal_causes(evaluator, settings.to_numpy(dtype=float), case.unsafe)
+    rows = settings.to_numpy(dtype=float)
+    causes = find_minimal_causes(evaluator, rows, case.unsafe, price)
     kinds = pd.Series(
         [
             {directions(evaluator.characteristics, cause.changes) for cause in group}

@@ -184,7 +184,8 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
             assert float(re.search(rf"{item.short_name} at ([\d.]+)", verdict)[1]) == value  # type: ignore[index]
     share = f"{100 * leading['robust_share']:.0f} % of vehicles with slightly different values"
     assert re.search(
-        rf"^With .* the vehicle collides\. Of 256 vehicles .*\. The cause d.* exact values: .*{share} are unsafe, too\.",
+        r"^With .* the vehicle collides\. Of 256 vehicles .*\. The cause d.* exact values: "
+        rf".*{share} are unsafe, too\.",
         verdict,
     )
     assert f"The cause holds in {leading['holds']} of {FITS} parameter sets" in verdict

@@ -83,8 +83,10 @@ LIMIT, QUICK_LIMIT = 40_000, 4_000
 """Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
 if all would take more, a random sample is analysed.
 """
-OF_SAMPLE = 600
-"""Settings for the minimal causes of failures that were sampled over the domain, at least."""
+STUDY_LIMIT, OF_SAMPLE = 12_000, 600
+"""The same for failures that were sampled over the domain of a study, and the least number of
+settings.
+"""
 BEYOND = 256
 """Number of vehicles beyond the values of a cause that are simulated."""
 FOR_ONE = 800
@@ -149,9 +151,9 @@ def explain(
         few failures.
     """
     of_study = isinstance(subject, Study)
-    limit = QUICK_LIMIT if quick or of_study else LIMIT
+    limit = QUICK_LIMIT if quick else LIMIT
     if of_study:
-        limit = max(limit, OF_SAMPLE * len(evaluator.system.points))
+        limit = max(QUICK_LIMIT if quick else STUDY_LIMIT, OF_SAMPLE * len(evaluator.system.points))
     fits = 0 if quick else fits
     study = evaluator.study
     settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)

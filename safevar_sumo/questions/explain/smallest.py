@@ -231,35 +231,36 @@ def draw_staircase(answer: Answer) -> Figure:
     from safevar_sumo.questions.figures import BLUE, FONT_SIZE, escape_dollars, new_figure
 
     # A step for each share, the original at the left.
-    frame = answer.tables["staircase"].iloc[::-1]
-    size = (6.4, 3.6)
-    title = f"{answer.study.name}: the fewest changes that are unsafe"
-    figure, ((axis,),) = new_figure(title, 1, 1, size)
-    found = frame[frame["fewest"].notna()]
-    axis.step(100 * found["share"], found["fewest"], where="mid", color=BLUE)
-    axis.plot(100 * found["share"], found["fewest"], "o", color=BLUE)
-    for row in found.itertuples():
-        parts = row.causes[0].replace(", ", "\n") + ("\n..." if len(row.causes) > 1 else "")
+    rows = answer.tables["staircase"].iloc[::-1].to_dict("records")
+    found = [(100 * row["share"], row["fewest"], row["causes"]) for row in rows if row["causes"]]
+    figure, ((axis,),) = new_figure(
+        f"{answer.study.name}: the fewest changes that are unsafe", 1, 1, (6.4, 3.6)
+    )
+    shares = [share for share, _, _ in found]
+    fewest = [number for _, number, _ in found]
+    axis.step(shares, fewest, "o-", where="mid", color=BLUE)
+    for share, number, causes in found:
+        parts = causes[0].replace(", ", "\n") + ("\n..." if len(causes) > 1 else "")
         axis.annotate(
             escape_dollars(parts),
-            (100 * row.share, row.fewest),
+            (share, number),
             xytext=(0, 6),
             textcoords="offset points",
             ha="center",
             fontsize=FONT_SIZE - 2,
         )
-    for row in frame[frame["fewest"].isna()].itertuples():
-        axis.axvline(100 * row.share, color="0.6", linestyle=":")
-        axis.annotate(
-            f"none of {row.tried:,}",
-            (100 * row.share, 1),
-            fontsize=FONT_SIZE - 2,
-            rotation=90,
-            va="bottom",
-            ha="right",
-        )
+    for row in rows:
+        if not row["causes"]:
+            axis.text(
+                100 * row["share"],
+                1,
+                f"none of {row['tried']:,}",
+                fontsize=FONT_SIZE - 2,
+                rotation=90,
+                ha="center",
+            )
     axis.set_xlim(0, 108)
-    axis.set_ylim(0.5, max(found["fewest"], default=1) + 1.6)
+    axis.set_ylim(0.5, max(fewest, default=1) + 1.6)
     axis.yaxis.get_major_locator().set_params(integer=True)
     axis.set_xlabel("share of the way from the original to the end of the domain [%]")
     axis.set_ylabel("changes")
