@@ -177,6 +177,9 @@ def study(
     keys = _select_runs(all_runs(loaded), shard)
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
+    if system.has_simulator and not dry_run:
+        fewer = question_command("explain", study)
+        warn(f"{fewer} --simulations N finds the smallest changes with few simulations")
 
     # Measured or searched.
     if dry_run:
@@ -195,14 +198,19 @@ def study(
                 only=keys,
                 engine=engine,
             )
-            return _found(results, system, unsafe, jobs, parts.begin())
+            return _found(results, system, unsafe, jobs, parts.begin(), study)
     except KeyboardInterrupt:
         warn(INTERRUPTED.format(directory))
         raise
 
 
 def _found(
-    results: Results, system: System, unsafe: str | None, jobs: int | None, progress: Progress
+    results: Results,
+    system: System,
+    unsafe: str | None,
+    jobs: int | None,
+    progress: Progress,
+    study: str,
 ) -> Answer:
     """What was found, and what to ask next."""
     progress("the fewest unsafe changes", 0, 1)
@@ -211,9 +219,8 @@ def _found(
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
     directory = str(results.directory)
-    following = ", ".join(
-        question_command(name, directory) + criterion for name in ("explain", "tolerance")
-    )
+    asked = ("explain", study), ("explain", directory), ("tolerance", directory)
+    following = ", ".join(question_command(*one) + criterion for one in asked)
 
     # Questions refuse an original encounter in which the original vehicle is not safe.
     demanded = results.case.scoring.safe_original

@@ -65,8 +65,9 @@ def test_a_title_is_no_markup(in_tmp: Path) -> None:
 
 @SLOW
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
-    following = "explain results/smoke, python -m safevar_sumo tolerance results/smoke"
-    assert f"Next: python -m safevar_sumo {following}" in run("study", "smoke").stdout
+    asked = "explain smoke", "explain results/smoke", "tolerance results/smoke"
+    following = ", ".join(f"python -m safevar_sumo {question}" for question in asked)
+    assert f"Next: {following}" in run("study", "smoke").stdout
     output = run("study", "smoke", "--details").stdout
     for part in (
         "NSGA-II",
