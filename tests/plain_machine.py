@@ -107,20 +107,14 @@ def installed_files(machine: Machine) -> None:
 
 
 def read_me(machine: Machine) -> None:
-    """README's commands, its files, and the questions of its table, whose examples are quotes or
-    shown above.
-    """
-    ran = set()
+    """README's commands, its files, and the questions of its table, whose examples are quotes."""
     for block in blocks("README.md"):
         if block.title:
             (machine.folder / "readme" / block.title).write_text(block.text)
         elif block.language == "bash":
             for line in block.text.splitlines():
                 machine.run(line, "checkout" if line.startswith("pip") else "readme")
-                ran.add(line)
     for command, example in questions():
-        if PROGRAM + command in ran and "see above" in example:
-            continue
         printed = machine.run(PROGRAM + command, "readme", ANSWERS)
         quotes = re.findall('"(.+?)"', example)
         if not quotes:
