@@ -105,7 +105,7 @@ def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
         (causes,) = find_minimal_causes(evaluator, setting[np.newaxis], case.unsafe)
         if not causes:
             return None
-        worst = min(causes, key=lambda cause: cause.safety_degree)
+        worst = min(causes, key=lambda cause: (len(cause.changes), cause.safety_degree))
         model = Model(0, evaluator, case.unsafe)
         (printed,) = values_as_printed(model, [worst.changes | worst.encounter])
         settings = case.characteristics.setting(printed, beyond=True)[np.newaxis]

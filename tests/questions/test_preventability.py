@@ -16,9 +16,9 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain import _avoided_in_words
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
 from safevar_sumo.questions.explain.robustness import robust_shares
+from safevar_sumo.questions.explain.words import avoided_in_words
 from safevar_sumo.questions.preventability import (
     DRIVERS,
     assess_collisions,
@@ -93,11 +93,11 @@ def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> 
 def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None:
     many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
     assert (
-        _avoided_in_words(many)
+        avoided_in_words(many)
         == "In the same vehicle, a competent driver would have avoided nearly all of 1,000"
         " collisions, and full braking at the first possible moment all."
     )
-    assert _avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
+    assert avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
 
 
 def test_who_has_no_verdict_is_counted_with_the_points() -> None:

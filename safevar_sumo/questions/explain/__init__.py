@@ -4,13 +4,10 @@ failure robust, and would a reference driver have avoided it?
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Range, question
 from safevar_sumo.questions.case import Case, are_collisions
@@ -21,7 +18,6 @@ from safevar_sumo.questions.causes import (
     count_distinct_causes,
     count_needed,
 )
-from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import COMBINATIONS
 from safevar_sumo.questions.explain.failures import (
@@ -31,7 +27,6 @@ from safevar_sumo.questions.explain.failures import (
     choose_failures,
     gather_failures,
 )
-from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
 from safevar_sumo.questions.explain.smallest import (
     MAX_SETTINGS,
     SMALLEST_COLUMNS,
@@ -51,27 +46,22 @@ from safevar_sumo.questions.explain.tables import (
     failures_frame,
     statistics_tables,
 )
+from safevar_sumo.questions.explain.words import (
+    DRAWN,
+    SOLUTIONS,
+    others_in_words,
+    verdict_on_failures,
+)
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
-    LETTER,
     REFERENCE_DRIVERS,
     TITLES,
     assess_sample,
-    avoided_shares,
     has_reference_drivers,
 )
 from safevar_sumo.questions.tables import tabulate
-from safevar_sumo.questions.words import (
-    constraints_in_words,
-    counted_in_words,
-    encounter_in_words,
-    ending_in_words,
-    join_phrases,
-    number_of,
-    share_in_words,
-)
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
 
 if TYPE_CHECKING:
@@ -87,14 +77,10 @@ STUDY_LIMIT, OF_SAMPLE = 12_000, 600
 """The same for failures that were sampled over the domain of a study, and the least number of
 settings.
 """
-BEYOND = 256
-"""Number of vehicles beyond the values of a cause that are simulated."""
 FOR_ONE = 800
 """Settings for each failure that is explained, where few simulations are allowed."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
 """The last phases of progress, with their usual numbers of settings."""
-SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
-"""What the settings are of which some are unsafe."""
 
 
 @question
@@ -150,33 +136,26 @@ def explain(
         A rough answer: the study's own parameter set alone, and a short search. It has causes of
         few failures.
     """
-    of_study = isinstance(subject, Study)
-    limit = QUICK_LIMIT if quick else LIMIT
-    if of_study:
-        limit = max(QUICK_LIMIT if quick else STUDY_LIMIT, OF_SAMPLE * len(evaluator.system.points))
-    fits = 0 if quick else fits
-    study = evaluator.study
-    settings = SAMPLED_SETTINGS if isinstance(subject, Study) else len(subject.solutions)
-    planned = {TO_EXPLAIN: settings, SUBSETS: limit / len(evaluator.system.points)}
-    evaluator.plan(planned | ({COMBINATIONS: MAX_SETTINGS} if of_study else {}) | LATER)
+    of_study, study = isinstance(subject, Study), evaluator.study
+    limit = _plan(subject, evaluator, quick)
+    if quick or evaluator.left is not None:
+        fits = 0
 
     # The failures.
     if evaluator.left is not None:
-        fits = 0
         top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
+    is_caused = _has_causes(population, study)
 
     # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
     # of a smaller one where few simulations are allowed.
-    smallest = None
-    if of_study and _has_causes(population, study):
-        smallest = Smallest.of(evaluator, population.unsafe, fits)
+    has_smallest = of_study and is_caused
+    smallest = Smallest.of(evaluator, population.unsafe, fits) if has_smallest else None
     if evaluator.left is not None:
         limit = evaluator.left // 4
-    top = 0 if of_study else top
-    reasons, sample, causes, complete = choose_failures(population, evaluator, limit, top)
-    is_caused = _has_causes(population, study)
+    chosen = choose_failures(population, evaluator, limit, 0 if of_study else top)
+    reasons, sample, causes, complete = chosen
     of_chosen, of_sample = (
         [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
     )
@@ -186,19 +165,14 @@ def explain(
 
     # What reference drivers avoid.
     has_drivers = has_reference_drivers(evaluator)
-    is_assessed = runs.collided & has_drivers
-    verdicts, collisions = assess_sample(evaluator, runs.take(is_assessed))
+    verdicts, collisions = assess_sample(evaluator, runs.take(runs.collided & has_drivers))
 
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
-    if of_study:
-        leading = tables_of(smallest)
-    else:
-        found = causes_table(population, evaluator, fits, solutions, of_chosen, distinct)
-        leading = {"causes": found}
+    of_failures = (population, evaluator, fits, solutions, of_chosen, distinct)
     tables = {
-        **leading,
+        **(tables_of(smallest) if of_study else {"causes": causes_table(*of_failures)}),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions),
         "distinct_causes": distinct_table(distinct),
@@ -208,19 +182,11 @@ def explain(
         **(_collision_numbers(verdicts, collisions) if has_drivers else NO_COLLISION_NUMBERS),
         **(smallest.numbers if smallest is not None else {}),
     }
-    kind = DRAWN if isinstance(subject, Study) else SOLUTIONS
-    verdict = _verdict(evaluator, population, tables["causes"])
+    verdict = verdict_on_failures(evaluator, population, tables["causes"])
     if smallest is not None:
         verdict = smallest.sentences(evaluator, population.unsafe)
-    sentences = [
-        *verdict,
-        f"All minimal causes of up to {number_of(complete, 'change')} are found."
-        if complete
-        else "",
-        _avoided_in_words(verdicts),
-        _number_in_words(population, kind),
-        *_counted(study, population, kind),
-    ]
+    kind = DRAWN if of_study else SOLUTIONS
+    sentences = [*verdict, *others_in_words(study, population, complete, verdicts, kind)]
     return Answer(
         question="explain",
         study=study,
@@ -231,11 +197,17 @@ def explain(
     )
 
 
-def _counted(study: Study, population: Population, kind: str) -> Iterator[str]:
-    """Which of the settings count, in sentences."""
-    if kind == DRAWN:
-        yield from counted_in_words(study, population.left_out)
-    yield from constraints_in_words(study)
+def _plan(subject: Study | Case, evaluator: Evaluator, quick: bool) -> int:
+    """Plan the phases; returns the number of simulations for minimal causes of failures."""
+    points = len(evaluator.system.points)
+    if isinstance(subject, Study):
+        limit = max(QUICK_LIMIT if quick else STUDY_LIMIT, OF_SAMPLE * points)
+        planned = {TO_EXPLAIN: SAMPLED_SETTINGS, COMBINATIONS: MAX_SETTINGS}
+    else:
+        limit = QUICK_LIMIT if quick else LIMIT
+        planned = {TO_EXPLAIN: len(subject.solutions)}
+    evaluator.plan({**planned, SUBSETS: limit / points, **LATER})
+    return limit
 
 
 def _has_causes(population: Population, study: Study) -> bool:
@@ -282,99 +254,6 @@ def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
             (collisions, int(is_avoided.sum()), int(unavoidable.sum())),
             strict=True,
         )
-    )
-
-
-def _number_in_words(population: Population, kind: str) -> str:
-    """How many settings are unsafe."""
-    unsafe = population.unsafe
-    runs = population.evaluations
-    number = int(np.count_nonzero(unsafe.of(runs)))
-    return f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
-
-
-def _verdict(evaluator: Evaluator, population: Population, causes: pd.DataFrame) -> Iterator[str]:
-    """How little is enough, and how sure that is."""
-    unsafe = population.unsafe
-    contact = evaluator.system.contact
-    runs = population.evaluations
-
-    # Nothing has to change if the original is unsafe.
-    if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
-        words = unsafe.breach_in_words(population.original)
-        yield f"The original vehicle itself {words}: no change is necessary."
-        yield unsafe.smaller_demand(population.original)
-        return
-
-    # Without a cause, how the worst setting and the original end.
-    if causes.empty:
-        nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
-        for who, run in (("worst vehicle", nearest), ("original vehicle", population.original)):
-            if len(run):
-                ending = ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)
-                yield f"The {who} {ending}."
-        return
-    leading = causes.iloc[0]
-    if not leading["changes"]:
-        yield "The original vehicle itself is unsafe in this encounter: no change is necessary."
-        return
-
-    # Its values, its encounter, and how sure the cause is.
-    members = evaluator.characteristics
-    boundary = leading["boundary"]
-    values = [
-        f"{item.short_name} at {limit_text(item, boundary[item.name])}"
-        for item in members
-        if item.name in boundary
-    ]
-    encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
-    where = " in an encounter in which the original vehicle is safe" if encounter else ""
-    verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    yield f"With {join_phrases(values)} the vehicle {verb}{where}."
-    yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
-    yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
-    yield robustness_in_words(leading["robust_share"])
-    if pd.notna(leading["holds"]):
-        holding = f"{leading['holds']} of {leading['fits']}"
-        yield f"The cause holds in {holding} parameter sets of the vehicle model."
-
-
-def _beyond_in_words(
-    evaluator: Evaluator, unsafe: Unsafe, cause: dict[str, float], encounter: dict[str, float]
-) -> str:
-    """The share of vehicles beyond all values of a cause, all else as in the original, that are
-    unsafe, in a sentence; empty if there are none, or too few may be simulated.
-    """
-    members = evaluator.characteristics
-    number = evaluator.at_most(BEYOND, 4)
-    at_cause = members.setting(cause | encounter, beyond=True)
-    ends = np.where(at_cause > members.original, members.upper, members.lower)
-    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
-    if number < LEAST_NEIGHBOURS or not is_open.any():
-        return ""
-    shares = np.random.default_rng(evaluator.study.search.seed).random((number, len(members)))
-    vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
-    runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
-    share = share_in_words(float(np.mean(unsafe.of(runs))))
-    verbs = "collide" if str(unsafe) == Outcome.COLLISION else "are unsafe"
-    whose = "these values" if len(cause) > 1 else "this value"
-    return f"Of {number} vehicles beyond {whose}, all else as in the original, {share} {verbs}."
-
-
-def _avoided_in_words(verdicts: pd.DataFrame) -> str:
-    """What a competent driver, and full braking, would have avoided."""
-    shares = avoided_shares(verdicts)
-    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
-    number = number_of(len(verdicts), "collision")
-    avoided = [
-        (title, share_in_words(shares[name])) for name, title in titles.items() if name in shares
-    ]
-    if not avoided:
-        return ""
-    (first, share_of_first), *others = avoided
-    and_others = "".join(f", and {title} {share}" for title, share in others)
-    return (
-        f"In the same vehicle, {first} would have avoided {share_of_first} of {number}{and_others}."
     )
 
 

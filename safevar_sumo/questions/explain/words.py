@@ -1,0 +1,141 @@
+"""What `explain` says of failures: the values of a cause and how sure it is, who avoids them, and
+what counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.counterexamples import limit_text
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain.failures import Population
+from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
+from safevar_sumo.questions.preventability import FULL, LETTER, avoided_shares
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    counted_in_words,
+    encounter_in_words,
+    ending_in_words,
+    join_phrases,
+    number_of,
+    share_in_words,
+)
+from safevar_sumo.records import Outcome
+from safevar_sumo.study import Study
+
+BEYOND = 256
+"""Number of vehicles beyond the values of a cause that are simulated."""
+SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
+"""What the settings are of which some are unsafe."""
+
+
+def verdict_on_failures(
+    evaluator: Evaluator, population: Population, causes: pd.DataFrame
+) -> Iterator[str]:
+    """How little is enough, and how sure that is."""
+    unsafe = population.unsafe
+    contact = evaluator.system.contact
+    runs = population.evaluations
+
+    # Nothing has to change if the original is unsafe.
+    if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
+        words = unsafe.breach_in_words(population.original)
+        yield f"The original vehicle itself {words}: no change is necessary."
+        yield unsafe.smaller_demand(population.original)
+        return
+
+    # Without a cause, how the worst setting and the original end.
+    if causes.empty:
+        nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
+        for who, run in (("worst vehicle", nearest), ("original vehicle", population.original)):
+            if len(run):
+                ending = ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)
+                yield f"The {who} {ending}."
+        return
+    leading = causes.iloc[0]
+    if not leading["changes"]:
+        yield "The original vehicle itself is unsafe in this encounter: no change is necessary."
+        return
+
+    # Its values, its encounter, and how sure the cause is.
+    members = evaluator.characteristics
+    boundary = leading["boundary"]
+    values = [
+        f"{item.short_name} at {limit_text(item, boundary[item.name])}"
+        for item in members
+        if item.name in boundary
+    ]
+    encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
+    where = " in an encounter in which the original vehicle is safe" if encounter else ""
+    verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
+    yield f"With {join_phrases(values)} the vehicle {verb}{where}."
+    yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
+    yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
+    yield robustness_in_words(leading["robust_share"])
+    if pd.notna(leading["holds"]):
+        holding = f"{leading['holds']} of {leading['fits']}"
+        yield f"The cause holds in {holding} parameter sets of the vehicle model."
+
+
+def _beyond_in_words(
+    evaluator: Evaluator, unsafe: Unsafe, cause: dict[str, float], encounter: dict[str, float]
+) -> str:
+    """The share of vehicles beyond all values of a cause, all else as in the original, that are
+    unsafe, in a sentence; empty if there are none, or too few may be simulated.
+    """
+    members = evaluator.characteristics
+    number = evaluator.at_most(BEYOND, 4)
+    at_cause = members.setting(cause | encounter, beyond=True)
+    ends = np.where(at_cause > members.original, members.upper, members.lower)
+    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
+    if number < LEAST_NEIGHBOURS or not is_open.any():
+        return ""
+    shares = np.random.default_rng(evaluator.study.search.seed).random((number, len(members)))
+    vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
+    runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
+    share = share_in_words(float(np.mean(unsafe.of(runs))))
+    verbs = "collide" if str(unsafe) == Outcome.COLLISION else "are unsafe"
+    whose = "these values" if len(cause) > 1 else "this value"
+    return f"Of {number} vehicles beyond {whose}, all else as in the original, {share} {verbs}."
+
+
+def others_in_words(
+    study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame, kind: str
+) -> Iterator[str]:
+    """Up to which size causes are complete, who avoids the failures, and which settings count."""
+    if complete:
+        yield f"All minimal causes of up to {number_of(complete, 'change')} are found."
+    yield avoided_in_words(verdicts)
+    yield _number_in_words(population, kind)
+    if kind == DRAWN:
+        yield from counted_in_words(study, population.left_out)
+    yield from constraints_in_words(study)
+
+
+def avoided_in_words(verdicts: pd.DataFrame) -> str:
+    """What a competent driver, and full braking, would have avoided."""
+    shares = avoided_shares(verdicts)
+    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
+    number = number_of(len(verdicts), "collision")
+    avoided = [
+        (title, share_in_words(shares[name])) for name, title in titles.items() if name in shares
+    ]
+    if not avoided:
+        return ""
+    (first, share_of_first), *others = avoided
+    and_others = "".join(f", and {title} {share}" for title, share in others)
+    return (
+        f"In the same vehicle, {first} would have avoided {share_of_first} of {number}{and_others}."
+    )
+
+
+def _number_in_words(population: Population, kind: str) -> str:
+    """How many settings are unsafe."""
+    unsafe = population.unsafe
+    runs = population.evaluations
+    number = int(np.count_nonzero(unsafe.of(runs)))
+    return f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
