@@ -143,7 +143,8 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
             inner_keys = getattr(kind_of_field, "__struct_fields__", ())
             places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
     places |= {name: name for name in own}
-    nearest = [key] if key in places else get_close_matches(key, own, n=1)
+    likely = own if "." in path else places  # a key above all tables belongs to any of them
+    nearest = [key] if key in places else get_close_matches(key, likely, n=1)
     nearest = nearest or get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
     return InputError("", f"{path}: there is no such key{hint}", one_of(own))

@@ -36,7 +36,7 @@ def test_the_box_with_limits_is_nearly_the_largest(
     found = box_of(3, linear, limits)
     assert 0.97 * largest < relative_volume(found) <= largest
     assert (found.box.upper - 5) @ LINEAR <= 10
-    assert found.proof.at_most == pytest.approx(1 - (0.05 / 2) ** (1 / found.proof.samples))
+    assert found.proof.at_most == pytest.approx(1 - 0.05 ** (1 / found.proof.samples))
     assert all(
         found.box.upper["abc".index(name)] == limit.at_most for name, limit in limits.items()
     )

@@ -224,7 +224,9 @@ def test_nothing_everything_and_too_little() -> None:
     assert (row.rule, row.density, row.coverage) == ("everywhere", 1.0, 1.0)
     few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.tables["rules"].empty
-    assert few.verdict.endswith("Ask for more with --samples.")
+    assert few.verdict.endswith(
+        "Ask for more with --samples, or with --simulations where that is given."
+    )
 
 
 def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:

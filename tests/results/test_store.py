@@ -417,7 +417,7 @@ def test_results_survive_a_study_whose_characteristics_are_in_another_order(
     command = ("study", "slippery.toml", "--runs", "2", "--out", str(copied), "--jobs", "1")
     refused(*command, message=("another study",))
     assert contents(copied) == before
-    assert "collision" in run("explain", str(copied), "--quick").stdout
+    assert "collide" in run("explain", str(copied), "--quick").stdout
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:

@@ -34,7 +34,7 @@ from safevar_sumo.questions.explain.smallest import (
     STAIRCASE_COLUMNS,
     Smallest,
     draw_staircase,
-    tables_of,
+    smallest_tables,
 )
 from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
@@ -172,7 +172,7 @@ def explain(
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
     of_failures = (population, evaluator, fits, solutions, of_chosen, distinct)
     tables = {
-        **(tables_of(smallest) if of_study else {"causes": causes_table(*of_failures)}),
+        **(smallest_tables(smallest) if of_study else {"causes": causes_table(*of_failures)}),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions),
         "distinct_causes": distinct_table(distinct),

@@ -206,7 +206,7 @@ class Smallest(NamedTuple):
         return _capital(f"{join_phrases(others)} {verb} in no cause of {up_to} to an end.")
 
 
-def tables_of(smallest: Smallest | None) -> dict[str, pd.DataFrame]:
+def smallest_tables(smallest: Smallest | None) -> dict[str, pd.DataFrame]:
     """The tables of causes and of the staircase; empty where the original itself is unsafe."""
     rows = [
         (
