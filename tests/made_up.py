@@ -22,6 +22,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
 
 HAS_AD_RSS = (
     sys.platform == "linux" and platform.machine() == "x86_64" and sys.version_info < (3, 14)
@@ -44,7 +45,7 @@ HARDEST = Measure(
 
 def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:
     """A case of one run of NSGA-II with these solutions, without evaluations."""
-    frame = solutions_frame(tuple(study.vehicle.characteristics), [(("nsga2", 0), solutions)])
+    frame = solutions_frame(CharacteristicSet.of(study).names, [(("nsga2", 0), solutions)])
     return build_case(study, record(original, 0), frame, frame.iloc[:0], [("nsga2", 0)])
 
 

@@ -52,7 +52,7 @@ QUESTIONS = {
     "risk tiny.toml --samples 300": f"{DEMANDED}.*left out",
     "risk results --samples 300": COUNTED,
     "rules tiny.toml --samples 300": COUNTED,
-    "explain tiny.toml --quick --top 2": f"{CAUSE}.* {COUNTED}",
+    "explain tiny.toml --quick": rf"each combination was simulated in the original .* {COUNTED}",
     "explain results --quick --top 2": CAUSE,
     "tables results": (
         rf"are less safe than the original vehicle in the same encounter\. {DEMANDED}"

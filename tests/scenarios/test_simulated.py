@@ -319,10 +319,9 @@ def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(wall: Path)
     found = json_of("explain", "wall.toml", "--quick")
     assert found["numbers"]["collisions"] is None
     assert not found["tables"]["drivers"]["rows"]
-    causes = [row["boundary"] for row in found["tables"]["causes"]["rows"]]
-    alone = [row["decel"] for row in causes if [*row] == ["decel"]]
-    assert alone
-    assert all(value == pytest.approx(225 / 2 / 32.5, abs=0.1) for value in alone)
+    causes = found["tables"]["causes"]["rows"]
+    (share,) = (row["begins_at"] for row in causes if row["causes"] == {"decel": 3})
+    assert 8 - 5 * share == pytest.approx(225 / 2 / 32.5, abs=0.1)
     assert "weather" not in run("tolerance", "wall.toml", "--quick").stdout
 
 

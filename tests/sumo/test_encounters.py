@@ -26,7 +26,7 @@ from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, searched, verify_everywhere
-from tests.made_up import drawn
+from tests.made_up import case_of, drawn
 from tests.sumo.planted import BRAKING, GAP
 
 
@@ -295,7 +295,11 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     None
 ):
     study = planted()
-    answer = explain.compute(study, Evaluator(study, InlinePool()), quick=True, top=2)
+    evaluator = Evaluator(study, InlinePool())
+    found = evaluator.evaluate(evaluator.feasible_settings(256), "solutions")
+    case = case_of(study, evaluator.evaluate_original(), found.take(found.valid))
+    answer = explain.compute(case, evaluator, quick=True, top=2)
+    assert len(answer.tables["causes"])
     for cause in answer.tables["causes"].to_dict("records"):
         assert [*cause["changes"]] == ["brakes"]
         speed = cause["encounter"]["speed"] * KMH
