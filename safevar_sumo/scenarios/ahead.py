@@ -152,8 +152,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     def benign(self) -> Iterable[tuple[str, Scenario]]:
         """The target moves along beside the vehicle's path; a car is in the next lane."""
         for place in BESIDE:
-            target = f"target at {self.parameter('target_speed'):g} km/h"
-            name = f"{self.test}, {self.speed:g} km/h, {target} beside at {place:g} %"
+            name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
             yield name, replace(self, impact_location=place)
         yield from next_lane(self, HEADWAYS[::4])
 

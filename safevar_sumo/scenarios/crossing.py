@@ -281,7 +281,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next
         lane.
         """
-        row = f"{self.test}, {self.speed:g} km/h, target at {self.parameter('target_speed'):g} km/h"
+        row = f"{self.test}, {self.speed:g} km/h"
         if self.is_on_foot and self.parameter("lateral_start") is not None and not self.heading:
             middle = replace(self, impact_location=50.0, start_share=1.0)
             for short in SHORT_OF_PATH:

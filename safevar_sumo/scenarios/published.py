@@ -156,11 +156,6 @@ class PedestrianCrossing(
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
         return changes
 
-    @property
-    def _speed(self) -> Quantity:
-        """The pedestrian's speed [m/s]."""
-        return WALKING_SPEED if self.walking_speed is None else self.walking_speed
-
     def _front(self, roads: Roads) -> Quantity:
         """Position of the vehicle's front on its lane at the start [m]; None as in the traffic
         file.
@@ -173,14 +168,15 @@ class PedestrianCrossing(
         """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
         nobody.
         """
-        near = Crossing(test="CPNA", target_speed=self._speed * KMH_PER_MS, time_to_impact=7.0)
+        target_speed = WALKING_SPEED * KMH_PER_MS
+        near = Crossing(test="CPNA", target_speed=target_speed, time_to_impact=7.0)
         for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         # The walk at constant speed.
         times = np.arange(samples)[:, np.newaxis]
-        speed = self._speed
+        speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
         start = LATERAL_START if self.lateral_start is None else self.lateral_start
         lateral = speed * step * times - start
         turned = np.zeros((samples, 1), dtype=bool)

@@ -392,13 +392,6 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
         )
 
 
-def test_benign_pedestrians_walk_at_all_speeds_of_the_study() -> None:
-    study = sv.load_study("sun_joint")
-    names = " ".join(point.name for point in benign_scenes(study, assemble(study)))
-    speeds = {*re.findall("target at (.*?) km/h", names)}
-    assert speeds == {"4.32", "6.48", "8.64"}, "1.2, 1.8 and 2.4 m/s"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
