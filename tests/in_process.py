@@ -107,9 +107,9 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
     return CommandOutput(out.getvalue(), err.getvalue())
 
 
-def json_of(*arguments: str) -> Any:
+def json_of(*arguments: str, expect: int = 0) -> Any:
     """The JSON that a command prints."""
-    return json.loads(run(*arguments, "--json").stdout)
+    return json.loads(run(*arguments, "--json", expect=expect).stdout)
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:

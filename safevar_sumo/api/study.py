@@ -179,7 +179,7 @@ def study(
         warn(f"--shard {shard} selects none of the runs")
     if system.has_simulator and not dry_run:
         fewer = question_command("explain", study)
-        warn(f"{fewer} --simulations N finds the smallest changes with few simulations")
+        warn(f"{fewer} --simulations N looks for the smallest changes with N simulations alone")
 
     # Measured or searched.
     if dry_run:

@@ -240,7 +240,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path
     (joint / "wider.toml").write_text(
         STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
     )
-    answer = json_of("compare", "results", "wider.toml", "--samples", "64")
+    answer = json_of("compare", "results", "wider.toml", "--samples", "64", expect=4)
     assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
     assert answer["numbers"]["margin"] == 0.1, "as in tolerance"
     assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0

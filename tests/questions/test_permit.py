@@ -23,6 +23,7 @@ from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import EncounterRange, ranges_of, span_of
 from safevar_sumo.questions.permit.search import PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -59,7 +60,13 @@ def short(in_tmp: Path) -> Study:
 
 
 def are_unsafe(
-    study: Study, fit: int, cars: FloatArray, values: FloatArray, places: FloatArray, keep: float
+    study: Study,
+    fit: int,
+    cars: FloatArray,
+    values: FloatArray,
+    places: FloatArray,
+    keep: float,
+    phase: float = 0,
 ) -> BoolArray:
     """Second computation: which cars are unsafe at each speed, shape (cars, speeds), at any of the
     impact locations `places` in any test alone, whether or not the original is safe there.
@@ -69,9 +76,13 @@ def are_unsafe(
     assert own.matrix is not None
     for test in own.matrix.tests:
         alone = msgspec.structs.replace(own.matrix, tests=[test])
-        system = assemble(msgspec.structs.replace(own, matrix=alone))
+        single = msgspec.structs.replace(own, matrix=alone)
+        system = assemble(single)
+        if phase:
+            system = assemble(in_phases(single, system))
         grid = np.stack(np.meshgrid(values, places, indexing="ij"), axis=-1).reshape(-1, 2)
         rows = np.hstack([np.repeat(cars, len(grid), axis=0), np.tile(grid, (len(cars), 1))])
+        rows = np.pad(rows, ((0, 0), (0, int(phase > 0))), constant_values=phase)
         runs = drive_and_score(system, rows, with_originals=False)
         fails = runs.collided | (runs.f_safe < (keep if fit == 0 else 0.0))
         found |= fails.reshape(len(cars), len(values), -1).any(axis=2)
@@ -104,7 +115,8 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
             numbers = re.findall(r"(\S+) (?:km/h|%)", encounter)
             speed, place = np.array(numbers, dtype=float).reshape(2, 1)
             assert speed <= (10.0 if np.isnan(reached) else reached + 1), (name, fit)
-            fails_there = are_unsafe(study, fit, settings[[car]], speed, place, keep=0.1)
+            phase = sets.phase[name, fit] or 0
+            fails_there = are_unsafe(study, fit, settings[[car]], speed, place, 0.1, phase)
             assert fails_there.all(), (name, fit, encounter)
     rows = answer.table().set_index("car")
     for name in frame["car"]:

@@ -15,6 +15,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
+from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.records import BoolArray, FloatArray
 from tests.in_process import InlinePool, json_of
 from tests.questions.conftest import ORIGINAL, made_up_evaluator, nowhere
@@ -110,3 +111,20 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
     answer = sv.explain("sun_joint", fits=0, quick=True, pool=InlinePool())
     assert "Scope: each combination was simulated in the original encounter" in answer.verdict
+
+
+def test_the_verdict_claims_no_more_than_was_simulated() -> None:
+    """Two changes collide and, without them, three; the staircase ends with up to three changes."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        moved = settings - ORIGINAL
+        pair = (moved[:, 0] > 3) & (moved[:, 1] > 3)
+        return pair | ((moved[:, 1:] < -3).all(axis=1))
+
+    evaluator = made_up_evaluator(4, region)
+    smallest = Smallest.of(evaluator, COLLISION, 0)
+    sentences = " ".join(smallest.sentences(evaluator, COLLISION))
+    assert "pairs one collides: a and b." in sentences
+    assert "combinations of three one collides without a smaller cause: b, c and d." in sentences
+    last = smallest.steps[-1]
+    assert f"none of {last.tried} combinations of up to four changes at" in sentences

@@ -389,7 +389,7 @@ def _decide(
         if not better:
             what = f"does not differ from {a} in anything that was measured"
     shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
-    reasons = "".join(f" It {one.phrase}." for one in shown)
+    reasons = "".join(f" It {phrase}." for phrase in dict.fromkeys(one.phrase for one in shown))
     numbers = {"decision": decision.lower(), "better_in": len(better), "worse_in": len(worse)}
     return numbers, f"{decision}: {b} {what}.{reasons}"
 

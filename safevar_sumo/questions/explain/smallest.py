@@ -108,7 +108,9 @@ class Smallest(NamedTuple):
         yield from self._of_sizes(members, verbs, [size for size in sizes if size <= fewest])
         yield from self._leading(members, verbs[0], fewest)
         yield self._stairs(verbs[1])
-        yield from self._of_sizes(members, verbs, [size for size in sizes if size > fewest])
+        larger = [size for size in sizes if size > fewest]
+        verbs = f"{verbs[0]} without a smaller cause", f"{verbs[1]} without a smaller cause"
+        yield from self._of_sizes(members, verbs, larger)
         yield self._in_none(members)
         encounters = len(evaluator.critical_encounters)
         if encounters:
@@ -185,7 +187,9 @@ class Smallest(NamedTuple):
             ends = [f"{100 * steps[place].share:.0f}" for place in {0, len(steps) - 1}]
             what = _count(number)
             if not number:
-                what = f"none of {number_of(steps[0].tried, 'combination')}"
+                largest = max(steps[0].simulated, default=0)
+                tried = number_of(steps[0].tried, "combination")
+                what = f"none of {tried} of {_up_to(largest)}"
             phrases.append(f"{what} at {' to '.join(ends)} %")
         if not self.at_ends.causes:
             return ""
@@ -202,8 +206,8 @@ class Smallest(NamedTuple):
         if not (others and self.at_ends.causes and size):
             return ""
         verb = "is" if len(others) == 1 else "are"
-        up_to = "one change" if size == 1 else f"up to {_count(size)} changes"
-        return _capital(f"{join_phrases(others)} {verb} in no cause of {up_to} to an end.")
+        sentence = f"{join_phrases(others)} {verb} in no cause of {_up_to(size)} to an end."
+        return sentence[:1].upper() + sentence[1:]
 
 
 def smallest_tables(smallest: Smallest | None) -> dict[str, pd.DataFrame]:
@@ -239,7 +243,9 @@ def draw_staircase(answer: Answer) -> Figure:
     shares = [share for share, _, _ in found]
     fewest = [number for _, number, _ in found]
     axis.step(shares, fewest, "o-", where="mid", color=BLUE)
-    for share, number, causes in found:
+    for place, (share, number, causes) in enumerate(found):
+        if place and causes == found[place - 1][2]:
+            continue
         parts = causes[0].replace(", ", "\n") + ("\n..." if len(causes) > 1 else "")
         axis.annotate(
             escape_dollars(parts),
@@ -304,11 +310,7 @@ def _table(
     ]
     rows.sort(key=lambda row: (-np.nan_to_num(row[5], nan=-1), -(row[3] or 0), row[1]))
     frame = pd.DataFrame(rows, columns=[*SMALLEST_COLUMNS])
-    title = (
-        "The smallest changes to an end of the domain that are unsafe, all else as in the original"
-    )
-    counts = {"holds": "Int64", "fits": "Int64"}
-    return tabulate(title, SMALLEST_COLUMNS, frame.astype(counts))
+    return frame.astype({"holds": "Int64", "fits": "Int64"})
 
 
 def _names(members: CharacteristicSet, changes: Collection[str]) -> list[str]:
@@ -320,5 +322,5 @@ def _count(number: int) -> str:
     return words[number] if number < len(words) else f"{number:,}"
 
 
-def _capital(sentence: str) -> str:
-    return sentence[:1].upper() + sentence[1:]
+def _up_to(size: int) -> str:
+    return "one change" if size <= 1 else f"up to {_count(size)} changes"

@@ -16,6 +16,7 @@ from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
 from safevar_sumo.scenarios import searchable_in
 from safevar_sumo.study import PHASE, unit_text
 
+PHASE_COLUMN = Column("-", "steps by which that encounter begins later", ".4f")
 DRIVE, LIMITED, STOP = "drive", "up to", "stop"
 """Verdicts: as fast as was driven, as is needed, or as the new car; up to a speed; not at all."""
 CARS: Columns = {
@@ -28,7 +29,7 @@ CARS: Columns = {
     "test": Column("", "the test that limits it", is_shown=False),
     "encounter": Column("", "the encounter in which it is unsafe", is_shown=False),
     "outcome": Column("", "what happens there", is_shown=False),
-    "phase": Column("-", "steps by which that encounter begins later", ".4f", is_shown=False),
+    "phase": PHASE_COLUMN._replace(is_shown=False),
     "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
     "repair_first": "the measured characteristic that, as new again, raises the value most",
     "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
@@ -40,6 +41,7 @@ SETS: Columns = {
     "up_to": Column("", "greatest value up to which it is safe with this set", ".10g"),
     "test": "the test that limits it",
     "encounter": "the encounter in which it is unsafe",
+    "phase": PHASE_COLUMN,
     "outcome": "what happens there",
 }
 
@@ -146,6 +148,6 @@ def set_rows(
     ]
     words = failures_in_words([each.failure for _, each in reached], with_car=with_car)
     return [
-        (name, each.fit, each.up_to, found.test, found.encounter, found.outcome)
+        (name, each.fit, each.up_to, found.test, found.encounter, found.phase, found.outcome)
         for (name, each), found in zip(reached, words, strict=True)
     ]
