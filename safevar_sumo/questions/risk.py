@@ -35,6 +35,7 @@ from safevar_sumo.questions.answer import (
 )
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
@@ -100,7 +101,7 @@ confidence interval; R2 is what a regression explains.
 
 @question
 @contents(
-    *("unsafe", "samples", "failures", "probability", "interval", "confidence"),
+    *("unsafe", "samples", "failures", "probability", "interval", "confidence", "by_set"),
     lead="sensitivity",
     next="explain",
     sensitivity=COLUMNS,
@@ -145,8 +146,9 @@ def risk(
             f"study {study.name!r}: none of {samples} vehicles could be simulated"
         )
 
-    # With which probability, and which characteristics decide.
+    # With which probability, also in other parameter sets, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
+    over_sets = SharesOverSets.of(evaluator, criterion, drawn.settings)
     indices, of_whom = given_data_indices, simulated
     if evaluator.left is not None and not model.is_correlated:
         indices = regression_indices
@@ -155,11 +157,13 @@ def risk(
     table = indices(evaluator, of_whom, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
     numbers |= {"probability": failures / total, "interval": [low, high], "confidence": confidence}
+    numbers["by_set"] = over_sets.of_all(failures / total)
 
     # In words.
     verdict = (
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
+        f"{over_sets.in_words(failures / total)}"
         f"{NO_PROBABILITY if not study.variation else ''}"
     )
     left_out = int(drawn.infeasible.sum())

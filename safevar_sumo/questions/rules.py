@@ -19,6 +19,7 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, percentage, with_scope
@@ -55,6 +56,10 @@ COLUMNS: Columns = {
     **with_interval(
         "coverage", Column("-", "share of all unsafe vehicles that lie within the region", ".2f")
     ),
+    **{
+        f"density_{end}": Column("-", f"{end} density over all parameter sets", ".2f", False)
+        for end in ("least", "greatest")
+    },
 }
 
 
@@ -65,6 +70,7 @@ COLUMNS: Columns = {
     "failures",
     "share",
     "interval",
+    "by_set",
     lead="rules",
     next="explain",
     rules=COLUMNS,
@@ -112,10 +118,12 @@ def rules(
 
     # Rules are boxes in which unsafe vehicles are dense.
     boxes, remark = _boxes(training.settings, is_unsafe, characteristics)
-    rows = [
-        (conditions(box, characteristics), *shares(box, testing.settings, is_unsafe_in_test))
-        for box in boxes
-    ]
+    groups = [is_within(box, testing.settings) for box in boxes]
+    over_sets = SharesOverSets.of(evaluator, criterion, testing.settings, groups)
+    rows = []
+    for number, box in enumerate(boxes, 1):
+        own = shares(box, testing.settings, is_unsafe_in_test)
+        rows.append((conditions(box, characteristics), *own, *over_sets.ends(number, own[0])))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
     table = tabulate("Regions in which many vehicles are unsafe", COLUMNS, frame)
@@ -130,7 +138,8 @@ def rules(
     verdict = (
         f"Of {total:,} vehicles {drawn}, {criterion.number_in_words(failures)}:"
         f" {percentage(failures / total)} % (95 % confidence interval"
-        f" {percentage(low)} to {percentage(high)} %).{remark}"
+        f" {percentage(low)} to {percentage(high)} %)."
+        f"{over_sets.in_words(failures / total)}{remark}"
         f"{_rule_in_words(table, failures / total)}"
     )
     numbers = {
@@ -139,9 +148,9 @@ def rules(
         "failures": failures,
         "share": failures / total,
         "interval": [low, high],
+        "by_set": over_sets.of_all(failures / total),
     }
-    left_out = int(evaluations.infeasible.sum())
-    verdict = with_scope(study, left_out, verdict, criterion.remark)
+    verdict = with_scope(study, int(evaluations.infeasible.sum()), verdict, criterion.remark)
     return Answer(
         question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
     )
@@ -155,9 +164,13 @@ def _rule_in_words(table: pd.DataFrame, share: float) -> str:
     if not len(denser):
         return ""
     rule = denser.iloc[0]
+    over_sets = ""
+    if rule["density_least"] < rule["density_greatest"]:
+        ends = f"{100 * rule['density_least']:.0f} to {100 * rule['density_greatest']:.0f} %"
+        over_sets = f" ({ends} over the parameter sets)"
     return (
         f" {100 * rule['coverage']:.0f} % of the unsafe vehicles have {rule['rule']}. Of all"
-        f" vehicles in this region {100 * rule['density']:.0f} % are unsafe."
+        f" vehicles in this region {100 * rule['density']:.0f} % are unsafe{over_sets}."
     )
 
 

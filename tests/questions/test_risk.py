@@ -17,10 +17,14 @@ import pytest
 from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
+from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.risk import OUTPUTS, deciding_in_words
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool
 from tests.questions.conftest import (
     Plant,
     Region,
@@ -259,3 +263,31 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
     for one, other in ((400, 1000), (1000, 400)):
         low, high = numbers[one]["interval"]
         assert low < numbers[other]["share"] < high
+
+
+def test_shares_have_a_range_over_the_parameter_sets() -> None:
+    """Of risk, and of rules for the whole sample and for each region."""
+    study = load_study("wear")
+    vehicles = VariationModel(study).draw(400, np.random.default_rng(study.search.seed))
+    unsafe = np.array(
+        [
+            drive_and_score(assemble(one), vehicles, with_originals=False).collided
+            for one in studies_of_sets(study)
+        ]
+    )
+    expected = [unsafe[0].mean(), *unsafe[1:, :40].mean(axis=1)]
+    answer = risk(study, samples=400, unsafe="collision", pool=InlinePool())
+    assert answer.numbers["by_set"] == expected
+    told = re.findall(
+        r"Over 12 parameter sets .* \(set (\d+)\) to .* \(set (\d+)\)", answer.verdict
+    )
+    assert told == [(str(np.argmin(expected)), str(np.argmax(expected)))]
+
+    found = rules(study, samples=400, unsafe="collision", pool=InlinePool())
+    tested = unsafe[:, 200:220].mean(axis=1)
+    assert found.numbers["by_set"] == [unsafe[0].mean(), *tested[1:]]
+    table = found.tables["rules"]
+    assert (table["density_least"] <= table["density"]).all()
+    assert (table["density_greatest"] >= table["density"]).all()
+    few = risk(study, simulations=400, unsafe="collision", pool=InlinePool())
+    assert "the study's own parameter set of the vehicle model alone" in few.verdict

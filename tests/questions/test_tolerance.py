@@ -244,6 +244,17 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
     assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
 
 
+@pytest.mark.parametrize("region", [lambda rows: rows.sum(axis=1) > 15, two_islands])
+def test_the_car_beyond_a_limit_is_within_those_of_the_other_parts(region: Region) -> None:
+    table = answer_of(2, region, unsafe="collision").tables["limits"].set_index("characteristic")
+    assert table["together_low"].notna().all()
+    for name, car in table["fails_at"].dropna().items():
+        (other,) = {"a", "b"} - {name}
+        assert table.loc[other, "together_low"] <= car[other] <= table.loc[other, "together_high"]
+        own = table.loc[name]
+        assert not own["together_low"] <= car[name] <= own["together_high"]
+
+
 def test_a_refusal_says_which_limits_would_hold() -> None:
     answer = answer_of(
         2,

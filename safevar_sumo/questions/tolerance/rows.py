@@ -125,7 +125,7 @@ def limit_rows(
         box = None if together is None else together.box
         column = models[0].evaluator.characteristics.names.index(name)
         ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
-        failure = beyond.get(name) or beyond_alone.get(name)
+        failure = (beyond_alone if box is None else beyond).get(name)
         is_kept = None if limit is None else _is_kept(each, specified, together)
         if is_kept is False and each.safe is not None:
             broken.append(

@@ -1,0 +1,90 @@
+"""The unsafe shares of a sample over all parameter sets of the vehicle model: the study's own has
+the whole sample, each other set a tenth of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import models_of
+from safevar_sumo.questions.words import percentage
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study
+
+STAGE = "other parameter sets"
+"""Phase of progress."""
+PART = 10
+"""In each other set one of so many vehicles of a sample is simulated."""
+
+
+class SharesOverSets(NamedTuple):
+    """The unsafe shares of G groups of vehicles with each other parameter set.
+
+    Attributes
+    ----------
+    vehicles
+        Number of vehicles that were simulated with each of them.
+    others
+        The shares, shape (sets, G); NaN for a group of which no vehicle could be simulated. No row
+        where the number of simulations is bounded, or the study has one set.
+    """
+
+    study: Study
+    vehicles: int
+    others: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        evaluator: Evaluator,
+        unsafe: Unsafe,
+        settings: FloatArray,
+        groups: Sequence[BoolArray] = (),
+    ) -> Self:
+        """Simulate a tenth of M settings, shape (M, n). The first group is all of them; further
+        groups have shape (M,).
+        """
+        part = settings[: len(settings) // PART]
+        groups = [np.ones(len(part), dtype=bool), *(group[: len(part)] for group in groups)]
+        others = list[FloatArray]()
+        if evaluator.left is None and len(part):
+            models = models_of(evaluator, unsafe, None, with_unsafe_originals=True)
+            for model in models.members[1:]:
+                runs = model.evaluator.evaluate(part, STAGE)
+                counted = np.array(groups) & runs.valid
+                number = counted.sum(axis=1)
+                failing = (counted & unsafe.of(runs)).sum(axis=1)
+                others.append(np.where(number, failing / np.maximum(number, 1), np.nan))
+        return cls(evaluator.study, len(part), np.array(others).reshape(-1, len(groups)))
+
+    def of_all(self, own: float) -> list[float]:
+        """The share of all vehicles, by the number of the set; `own` is that of the study's own."""
+        return [own, *self.others[:, 0].tolist()]
+
+    def ends(self, group: int, own: float) -> tuple[float, float]:
+        """The least and the greatest share of a group."""
+        shares = [own, *self.others[:, group]]
+        return float(np.fmin.reduce(shares)), float(np.fmax.reduce(shares))
+
+    def in_words(self, own: float) -> str:
+        """The least and the greatest share of all vehicles with their sets; that the study's own
+        was the only one if there are others.
+        """
+        if not self.study.spread:
+            return ""
+        if not len(self.others):
+            return " This holds for the study's own parameter set of the vehicle model alone."
+        shares = self.of_all(own)
+        ends = [
+            f"{percentage(shares[number])} % (set {number})"
+            for number in (int(np.nanargmin(shares)), int(np.nanargmax(shares)))
+        ]
+        return (
+            f" Over {len(shares)} parameter sets of the vehicle model the share is"
+            f" {' to '.join(ends)}, by {self.vehicles:,} vehicles in each set but the study's own."
+        )
