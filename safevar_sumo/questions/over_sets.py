@@ -46,21 +46,25 @@ class SharesOverSets(NamedTuple):
         settings: FloatArray,
         groups: Sequence[BoolArray] = (),
     ) -> Self:
-        """Simulate a tenth of M settings, shape (M, n). The first group is all of them; further
-        groups have shape (M,).
+        """Simulate a tenth of M settings, shape (M, n), which are the first group, and for further
+        groups, shape (M,) each, as many of their settings.
         """
-        part = settings[: len(settings) // PART]
-        groups = [np.ones(len(part), dtype=bool), *(group[: len(part)] for group in groups)]
+        number = len(settings) // PART
+        is_first = np.arange(len(settings)) < number
+        in_groups = np.any([np.zeros_like(is_first), *groups], axis=0)
+        is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= number))
+        part = settings[is_chosen]
+        members = np.array([is_first, *groups])[:, is_chosen]
         others = list[FloatArray]()
-        if evaluator.left is None and len(part):
+        if evaluator.left is None and number:
             models = models_of(evaluator, unsafe, None, with_unsafe_originals=True)
             for model in models.members[1:]:
                 runs = model.evaluator.evaluate(part, STAGE)
-                counted = np.array(groups) & runs.valid
-                number = counted.sum(axis=1)
+                counted = members & runs.valid
+                totals = counted.sum(axis=1)
                 failing = (counted & unsafe.of(runs)).sum(axis=1)
-                others.append(np.where(number, failing / np.maximum(number, 1), np.nan))
-        return cls(evaluator.study, len(part), np.array(others).reshape(-1, len(groups)))
+                others.append(np.where(totals, failing / np.maximum(totals, 1), np.nan))
+        return cls(evaluator.study, number, np.array(others).reshape(-1, len(members)))
 
     def of_all(self, own: float) -> list[float]:
         """The share of all vehicles, by the number of the set; `own` is that of the study's own."""
