@@ -90,5 +90,6 @@ class SharesOverSets(NamedTuple):
         ]
         return (
             f" Over {len(shares)} parameter sets of the vehicle model the share is"
-            f" {' to '.join(ends)}, by {self.vehicles:,} vehicles in each set but the study's own."
+            f" {' to '.join(ends)}, with {self.vehicles:,} vehicles in each set but the study's"
+            " own."
         )

@@ -114,7 +114,7 @@ def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> 
 
 
 def test_the_verdict_claims_no_more_than_was_simulated() -> None:
-    """Two changes collide and, without them, three; the staircase ends with up to three changes."""
+    """Two changes collide and, without them, three others."""
 
     def region(settings: FloatArray) -> BoolArray:
         moved = settings - ORIGINAL
