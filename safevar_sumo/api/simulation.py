@@ -20,7 +20,7 @@ from safevar_sumo.metrics import (
     impact_in_words,
     time_to_collision,
 )
-from safevar_sumo.questions.phases import with_phase_if_set
+from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
     STANDSTILL,
@@ -310,7 +310,7 @@ def simulate(
     """
     loaded_study, system = load_and_assemble(study)
     with about("changes"):
-        loaded_study, system = with_phase_if_set(
+        loaded_study, system = with_encounters(
             loaded_study, system, () if changes is None else [*changes]
         )
     return simulate_with_original(
@@ -375,6 +375,7 @@ def simulate_with_original(
         Engine.LIBSUMO,
         listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
     )
+    observations = observations[-len(runs.trace.time) :]  # those of runs that went on, alone
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 
     # With the values that the filter resets.

@@ -6,21 +6,24 @@ has the vehicle's characteristics, then a place on each axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 from msgspec.structs import replace as replace_in
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import Scenario, searchable_in
-from safevar_sumo.study import Domain, MatrixTest, Study
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.scenarios import Scenario, searchable_in, weather_of
+from safevar_sumo.study import PHASE, Domain, MatrixTest, Study
+from safevar_sumo.sumo.system import System, assemble
 
 DECIMALS = 2
 """Decimals of a place on an axis, as it is printed."""
@@ -144,14 +147,24 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
 
 def domains_of_axes(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
     """The axes of a test that move, each from its least to its greatest value."""
+    axes = axes_of(test, scenario)
+    return {name: axes[name] for name in moving_axes(study, test, scenario)}
+
+
+def axes_of(test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
+    """The axes of a test that its scenario can move, each from its least to its greatest value; one
+    with a single value as far as is legal.
+    """
+    searchable = searchable_in(scenario)
     return {
         name: Domain(
-            unit=searchable_in(scenario)[name].unit,
-            original=float(test.over[name][0]),
-            lower=float(min(test.over[name])),
-            upper=float(max(test.over[name])),
+            unit=searchable[name].unit,
+            original=float(values[0]),
+            lower=float(min(values) if len(values) > 1 else searchable[name].lower),
+            upper=float(max(values) if len(values) > 1 else searchable[name].upper),
         )
-        for name in moving_axes(study, test, scenario)
+        for name, values in test.over.items()
+        if name in searchable and all(type(value) in (int, float) for value in values)
     }
 
 
@@ -177,3 +190,82 @@ def _points_of(test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]
         over = dict(zip(test.over, place, strict=True))
         alone = replace_in(test, over={name: [value] for name, value in over.items()})
         yield (test.name, *over.items()), alone
+
+
+def with_encounters(study: Study, system: System, names: Iterable[str]) -> tuple[Study, System]:
+    """A study and its system; if axes of its matrix, or the phase, are among the names of what a
+    user sets, they are searched parameters, in the tests that have all of these axes.
+
+    Raises
+    ------
+    InputError
+        If the phase is set, and the study's encounters have none.
+    """
+    found = _with_axes(study, system, {*names} - {*system.characteristics.names})
+    if PHASE in names and PHASE not in system.characteristics.names:
+        phased = in_phases(found, assemble(found))
+        if phased == found:
+            problem = f"study {study.name!r} has no {PHASE}"
+            expected = "a study whose actors move on tracks, and react to nobody"
+            raise InputError("", problem, expected)
+        found = phased
+    if found == study:
+        return study, system
+
+    # Whether an encounter counts does not become a question by this.
+    scoring = system.measuring.scoring
+    searched = assemble(found)
+    return found, replace(searched, measuring=searched.measuring._replace(scoring=scoring))
+
+
+def _with_axes(study: Study, system: System, names: set[str]) -> Study:
+    """A study that searches those of the names that are axes of its matrix which a scenario can
+    move, in the tests that have all of them, at its point if it is at one.
+    """
+    matrix = study.matrix
+    if matrix is None or matrix.protocol or study.scenario.search:
+        return study
+    here = {test.name: own for test, own in points_of_tests(study, system.points)}
+    moving = [
+        (test, axes_of(test, here[test.name][0].scenario))
+        for test in matrix.tests
+        if test.name in here
+    ]
+    axes = names & {name for _, domains in moving for name in domains}
+    if not axes:
+        return study
+
+    # At a point, the rest of its test stays as it is there.
+    kept = [(test, domains) for test, domains in moving if axes <= {*domains}]
+    tests = [
+        replace_in(test, over={name: test.over[name] for name in test.over if name not in axes})
+        for test, _ in kept
+    ]
+    if matrix.point:
+        of_point = dict(system.points[0].parameters)
+        tests = [
+            replace_in(
+                test,
+                over={name: [of_point[name]] for name in test.over},
+                weathers=[
+                    weather
+                    for weather in test.weathers
+                    if weather_of(weather).name == of_point["weather"]
+                ],
+            )
+            for test in tests
+        ]
+    domains = {
+        name: replace_in(
+            kept[0][1][name],
+            lower=min(own[name].lower for _, own in kept),
+            upper=max(own[name].upper for _, own in kept),
+        )
+        for name in kept[0][1]
+        if name in axes
+    }
+    return replace_in(
+        study,
+        matrix=replace_in(matrix, tests=tests, point=""),
+        scenario=replace_in(study.scenario, search=domains),
+    )

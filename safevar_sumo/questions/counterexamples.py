@@ -37,14 +37,15 @@ STAGE = "what fails first"
 
 class Failure(NamedTuple):
     """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with
-    the encounter, the parameters of the point of the matrix where it does, and its breach of the
-    criterion alone.
+    the encounter, the parameters of the point of the matrix where it does, its breach of the
+    criterion alone, and the command that simulates it.
     """
 
     setting: FloatArray
     words: str
     point: JsonObject
     breach: str
+    command: str
 
 
 def describe(
@@ -166,8 +167,33 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         if model.unsafe.is_of_impacts and runs.collided[row]:
             how = f"the car {breach}"
         where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
-        failures[row] = Failure(settings[row], f"{how}{where}{fit}", dict(point.parameters), breach)
+        failures[row] = Failure(
+            settings[row],
+            f"{how}{where}{fit}",
+            dict(point.parameters),
+            breach,
+            _command(model, settings[row], point, values),
+        )
     return failures
+
+
+def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]) -> str:
+    """The command that simulates a setting, shape (n,), in the encounter with these values of
+    searched parameters, where the place of a matrix can be set.
+    """
+    system = model.evaluator.system
+    members = model.evaluator.characteristics
+    axes = {
+        name: value
+        for name, value in point.parameters
+        if name in searchable_in(point.scenario) and isinstance(value, int | float)
+    }
+    if PHASE in values and PHASE not in members.names:
+        axes[PHASE] = values[PHASE]
+    words = [system.command, members.options(setting)]
+    words += [f"--set {name}={value!r}" for name, value in axes.items()]
+    words += [f"--fit {model.fit}"] * (model.fit > 0)
+    return " ".join(word for word in words if word)
 
 
 def where_in_words(

@@ -4,20 +4,17 @@ the limit depends on when between two decisions the encounter begins. Claims mee
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import PHASES
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, Domain, Study
 from safevar_sumo.sumo.batch import reason_for_sumo
 from safevar_sumo.sumo.encounters import encounter
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.falsify import Judge
@@ -49,28 +46,6 @@ def in_phases(study: Study, system: System) -> Study:
         return study
     search = {**study.scenario.search, PHASE: DOMAIN}
     return replace_in(study, scenario=replace_in(study.scenario, search=search))
-
-
-def with_phase_if_set(study: Study, system: System, names: Iterable[str]) -> tuple[Study, System]:
-    """A study and its system; if the phase is among the names of what is set, both with it as their
-    last parameter.
-
-    Raises
-    ------
-    InputError
-        If the phase is set, and the study's encounters have none.
-    """
-    if PHASE not in names or PHASE in system.characteristics.names:
-        return study, system
-    phased = in_phases(study, system)
-    if phased == study:
-        problem = f"study {study.name!r} has no {PHASE}"
-        expected = "a study whose actors move on tracks, and react to nobody"
-        raise InputError("", problem, expected)
-    # Whether an encounter counts does not become a question by this.
-    scoring = system.measuring.scoring
-    found = assemble(phased)
-    return phased, replace(found, measuring=found.measuring._replace(scoring=scoring))
 
 
 def meet_worst_phases(

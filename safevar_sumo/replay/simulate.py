@@ -19,13 +19,24 @@ from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import PointName
+from safevar_sumo.questions.ask import PointName, Range
+from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
-from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
-from safevar_sumo.questions.phases import with_phase_if_set
+from safevar_sumo.questions.model_spread import (
+    compute_model_spreads,
+    remarks_on_sets,
+    studies_of_sets,
+)
 from safevar_sumo.questions.subject import study_in, study_or_case
-from safevar_sumo.questions.words import change_texts, ending_in_words, number_of, points_in_words
+from safevar_sumo.questions.words import (
+    EXACT,
+    change_texts,
+    ending_in_words,
+    join_phrases,
+    number_of,
+    points_in_words,
+)
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
@@ -141,6 +152,7 @@ def show_simulation(
     gui: bool = False,
     spread: bool = False,
     point: PointName = None,
+    fit: Annotated[int, Range(0, 1000)] = 0,
     as_it_is_now: bool = False,
 ) -> Answer:
     """Simulate a study once, or a solution of results with the study as recorded there, beside the
@@ -153,8 +165,8 @@ def show_simulation(
         with the smallest changes, or the most severe one: smallest, most-severe; fewest: that with
         the fewest changes, of which as many are undone as it stays unsafe without.
     set
-        A characteristic's value in its unit, +10% of the original, or a sweep FROM..TO; repeat it
-        for others.
+        The value of a characteristic, of an axis of the matrix or of the phase, in its unit, +10%
+        of the original, or a sweep FROM..TO; repeat it for others.
     beyond
         Also accept values beyond the domains, and settings that violate a constraint.
     trace
@@ -168,17 +180,20 @@ def show_simulation(
         Add the vehicle model's own uncertainty: other parameters that fit published data as well.
     point
         Only this point of the study's matrix.
+    fit
+        With this parameter set of the vehicle model, by its number in [spread]; 0 is the study's.
     as_it_is_now
         If results were computed with other files or versions, simulate with the present ones and
         say so.
     """
     # What is simulated: a study or a solution, with changes.
     target = load_target(source, solution, as_it_is_now, point)
+    target = target._replace(study=_with_set(target.study, fit))
     system = assemble(target.study)
     changes = set
     with about("set"):
         names = [change.partition("=")[0].strip() for change in changes]
-        study, system = with_phase_if_set(target.study, system, names)
+        study, system = with_encounters(target.study, system, names)
         target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:
@@ -220,6 +235,20 @@ def show_simulation(
         show_in_gui(comparison)
     answer = _answer(target, system, simulation, with_spread=spread)
     return replace(answer, draw=lambda _: draw_comparison(comparison))
+
+
+def _meets(system: System, setting: FloatArray) -> list[str]:
+    """Sentences on an encounter that is not the study's, and on its phase."""
+    met = system.characteristics.named(setting)
+    places = [
+        f"{item.name.replace('_', ' ')} {met[item.name]:{EXACT}}{item.suffix}"
+        for item in system.characteristics.scenario
+        if item.name != PHASE and met[item.name] != item.original
+    ]
+    sentences = [f"The encounter has {join_phrases(places)}."] if places else []
+    if phase := met.get(PHASE):
+        sentences.append(f"The encounter begins {phase:g} steps of the driving system later.")
+    return sentences
 
 
 def _fails(study: Study, result: PointResult) -> bool:
@@ -295,8 +324,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
     members = system.characteristics.vehicle
     if texts := change_texts(members, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
-    if phase := system.characteristics.named(setting).get(PHASE):
-        verdict.append(f"The encounter begins {phase:g} steps of the driving system later.")
+    verdict += _meets(system, setting)
     solution = {} if target.handle is None else {"solution": str(target.handle)}
     return Answer(
         question="simulate",
@@ -367,6 +395,17 @@ def load_target(source: str, solution: str | None, as_it_is_now: bool, point: st
     if choice == "fewest" and (found := fewest_changes(subject)):
         values = subject.characteristics.named(found.settings[0])
     return Target(study, source, handle, values)
+
+
+def _with_set(study: Study, fit: int) -> Study:
+    """The study with a parameter set of its vehicle, by its number."""
+    if not fit:
+        return study
+    with about("fit"):
+        sets = studies_of_sets(study)
+        if fit >= len(sets):
+            raise InputError("", f"{fit}", f"a number up to {len(sets) - 1}")
+    return sets[fit]
 
 
 def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:

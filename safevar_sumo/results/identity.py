@@ -17,7 +17,7 @@ from safevar_sumo.study.schema import Tables
 
 FORMAT = 6
 """Version number of the format of a manifest."""
-RESULTS = 12
+RESULTS = 13
 """Version number of the package's results, raised whenever they change (enforced by tests/golden).
 """
 PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")

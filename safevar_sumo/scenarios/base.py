@@ -177,6 +177,8 @@ class Scenario:
     depends_until, dependence
         Time until which the others move as if the vehicle kept its speed [s], and a sentence on it:
         a run in which the ADS acts before is an invalid test.
+    goes_on
+        Whether a run goes on beyond `duration` while the vehicle still closes on somebody.
     uneventful
         Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the
         ADS; "" if something does, None if only a drive can tell.
@@ -200,6 +202,7 @@ class Scenario:
     centre_to_centre: bool = False
     brakes_fully: bool = False
     border: ClassVar[str] = ""
+    goes_on: ClassVar[bool] = False
     # A scenario may have fields or properties of these names: type checkers see properties.
     # `duration` and `start_speed` have no default.
     if TYPE_CHECKING:
@@ -335,7 +338,7 @@ SPEED_DIMENSION = "speed"
 class Point(NamedTuple):
     """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
     the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
-    All of it begins `phase` steps later, a number or of shape (N,).
+    All of it begins `phase` steps later, a number or of shape (N,), and ends `overtime` [s] later.
     """
 
     scenario: Scenario
@@ -344,6 +347,7 @@ class Point(NamedTuple):
     parameters: tuple[tuple[str, Any], ...] = ()
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
+    overtime: float = 0.0
 
 
 class PreCrash(StrEnum):

@@ -43,6 +43,7 @@ class OpenScenario(TrackScenario):
         Values of the file's parameters by name, numbers or texts, or arrays of N numbers.
     """
 
+    goes_on = False  # the file says when it ends
     has_phase = False  # its storyboard and its Ego's profile run on the clock of the simulation
 
     def __init__(self, file: str, ego: str = "Ego", **values: Quantity | str) -> None:

@@ -209,6 +209,7 @@ class TrackScenario(Scenario):
 
     RETURNS: ClassVar[Mapping[str, Returned]] = {"tracks": Returned(then=check_tracks)}
     reactive_actors = False
+    goes_on = True
     network = "along"
     sensor_setback = 0.0
     if TYPE_CHECKING:

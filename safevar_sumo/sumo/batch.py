@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
@@ -19,6 +20,7 @@ from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
 from safevar_sumo.sumo.network import copied_network, networks_for
+from safevar_sumo.sumo.overtime import finished
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
@@ -90,7 +92,8 @@ def drive_all(
 
     The result holds the runs at the first point, then the runs at the second point, and so on.
     Several points must have scenarios of tracks; SUMO simulates only one point at once. `listen` is
-    called with what the ADS observes at every sample.
+    called with what the ADS observes at every sample, and once more from the first sample on if the
+    runs go on beyond their time.
 
     Raises
     ------
@@ -107,26 +110,24 @@ def drive_all(
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
         traffic = traffic_of(system, encounters)
-
-        # In SUMO, among the other actors that it moves.
-        if not is_recorded(system, engine):
+        if not is_recorded(system, engine):  # in SUMO, among the other actors that it moves
             with open_points_world(system, encounters, traffic) as sumo_world:
-                return drive(
-                    on_road,
-                    vehicles,
-                    sumo_world,
-                    observer_of(scenario, sumo_world, traffic),
-                    listen,
-                )
-
-        # On a lane, among bodies on tracks, at all points at once.
-        if traffic is not None:
+                observer = observer_of(scenario, sumo_world, traffic)
+                runs = drive(on_road, vehicles, sumo_world, observer, listen)
+        elif traffic is not None:  # on a lane, among bodies on tracks, at all points at once
             lane = LaneWorld(traffic, _start_speeds(on_road.points, len(settings)), traffic.step)
-            return drive(on_road, np.tile(vehicles, (len(system.points), 1)), lane, traffic, listen)
+            vehicles = np.tile(vehicles, (len(system.points), 1))
+            runs = drive(on_road, vehicles, lane, traffic, listen)
+        else:  # in a scene that SUMO has played once
+            world = _recorded_world(system, encounters, scenario)
+            runs = drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
 
-        # In a scene that SUMO has played once.
-        world = _recorded_world(system, encounters, scenario)
-        return drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
+    # Who still closes on somebody drives again with more time; varied systems drive together.
+    if not all(point.scenario.goes_on and not point.overtime for point in system.points):
+        return runs
+    again = partial(drive_all, engine=engine, listen=listen)
+    together = listen is not None or isinstance(system.ads, VariedAds)
+    return finished(system, settings, runs, again, together=together)
 
 
 def _recorded_world(

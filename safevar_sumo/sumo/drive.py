@@ -121,7 +121,7 @@ def drive(
 
 def last_sample_of(point: Point, step: float) -> Quantity:
     """The number of the last sample of runs at a point, which begin later by its phase."""
-    return point.scenario.duration / step + point.phase
+    return (point.scenario.duration + point.overtime) / step + point.phase
 
 
 def _runs(

@@ -79,7 +79,7 @@ class System:
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - `allowed_impact_speed` [m/s] and `phase` are those of the only point; see `Point`.
+    - `allowed_impact_speed` [m/s], `phase` and `overtime` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `command` simulates the original vehicle of the study.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
@@ -103,6 +103,7 @@ class System:
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
+    overtime: float = 0.0
     repeats: int = 1
     command: str = ""
 
@@ -113,8 +114,13 @@ class System:
         """
         if self.matrix:
             return self.matrix
-        allowed = self.allowed_impact_speed
-        only = Point(self.scenario, self.weather, allowed_impact_speed=allowed, phase=self.phase)
+        only = Point(
+            self.scenario,
+            self.weather,
+            allowed_impact_speed=self.allowed_impact_speed,
+            phase=self.phase,
+            overtime=self.overtime,
+        )
         return (only,)
 
     @property
@@ -192,6 +198,7 @@ class System:
             weather=point.weather,
             allowed_impact_speed=point.allowed_impact_speed,
             phase=point.phase,
+            overtime=point.overtime,
             matrix=(),
             rater=None,
         )

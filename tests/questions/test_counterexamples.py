@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic, region_of
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, json_of, refused
 from tests.questions.conftest import made_up_model, made_up_study, nowhere
 
 
@@ -104,3 +105,29 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
         "The original vehicle itself keeps 0.88 m of clearance, less than 30"
     )
     assert answer.numbers["kept"] is False
+
+
+def typed(command: str) -> dict[str, Any]:
+    """The numbers of the simulation that a printed command asks for."""
+    simulated: dict[str, Any] = json_of(*shlex.split(command)[3:])["numbers"]
+    return simulated
+
+
+@pytest.mark.slow
+def test_a_failure_between_tests_of_any_set_is_simulated_by_its_command() -> None:
+    car = ["--set", "treadDepth=2", "--set", "brakeTorque=0.5", "--set", "payload=500"]
+    asked = json_of("permit", "wear", *car, "--others", "new")
+    failing = [row for row in asked["tables"]["sets"]["rows"] if row["simulate"]]
+    assert len({row["fit"] for row in failing}) > 5
+    for row in failing:
+        assert typed(row["simulate"])["f_safe"] < 0.3, row["simulate"]
+
+
+def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
+    point = ("--point", "CPFA, speed 40, wet")
+    at_test = json_of("simulate", "wear", "--set", "speed=40", *point)
+    assert at_test["numbers"] == json_of("simulate", "wear", *point)["numbers"]
+    both = json_of("simulate", "wear", "--set", "speed=33", "--set", "impact_location=40")
+    assert [row["point"] for row in both["tables"]["points"]["rows"]] == ["CPNA, wet"]
+    refused("simulate", "wear", "--set", "speed=70", message=("speed = 70.0", "[10, 60] km/h"))
+    refused("simulate", "wear", "--fit", "12", message=("--fit: 12", "a number up to 11"))

@@ -140,7 +140,7 @@ class PermitAnswer:
                 (
                     *(name, permit.up_to, new_car, self.span.unit, verdict, reason),
                     *(found.test, found.encounter, found.outcome, found.phase, fit, *after),
-                    assumed,
+                    *(found.command, assumed),
                 )
             )
         return rows

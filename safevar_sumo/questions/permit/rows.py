@@ -33,6 +33,7 @@ CARS: Columns = {
     "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
     "repair_first": "the measured characteristic that, as new again, raises the value most",
     "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
+    "simulate": Column("", "the command that simulates its failure", is_detail=True),
     "assumed": Column("", "what was not measured, with its assumed value", is_detail=True),
 }
 SETS: Columns = {
@@ -43,12 +44,13 @@ SETS: Columns = {
     "encounter": "the encounter in which it is unsafe",
     "phase": PHASE_COLUMN,
     "outcome": "what happens there",
+    "simulate": "the command that simulates it",
 }
 
 
 class FailureInWords(NamedTuple):
-    """A failure: its test, its encounter with its phase, what happens, and a sentence without its
-    end.
+    """A failure: its test, its encounter with its phase, what happens, a sentence without its end,
+    and the command that simulates it.
     """
 
     test: str | None = None
@@ -56,6 +58,7 @@ class FailureInWords(NamedTuple):
     phase: float | None = None
     outcome: str | None = None
     sentence: str = ""
+    command: str | None = None
 
 
 def failures_in_words(
@@ -101,6 +104,7 @@ def failures_in_words(
                 phase=phase,
                 outcome=described[row].breach,
                 sentence=words,
+                command=described[row].command,
             )
     return found
 
@@ -148,6 +152,9 @@ def set_rows(
     ]
     words = failures_in_words([each.failure for _, each in reached], with_car=with_car)
     return [
-        (name, each.fit, each.up_to, found.test, found.encounter, found.phase, found.outcome)
+        (
+            *(name, each.fit, each.up_to, found.test, found.encounter, found.phase),
+            *(found.outcome, found.command),
+        )
         for (name, each), found in zip(reached, words, strict=True)
     ]

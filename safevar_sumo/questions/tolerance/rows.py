@@ -53,6 +53,7 @@ LIMITS: Columns = {
     ),
     "fails_first": Column("", "what fails first beyond the limit", head="just beyond it"),
     "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
+    "simulate": Column("", "the command that simulates it", is_detail=True),
     "sentence": Column(
         "",
         "sentence for a maintenance manual; all these limits hold at the same time",
@@ -143,6 +144,7 @@ def limit_rows(
                     if failure is None
                     else dict(zip(members.names, failure.setting.tolist(), strict=True))
                 ),
+                None if failure is None else failure.command,
                 (
                     None
                     if together is None

@@ -1,0 +1,70 @@
+"""Runs go on beyond their time while the vehicle still closes on somebody."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.records import Outcome, differences
+from safevar_sumo.scenarios.ahead import CarToCar
+from safevar_sumo.sumo.batch import drive_all
+from safevar_sumo.sumo.engine import Engine
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import System, assemble
+from tests.made_up import drawn, original_of
+
+CREEPS = "braking lead vehicle, 50 km/h, headway 0.864, target_deceleration 4.905, clear"
+"""A test at whose end many vehicles still roll towards the leader, who stands."""
+
+
+@pytest.fixture(scope="module")
+def creeping() -> System:
+    system = assemble(load_study("fmvss127"))
+    return system.at(next(point for point in system.points if point.name == CREEPS))
+
+
+def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> None:
+    scenario = creeping.scenario
+    assert isinstance(scenario, CarToCar)
+    patient = replace(creeping, scenario=msgspec.structs.replace(scenario, time_after=35.0))
+    population = drawn(creeping, 60, 3)
+    found = drive_and_score(creeping, population)
+    assert set(found.outcome) <= {Outcome.STOPPED, Outcome.COLLISION}
+    assert not [*differences(found.results, drive_and_score(patient, population).results)]
+
+
+def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
+    population = drawn(creeping, 60, 3)
+    ends = drive_all(creeping, population).trace.last_active * 0.05
+    went_on = ends > float(np.max(creeping.scenario.duration))
+    assert 0 < went_on.sum() < len(population)
+    alone = drive_and_score(creeping, population[~went_on]).results
+    together = drive_and_score(creeping, population).take(~went_on).results
+    assert not [*differences(alone, together)]
+
+
+@pytest.mark.parametrize("engine", [Engine.RECORDED, Engine.LIBSUMO])
+def test_the_new_car_stops_behind_the_leader(creeping: System, engine: Engine) -> None:
+    heard = []
+    runs = drive_all(creeping, original_of(creeping), engine, listen=heard.append)
+    assert runs.outcome[0] == Outcome.STOPPED
+    assert runs.trace.speed[-1, 0] == 0
+    assert runs.trace.gap[-1, 0] == pytest.approx(0.7035, abs=1e-4)
+    assert len(heard) > len(runs.trace.time)  # those of the first time, and all once more
+
+
+def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
+    system = assemble(load_study("alks_joint"))
+    patient = replace(system, scenario=msgspec.structs.replace(system.scenario, duration=60.0))
+    population = drawn(system, 300, 1)
+    found = drive_and_score(system, population, with_originals=False)
+    assert not [
+        *differences(
+            found.take(found.collided).results,
+            drive_and_score(patient, population, with_originals=False).take(found.collided).results,
+        )
+    ]
