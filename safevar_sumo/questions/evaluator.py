@@ -117,12 +117,13 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, settings: Mapping[str, float]) -> None:
+    def plan(self, settings: Mapping[str, float], least: int = 1) -> None:
         """Plan the phases of a question, each with the number of settings that it is expected to
-        simulate.
+        simulate; below the `least` number there is no answer.
         """
         expected = sum(settings.values())
         if self.account.is_question:
+            self.account.require((least + MEASURED * self.system.has_simulator) * self._each)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
             self.account.open(expected * self._each, seconds)
             if seconds is not None:

@@ -22,6 +22,8 @@ LONGEST = 900.0
 """Time up to which a question does by default all that it is made for [s]."""
 MEASURED = 2
 """Settings that are simulated to know how long one takes."""
+LEAST_SETTINGS = 3
+"""Fewest settings with which a question that samples answers."""
 DIGITS = 2
 """Digits of a number of simulations that is derived from a time."""
 
@@ -65,6 +67,12 @@ class Account:
         if bound is not None and self.spent > bound:
             problem = f"{bound:,} do not suffice: {self.spent:,} are needed to go on"
             raise InputError("simulations", problem, "a larger number")
+
+    def require(self, least: int) -> None:
+        """Refuse fewer simulations than the least number for an answer."""
+        if self.asked is not None and self.asked < least:
+            problem = f"{self.asked:,} do not suffice: an answer takes at least {least:,}"
+            raise InputError("simulations", problem, f"{least} or more")
 
     def open(self, expected: float, seconds: float | None) -> None:
         """Allow what the user allows, or all if that does not take too long; `expected` simulations

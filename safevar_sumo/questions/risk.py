@@ -36,6 +36,7 @@ from safevar_sumo.questions.answer import (
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
+from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
@@ -131,7 +132,8 @@ def risk(
     model = VariationModel(study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
-    evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
+    planned = {SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block}
+    evaluator.plan(planned, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     vehicles = model.draw(samples, np.random.default_rng(study.search.seed))

@@ -20,6 +20,7 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tab
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
+from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, percentage, with_scope
@@ -97,7 +98,7 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.plan({SAMPLED_STAGE: samples})
+    evaluator.plan({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)

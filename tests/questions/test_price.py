@@ -59,9 +59,27 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
 
 
 def test_no_joint_limits_are_stated_that_nothing_was_tried_in(rig: str) -> None:
-    answer = sv.tolerance(rig, simulations=20, pool=InlinePool())
+    answer = sv.tolerance(rig, simulations=35, pool=InlinePool())
     assert "did not suffice" in answer.verdict
     assert answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+
+
+@pytest.mark.parametrize(
+    ("question", "least"), [("risk", 5), ("rules", 5), ("explain", 5), ("tolerance", 35)]
+)
+def test_the_least_number_is_told_before_anything_is_simulated(
+    rig: str, question: str, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert getattr(sv, question)(rig, simulations=least, pool=InlinePool()).verdict
+    monkeypatch.setattr(price, "carry_out", lambda *_: pytest.fail("it was simulated"))
+    with pytest.raises(InputError, match=f"an answer takes at least {least}"):
+        getattr(sv, question)(rig, simulations=least - 1, pool=InlinePool())
+
+
+def test_a_rough_comparison_keeps_to_its_number_in_a_matrix() -> None:
+    answer = sv.compare("wear", "wear", simulations=1000, jobs=1)
+    assert answer.numbers["simulations"] <= 1000
+    assert answer.verdict.startswith("Rough answer (--simulations 1000): RELEASE")
 
 
 CURVE = """

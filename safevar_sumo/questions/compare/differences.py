@@ -24,7 +24,7 @@ from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, n
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
-from safevar_sumo.questions.tolerance.scans import scan
+from safevar_sumo.questions.tolerance.scans import SCAN_VALUES, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import Limit
@@ -128,10 +128,12 @@ def limits_of_both(
     # Limits of each characteristic alone, in both.
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     alone = list[Sequence[AloneLimit]]()
+    is_rough = evaluators[0].left is not None
+    number = evaluators[0].at_most(SCAN_VALUES, 12 * len(columns))
     for side, unsafe in zip(evaluators, criteria, strict=True):
         own = Model(0, side, unsafe)
-        search = AloneSearch(scan(side, columns, unsafe), columns, own)
-        if tests := [] if at_tests else moving_tests(own, unsafe):
+        search = AloneSearch(scan(side, columns, unsafe, number=number), columns, own)
+        if tests := [] if at_tests or is_rough else moving_tests(own, unsafe):
             search.add(own, tests)
         alone.append(search.limits())
     domains = [side.study.domains for side in evaluators]

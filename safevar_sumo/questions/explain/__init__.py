@@ -60,6 +60,7 @@ from safevar_sumo.questions.preventability import (
     assess_sample,
     has_reference_drivers,
 )
+from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
@@ -206,7 +207,7 @@ def _plan(subject: Study | Case, evaluator: Evaluator, quick: bool) -> int:
     else:
         limit = QUICK_LIMIT if quick else LIMIT
         planned = {TO_EXPLAIN: len(subject.solutions)}
-    evaluator.plan({**planned, SUBSETS: limit / points, **LATER})
+    evaluator.plan({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit
 
 

@@ -11,11 +11,12 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
-from safevar_sumo.questions.tolerance.frugal import answer_roughly
+from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
     INTERVALS,
@@ -107,7 +108,8 @@ def tolerance(
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
     phases = phases_of(evaluator, len(columns), budget, 0 if quick else fits)
-    evaluator.plan({name: (1 + len(smaller)) * cost for name, cost in phases.items()})
+    planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
+    evaluator.plan(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.

@@ -177,7 +177,7 @@ def answer_roughly(asked: Asked) -> Answer:
             ends = NOWHERE if together is None else tuple(float(one[column]) for one in together)
             limit = NOWHERE if has_encounters else tuple(float(one[column]) for one in alone)
             known = (item.name, item.unit, item.original, *limit, *ends)
-            rows.append((*known, *NOWHERE, None, None, None, None))
+            rows.append((*known, *[None] * (len(LIMITS) - len(known))))
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
     limits.attrs["bars"] = bars_of(limits, domains)

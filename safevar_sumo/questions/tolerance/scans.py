@@ -101,6 +101,8 @@ def scan(
     usual, rounds = (
         (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
     )
+    if evaluator.left is not None:  # a rough answer
+        rounds = 0
     number = evaluator.at_most(number or usual, 6 * len(scanned))
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [
