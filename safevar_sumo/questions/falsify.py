@@ -17,7 +17,7 @@ LEAST_SIMULATIONS = 1000
 """Fewest simulations that search for a counterexample before a value is printed as one that holds.
 """
 USUAL_BUDGET = 5000
-"""Simulations that search for a counterexample to a claim, unless an option says otherwise."""
+"""Simulations that search for a counterexample to a claim."""
 GENERATION, PARENTS = 512, 32
 """Settings of a generation; the worst ones so far, which are its parents."""
 STEP, PULL = 0.1, 0.5
@@ -63,11 +63,9 @@ class Falsification(NamedTuple):
         }
 
 
-def enough(budget: int) -> int:
-    """The number of simulations with which a value that is printed is tested; 0 leaves the
-    falsification out.
-    """
-    return max(budget, LEAST_SIMULATIONS) if budget else 0
+def budget_of(*, quick: bool) -> int:
+    """Simulations that search for a counterexample to a claim, few for a rough answer."""
+    return LEAST_SIMULATIONS if quick else USUAL_BUDGET
 
 
 def falsify(

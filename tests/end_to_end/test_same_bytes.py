@@ -21,7 +21,7 @@ from tests.in_process import run
 
 QUESTIONS = {
     "explain": "small.toml --quick --top 1",
-    "tolerance": "small.toml --characteristics mass,tireFric --fits 0 --attack 500",
+    "tolerance": "small.toml --characteristics mass,tireFric --quick",
     "risk": "small.toml --samples 300",
     "rules": "small.toml --samples 300",
     "compare": "small.toml smoke --samples 100",

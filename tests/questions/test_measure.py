@@ -85,7 +85,7 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
         ("rules", "tiny.toml", "--samples", "256"),
         ("explain", "results", "--fits", "0", "--top", "1"),
         ("compare", "tiny.toml", "tiny.toml", "--samples", "64"),
-        ("tolerance", "tiny.toml", "--fits", "0", "--attack", "200", *few),
+        ("tolerance", "tiny.toml", "--quick", *few),
         ("repair", "tiny.toml", "--fits", "0", "--promise", "tireFric >= 3"),
     ):
         answer = json_of(*typed, "--unsafe", "hardest > 6.8")

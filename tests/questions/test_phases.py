@@ -200,7 +200,7 @@ def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
     ("question", "options"),
     [
         (sv.permit, {"set": ("brakeTorque=1",), "others": "new", "step": 30}),
-        (sv.tolerance, {"characteristics": ("brakeTorque",), "attack": 1000, "at_tests": True}),
+        (sv.tolerance, {"characteristics": ("brakeTorque",), "at_tests": True}),
         pytest.param(sv.repair, {"promise": ("brakeTorque >= 0.9",)}, marks=pytest.mark.slow),
     ],
 )

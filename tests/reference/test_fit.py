@@ -220,6 +220,7 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_simulations")
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     gap = "ads.parameters.brake_gap"
@@ -234,7 +235,7 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.M
     of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
     assert len({*of_each}) > 1, "the fits differ"
     asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
-    answer = tolerance(study, **asked, attack=200)
+    answer = tolerance(study, **asked)
     (row,) = answer.to_dict()["tables"]["limits"]["rows"]
     assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, (
         "the strictest fit decides, rounded to the safe side"

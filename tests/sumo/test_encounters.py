@@ -276,13 +276,13 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("coarse")
+@pytest.mark.usefixtures("coarse", "few_simulations")
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
     """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap
     of the brakes.
     """
     study = planted()
-    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0, attack=100)
+    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0)
     (limit,) = answer.tables["limits"].to_dict("records")
     border = 1 - (MARGIN - 0.1) / GAP  # it keeps 0.1 m
     assert limit["together_low"] == pytest.approx(border, rel=0.01)

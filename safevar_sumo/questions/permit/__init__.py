@@ -19,7 +19,7 @@ from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
@@ -64,7 +64,6 @@ def permit(
     margin: Margin = None,
     unsafe: Criterion = None,
     fits: Annotated[int | None, Range(0, 1000)] = None,
-    attack: Annotated[int, Range(1000, 100_000_000)] = LEAST_SIMULATIONS,
     quick: bool = False,
     out: Annotated[str | None, "FILE.csv"] = None,
 ) -> Answer:
@@ -103,9 +102,6 @@ def permit(
         What is unsafe: a collision, a safety degree below X, or a metric beyond a limit.
     fits
         Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
-    attack
-        Number of simulations for each car and parameter set that search for an unsafe encounter up
-        to the speed found.
     quick
         A rough answer: the study's own parameter set alone, and a short search. The grid alone is
         driven, no car may drive without a limit, and no repair is named.
@@ -123,8 +119,8 @@ def permit(
     criterion = _criterion(evaluator, unsafe, margin)
     models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
-    budget = max(attack, USUAL_BUDGET) if limits else attack
-    search = PermitSearch(models, span, values, 0 if quick else budget)
+    budget = 0 if quick else budget_of(quick=not limits)
+    search = PermitSearch(models, span, values, budget)
     asked = [Cars.one(setting) for setting in fleet.settings]
     if limits:
         asked = [_within(members, limits, study, fleet.settings[0])]

@@ -31,7 +31,7 @@ from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair.price import price_of
@@ -193,7 +193,8 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * (LEAST_SIMULATIONS if quick else USUAL_BUDGET)})
+    budget = budget_of(quick=quick)
+    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * budget})
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -202,7 +203,7 @@ def repair(
             parameters=parameters,
             unsafe=model.unsafe,
             fit=model.fit,
-            budget=LEAST_SIMULATIONS if quick else USUAL_BUDGET,
+            budget=budget,
         )
         for model in models.members
     ]

@@ -12,7 +12,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.frugal import answer_roughly
@@ -56,7 +56,6 @@ def tolerance(
     margin: Margin = None,
     unsafe: Criterion = None,
     fits: Annotated[int | None, Range(0, 1000)] = None,
-    attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
     up_to: Annotated[str | None, "NAME=V"] = None,
     at_tests: bool = False,
     quick: bool = False,
@@ -85,10 +84,6 @@ def tolerance(
     fits
         Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
-    attack
-        Number of simulations that search for a counterexample to the joint limits, over all
-        parameter sets, at least 1,000; 0 leaves this search out, and then no limit is called kept.
-        With fewer than by default the answer is rough.
     up_to
         Limits that hold up to a value of a searched parameter or of an axis of the matrix, such as
         speed=40: encounters with a larger value do not count.
@@ -103,10 +98,11 @@ def tolerance(
     if up_to is not None:
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
-    budget = min(attack, LEAST_SIMULATIONS) if quick else attack
+    budget = budget_of(quick=quick)
+    fits = 0 if quick else fits
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
-    phases = phases_of(evaluator, len(columns), budget, 0 if quick else fits)
+    phases = phases_of(evaluator, len(columns), budget, fits)
     evaluator.plan({name: (1 + len(smaller)) * cost for name, cost in phases.items()})
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
@@ -125,7 +121,7 @@ def tolerance(
         original=original,
         criterion=unsafe,
         margin=margin,
-        fits=0 if quick else fits,
+        fits=fits,
         budget=budget,
         is_quick=quick,
         at_tests=at_tests,

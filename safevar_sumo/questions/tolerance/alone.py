@@ -26,9 +26,9 @@ VALUES = 17
 each model.
 """
 FALSIFICATIONS, FALSIFICATION_SHARE, GENERATIONS = 20, 0.1, 5
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of
-`--attack` of each, though never less than `LEAST_SIMULATIONS`, and its number of generations, the
-first at the limit itself.
+"""Largest number of attacks on a limit, in a study that searches its scenario; the share of the
+simulations that search for a counterexample of each, though never less than `LEAST_SIMULATIONS`,
+and its number of generations, the first at the limit itself.
 """
 ALONE_STAGE = "limits alone with each parameter set"
 Beyond = tuple[FloatArray, Model] | None
@@ -151,7 +151,7 @@ class AloneSearch:
         """Move ends in before what a falsification in a model finds in other encounters, in a study
         that searches its scenario.
         """
-        if self.ends and budget and len(model.evaluator.characteristics.scenario):
+        if self.ends and len(model.evaluator.characteristics.scenario):
             share = max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
             _falsify_alone(self.ends, model, share)
 

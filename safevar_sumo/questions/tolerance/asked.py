@@ -64,16 +64,6 @@ class Asked(NamedTuple):
     smaller: Sequence[Evaluator] = ()
 
     @property
-    def drives_between(self) -> bool:
-        """Whether limits are falsified between the tests of a matrix."""
-        return self.budget > 0 and not self.at_tests
-
-    @property
-    def may_keep(self) -> bool:
-        """Whether limits may be called kept: a search for counterexamples met all that counts."""
-        return self.budget > 0 and not self.is_quick
-
-    @property
     def unsafe_solutions(self) -> FloatArray:
         """The distinct unsafe solutions of results that change no other characteristics than those
         that vary, and parameters of the scenario; shape (K, n).

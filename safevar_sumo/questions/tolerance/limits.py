@@ -16,7 +16,6 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import USUAL_BUDGET, enough
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
@@ -47,7 +46,7 @@ from safevar_sumo.questions.tolerance.wider import (
     usual_settings,
     wider_rows,
 )
-from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences, why_not_kept
+from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import Limit
@@ -141,10 +140,10 @@ def phases_of(
     if is_rated(study):
         return phases
     sets = len(studies_of_sets(study)[1:fits]) if study.spread and fits != 0 else 0
-    own = USUAL_BOXES * enough(max(budget, 1)) / points
+    own = USUAL_BOXES * budget / points
     of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
     phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
-    if study.wider and budget:
+    if study.wider:
         phases[WIDER_STAGE] = SLOWNESS * usual_settings(evaluator, budget, 1 + sets)
     return phases
 
@@ -210,7 +209,7 @@ def _find_together(
         item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
     }
     tests = {
-        model.fit: moving_tests(model, asked.unsafe) if asked.drives_between else []
+        model.fit: [] if asked.at_tests else moving_tests(model, asked.unsafe)
         for model in models.members
     }
     joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget, outer)
@@ -243,9 +242,9 @@ def answer_limits(asked: Asked) -> Answer:
     found = find_nested_limits(asked)
     models = found.models
     together = found.together
-    scope = scope_of(study, between=asked.drives_between)
+    scope = scope_of(study, between=not asked.at_tests)
     rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
-    if not asked.may_keep:
+    if asked.is_quick:
         rows = rows.without_kept()
     nearest = []
     if rows.broken and together is not None:
@@ -257,11 +256,13 @@ def answer_limits(asked: Asked) -> Answer:
         refusal = f"the original vehicle itself {breach}: no limit can be kept"
         demand = f"{refusal}. {asked.unsafe.smaller_demand(asked.original)}".strip()
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
-    is_kept = None if not failures and not asked.may_keep else not failures
+    is_kept = None if not failures and asked.is_quick else not failures
+    if is_kept is None and asked.limits:
+        failures = ("with --quick, no limit is called kept: ask without it",)
     sentences = verdict_sentences(
         models, found.alone, together, asked, rows.broken, nearest, wider, demand
     )
-    tested = tested_sentences(models, together, asked.budget)
+    tested = tested_sentences(models, together)
     return Answer(
         question="tolerance",
         study=study,
@@ -271,13 +272,13 @@ def answer_limits(asked: Asked) -> Answer:
             "unsafe": str(asked.unsafe),
             "margin": asked.unsafe.keep,
             "kept": is_kept,
-            "rough": asked.budget < USUAL_BUDGET,
+            "rough": asked.is_quick,
             "scope": scope,
             "up_to": None if asked.up_to is None else float(asked.up_to.partition("=")[2]),
             **_numbers(found),
         },
         tables=_tables(found, rows.rows, nearest, wider),
-        failures=(why_not_kept(asked),) if is_kept is None and asked.limits else failures,
+        failures=failures,
         draw=draw_bars,
     )
 

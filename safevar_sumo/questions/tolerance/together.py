@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, enough
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.extension import Extension
@@ -225,7 +225,7 @@ class JointSearch:
         self._tests = tests
         self._columns = columns
         self._limits = limits
-        self._budget = enough(budget)
+        self._budget = budget
         self._search = BoxSearch(self.own, columns, limits, _nothing(self.own))
         specified = self._search.printed(self._search.fixed)
         self.found = LimitsTogether(
@@ -389,7 +389,7 @@ def budget_of_set(budget: int) -> int:
     """Number of simulations of a falsification with another parameter set, or in a test that
     moves.
     """
-    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS) if budget else 0
+    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS)
 
 
 def _nothing(model: Model) -> FloatArray:

@@ -88,7 +88,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     """
     evaluator = asked.evaluator
     budget = asked.budget
-    if not evaluator.study.wider or together is None or not asked.budget:
+    if not evaluator.study.wider or together is None:
         return []
     study = wider_study(evaluator.study)
     if asked.up_to is not None:
