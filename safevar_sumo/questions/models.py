@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -22,9 +23,6 @@ from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 SEARCHED_MARGIN = 0.1
 """Distance to keep in a study that searches its scenario [m]: where the original keeps just its

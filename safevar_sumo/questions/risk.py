@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import combinations, combinations_with_replacement, compress
-from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
@@ -34,6 +33,7 @@ from safevar_sumo.questions.answer import (
     with_interval,
 )
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -42,9 +42,6 @@ from safevar_sumo.questions.words import join_phrases, number_of, percentage, wi
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
 """Phases of progress."""

@@ -51,7 +51,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
 
     sequence = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
     exponent = max(0, math.ceil(math.log2(number)))
-    return np.asarray(sequence.random_base2(exponent)[:number])
+    return sequence.random_base2(exponent)[:number]
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:

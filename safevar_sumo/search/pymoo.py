@@ -276,7 +276,7 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
     algorithm: Any = msgspec.defstruct(
         label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace
     )
-    return algorithm  # type: ignore[no-any-return]
+    return algorithm
 
 
 def _class_of(name: str) -> Any:

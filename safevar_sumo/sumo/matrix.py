@@ -397,4 +397,4 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf
-    return np.asarray(order[np.argmin(values, axis=0)])
+    return order[np.argmin(values, axis=0)]

@@ -293,7 +293,7 @@ class CharacteristicSet:
 
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
-        return np.asarray(filtered != self.original)
+        return filtered != self.original
 
     def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
         """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
@@ -313,7 +313,7 @@ class CharacteristicSet:
             vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
         )
         change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
-        return np.asarray(np.max(vehicle.weight * change, axis=1))
+        return np.max(vehicle.weight * change, axis=1)
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method

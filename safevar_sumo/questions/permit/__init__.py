@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
@@ -32,9 +33,6 @@ from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study, limits_of, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -29,6 +29,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
 from safevar_sumo.questions.box import Proof
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
@@ -42,9 +43,6 @@ from safevar_sumo.questions.words import bound_in_words, encounter_in_words, joi
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 ROUNDS_STAGE, USUAL_ROUNDS = "smallest change that survives", 8
 """The phase of progress, and its usual number of rounds: each takes about the simulations of a

@@ -5,12 +5,13 @@ The filter of small changes is not applied, as the question is about the vehicle
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion
@@ -29,9 +30,6 @@ from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.study import Study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 
 @question

@@ -83,7 +83,7 @@ class Asked(NamedTuple):
         is_inside = (settings >= members.lower) & (settings <= members.upper)
         settings = settings[is_inside.all(axis=1)]
         evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
-        return np.asarray(settings[evaluations.valid & self.unsafe.of(evaluations)])
+        return settings[evaluations.valid & self.unsafe.of(evaluations)]
 
 
 def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:
