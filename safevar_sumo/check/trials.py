@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
@@ -196,9 +197,9 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
         np.where(is_odd, lower, upper),
         np.where(is_odd, upper, lower),
     ]
-    return np.concatenate(
-        [corners, np.random.default_rng(0).uniform(lower, upper, (count, len(lower)))]
-    )[:count]
+    return np.concatenate([corners, default_rng(0).uniform(lower, upper, (count, len(lower)))])[
+        :count
+    ]
 
 
 def _system(study: Study) -> System:
@@ -238,7 +239,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
         with user_errors(study.source):  # of a method that is no generator
-            search = algorithm.search(problem, np.random.default_rng(seed))
+            search = algorithm.search(problem, default_rng(seed))
         settings = []
         try:
             settings.append(next(search))

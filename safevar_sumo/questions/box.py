@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator, default_rng
 
 from safevar_sumo.questions.sampling import CONFIDENCE, Stream, sobol_points
 from safevar_sumo.records import BoolArray, FloatArray
@@ -40,13 +41,13 @@ class Box:
         is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
         return is_within & self.region.feasible(settings)
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+    def draw(self, number: int, rng: Generator) -> FloatArray:
         """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
         return self.region.draw_feasible(
             lambda count: self.at(rng.random((count, len(self.lower)))), number
         )
 
-    def with_ends(self, number: int, rng: np.random.Generator) -> FloatArray:
+    def with_ends(self, number: int, rng: Generator) -> FloatArray:
         """Random settings with half of their values at ends, shape (number, n); fewer where not all
         are feasible.
         """
@@ -72,7 +73,7 @@ class Box:
         of_vehicle = self.region.characteristics.of_vehicle
         is_open = self.lower < self.upper
         worn = np.flatnonzero(of_vehicle & is_open)
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         size = len(worn)
         numbers = (
             np.arange(2**size)

@@ -18,6 +18,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
+from numpy.random import default_rng
 from scipy.stats import norm, zscore
 
 from safevar_sumo.errors import SimulationError
@@ -131,7 +132,7 @@ def risk(
     evaluator.plan({SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block})
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = model.draw(samples, np.random.default_rng(study.search.seed))
+    vehicles = model.draw(samples, default_rng(study.search.seed))
     drawn = evaluator.evaluate(vehicles, SAMPLING)
 
     # How many are unsafe.
@@ -286,7 +287,7 @@ def regression_indices(
     than `LEAST_EXPLAINED` of the variance of vehicles that were left out.
     """
     names = list(evaluator.characteristics.names)
-    rng = np.random.default_rng(evaluator.study.search.seed)
+    rng = default_rng(evaluator.study.search.seed)
     others = VariationModel(evaluator.study).draw(REGRESSED, rng)
     inputs = np.nan_to_num(zscore(np.vstack([evaluations.settings, others])))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.bars import bars_of, draw_bars
@@ -125,7 +126,7 @@ class _Search:
                     self.high[column] = max(min(self.high[column], end), start[column])
         self.corners = self.tried = 0
 
-    def test_corners(self, rng: np.random.Generator) -> None:
+    def test_corners(self, rng: Generator) -> None:
         """Test corners, all if they are few, until none of them is unsafe."""
         of_vehicle = self.model.evaluator.characteristics.of_vehicle
         most = int(CORNER_SHARE * self.left)
@@ -142,7 +143,7 @@ class _Search:
                 return
             self.cut(unsafe)
 
-    def falsify(self, rng: np.random.Generator) -> bool:
+    def falsify(self, rng: Generator) -> bool:
         """Search for counterexamples with what is left; whether the last of them was cut off, and
         vehicles in the box were tried after it.
         """
