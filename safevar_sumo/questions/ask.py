@@ -321,9 +321,9 @@ class Question:
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
-                evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
-                if evaluator.measure:
-                    evaluator.check_measured(evaluator.measure)
+                if unsafe.bound:
+                    account.measure = unsafe.bound.measure
+                    evaluator.check_measured(account.measure)
 
             # The question's own function.
             with user_errors(self.name):
@@ -342,9 +342,14 @@ class Question:
             rough = f"Rough answer (--simulations {account.most}):"
         if self.has_rough_answer:
             numbers["rough"] = bool(rough or numbers.get("rough"))
-        verdict = " ".join(
-            filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
-        )
+        undefined = ""
+        if account.undefined:
+            of_all = f"{account.undefined:,} of {account.judged:,} simulated settings"
+            undefined = (
+                f"Remark: {account.measure} is undefined, without a collision, in {of_all}, which"
+                " count as safe."
+            )
+        verdict = " ".join(filter(None, (reason, rough, answer.verdict, cites, undefined)))
         following = self._following(subjects[0], evaluator, called) or answer.next
         return replace(answer, verdict=verdict, numbers=numbers, next=following)
 
@@ -510,18 +515,6 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     choices = get_args(hint) if get_origin(hint) is Literal else ()
     return Option(
         parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
-    )
-
-
-def _undefined_in_words(evaluator: Evaluator) -> str:
-    """How often the metric of the criterion was undefined, in a sentence; empty if it never was."""
-    undefined = sum(count for count, _ in evaluator.undefined)
-    total = sum(number for _, number in evaluator.undefined)
-    of_all = f"{undefined:,} of {total:,} simulated settings, which count as safe"
-    return (
-        f"Remark: {evaluator.measure} is undefined, without a collision, in {of_all}."
-        if undefined
-        else ""
     )
 
 

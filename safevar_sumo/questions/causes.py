@@ -72,7 +72,7 @@ def find_minimal_causes(
 
     # Subsets by size, those of all settings together, without those that contain a cause.
     expected = sum(_subset_counts([*map(len, changed)], complete))
-    with evaluator.stage(SUBSETS, expected):
+    with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
             subsets = (
                 (row, list(columns))
@@ -145,7 +145,7 @@ def select_affordable_rows(
     costs = np.array(_subset_counts(changes), dtype=float)
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
-    order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
+    order = np.random.default_rng(evaluator.seed).permutation(len(settings))
     return sorted(order[np.cumsum(costs[order]) <= max_evaluations].tolist())
 
 
@@ -368,7 +368,7 @@ def find_cause_limits(
     number = len(starts) * settings_of_line(PARTS)
     is_coarse = evaluator.left is not None and evaluator.left < 2 * number
     parts = COARSE_PARTS if is_coarse else PARTS
-    with evaluator.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
+    with evaluator.phases.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
         shares, limits, states = _first_unsafe_shares(
             evaluator, starts, ends, unsafe, thresholds.max(axis=1), parts
         )

@@ -64,7 +64,7 @@ def describe(
     for further in FURTHER_DIGITS:
         if not waiting:
             break
-        members = model.evaluator.characteristics
+        members = model.characteristics
         rows = np.array(
             [
                 as_printed(members, setting, further, within, only.get(name, ""))
@@ -83,7 +83,7 @@ def values_as_printed(
     """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
     are where it prints none, and but for one characteristic of each if `only` names them.
     """
-    members = model.evaluator.characteristics
+    members = model.characteristics
     settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
     printed = describe(model, settings, only=dict(zip(settings, only, strict=False)))
     settings |= {name: failure.setting for name, failure in printed.items()}
@@ -147,7 +147,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
     points = model.evaluator.system.points
     points = tuple(points[number] for number in model.points) or points
-    members = model.evaluator.characteristics
+    members = model.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
     fit = f" (parameter set {model.fit})" if model.fit else ""

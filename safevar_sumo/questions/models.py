@@ -23,6 +23,7 @@ from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
 
 SEARCHED_MARGIN = 0.1
 """Distance to keep in a study that searches its scenario [m]: where the original keeps just its
@@ -54,6 +55,11 @@ class Model(NamedTuple):
     at_worst_phase: bool = False
 
     @property
+    def characteristics(self) -> CharacteristicSet:
+        """Those of its study."""
+        return self.evaluator.characteristics
+
+    @property
     def numbers_of_points(self) -> Sequence[int]:
         """Numbers of the points that count."""
         return self.points or range(len(self.evaluator.system.points))
@@ -68,7 +74,7 @@ class Model(NamedTuple):
         evaluator = self.evaluator.in_phases
         if evaluator is None or self.unsafe.is_of_points:
             return None
-        is_searched = len(self.evaluator.characteristics.scenario) > 0
+        is_searched = len(self.characteristics.scenario) > 0
         points = self.points if is_searched else tuple(self.numbers_of_points)
         return self._replace(evaluator=evaluator, points=points, at_worst_phase=False)
 
@@ -95,7 +101,7 @@ class Model(NamedTuple):
         )
         failing = np.flatnonzero(robustness < 0)
         if self.new_car is not None and len(failing):
-            members = self.evaluator.characteristics
+            members = self.characteristics
             originals = self.evaluate(members.with_original_vehicle(settings[failing]), stage)
             counts = originals.valid & ~self.new_car.of(originals)
             robustness[failing[~counts]] = np.inf
@@ -113,7 +119,7 @@ class Model(NamedTuple):
         """The model at the points of the study's matrix at which settings are worst; without a
         matrix, and in a study that searches its scenario, as it is.
         """
-        if len(self.evaluator.characteristics.scenario):
+        if len(self.characteristics.scenario):
             return self
         worst = self.evaluate(settings, stage).worst_points
         if worst is None:

@@ -143,8 +143,8 @@ def nearest_limits(
     """Rows of name, unit, specified value and the nearest one at which the specified limits hold in
     all models, the others as specified; None where they do not hold even with the original's value.
     """
-    members = models.own.evaluator.characteristics
-    seed = models.own.evaluator.study.search.seed
+    members = models.own.characteristics
+    seed = models.own.evaluator.seed
     judges = judges_of(models.members, NEAREST_STAGE)
     # The specified limits in all encounters, all other characteristics as in the original.
     ends = [members.with_original_vehicle(last) for last in (members.lower, members.upper)]

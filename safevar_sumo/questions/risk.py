@@ -274,7 +274,7 @@ def _design(evaluator: Evaluator, model: VariationModel) -> Evaluations:
     """Saltelli's design, in which each characteristic varies alone and with all others."""
     from SALib.sample import sobol as design
 
-    seed = evaluator.study.search.seed % 2**32
+    seed = evaluator.seed % 2**32
     points = design.sample(_problem(evaluator), BASE_POINTS, calc_second_order=False, seed=seed)
     return evaluator.evaluate(model.settings(points), SENSITIVITY)
 
@@ -287,7 +287,7 @@ def regression_indices(
     than `LEAST_EXPLAINED` of the variance of vehicles that were left out.
     """
     names = list(evaluator.characteristics.names)
-    rng = default_rng(evaluator.study.search.seed)
+    rng = default_rng(evaluator.seed)
     others = VariationModel(evaluator.study).draw(REGRESSED, rng)
     inputs = np.nan_to_num(zscore(np.vstack([evaluations.settings, others])))
 
@@ -344,7 +344,7 @@ def sobol_indices(
 
     problem = _problem(evaluator)
     names = problem["names"]
-    seed = evaluator.study.search.seed % 2**32
+    seed = evaluator.seed % 2**32
     block = len(names) + 2
     is_complete = np.repeat(evaluations.valid.reshape(-1, block).all(axis=1), block)
 
@@ -379,7 +379,7 @@ def given_data_indices(
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:
-        seed = evaluator.study.search.seed % 2**32
+        seed = evaluator.seed % 2**32
         with (
             warnings.catch_warnings(),
             patch.object(warnings, "formatwarning"),

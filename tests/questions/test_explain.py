@@ -409,10 +409,10 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
     evaluator.plan({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
-    with evaluator.stage("all calls", 4):
+    with evaluator.phases.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
         another.evaluate(np.array([[4.0], [5.0]]), "another")
-    with evaluator.stage("first"):
+    with evaluator.phases.stage("first"):
         another.evaluate(np.array([[7.0]]), "as many as it takes")
     shown = [one for one in shown if one[0] != COMPILING]
     assert {stage for stage, _, _ in shown} == {"all calls"}

@@ -246,7 +246,7 @@ def printed_limits(
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
     whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
-    members = model.evaluator.characteristics
+    members = model.characteristics
     settings = np.array([members.setting(one, beyond=True) for one in whole])
     is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
     printed = [
@@ -279,7 +279,7 @@ def causes_holding(
     if not (sets and causes and evaluator.study.spread):
         return []
     studies = studies_of_sets(evaluator.study)[:sets]
-    with evaluator.stage(
+    with evaluator.phases.stage(
         OTHER_SETS, len(studies) * sum(1 + len(cause.changes) for cause in causes)
     ):
         return [

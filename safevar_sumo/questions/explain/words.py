@@ -94,7 +94,7 @@ def _beyond_in_words(
     is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
     if number < LEAST_NEIGHBOURS or not is_open.any():
         return ""
-    shares = np.random.default_rng(evaluator.study.search.seed).random((number, len(members)))
+    shares = np.random.default_rng(evaluator.seed).random((number, len(members)))
     vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
     runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
     share = share_in_words(float(np.mean(unsafe.of(runs))))

@@ -120,7 +120,7 @@ class PermitAnswer:
         self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
     ) -> list[tuple[Any, ...]]:
         """A row of `CARS` for each car, in the order of the list."""
-        vehicle = self.models.own.evaluator.characteristics.vehicle
+        vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
         words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)

@@ -73,7 +73,7 @@ def failures_in_words(
     for numbers in of_range.values():
         known = [failure for number in numbers if (failure := failures[number]) is not None]
         model = known[0].encounters.model
-        members = model.evaluator.characteristics
+        members = model.characteristics
         point = model.evaluator.system.points[0]
         rows = np.array([failure.setting for failure in known])
         described = failures_at(model, rows)

@@ -127,7 +127,7 @@ class PermitSearch:
             search = SpeedSearch(
                 self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name
             )
-            with model.evaluator.stage(name):
+            with model.evaluator.phases.stage(name):
                 search.drive_grid()
                 if self._budget:
                     search.falsify(self._budget)

@@ -225,7 +225,7 @@ def repair(
     survivors = Survivors([], len(problems), ())
     worst = vehicles[0]
     if is_repairable.any():
-        with evaluator.stage(ROUNDS_STAGE):
+        with evaluator.phases.stage(ROUNDS_STAGE):
             survivors = find_survivors(problems, between, vehicles[is_repairable])
         worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])

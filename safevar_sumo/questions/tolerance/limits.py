@@ -339,9 +339,7 @@ def _check_drawable(evaluator: Evaluator) -> None:
     members = evaluator.characteristics
     region = evaluator.region
     if not len(
-        Box(region, members.lower, members.upper).draw(
-            1, np.random.default_rng(evaluator.study.search.seed)
-        )
+        Box(region, members.lower, members.upper).draw(1, np.random.default_rng(evaluator.seed))
     ):
         problem = (
             f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"

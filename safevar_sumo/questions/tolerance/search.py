@@ -190,7 +190,7 @@ class BoxSearch(BoxGeometry):
         self.corners = list[FloatArray]()
         self.gap = 0.0
         self.search_count = 0
-        self.seed = model.evaluator.study.search.seed
+        self.seed = model.evaluator.seed
         self.batch = max(BATCH // len(model.points or model.evaluator.system.points), LEAST_BATCH)
 
     def join(self, model: Model) -> None:

@@ -142,7 +142,7 @@ def broken_specification(
     model at the points where it is: those of the study, or between those of its `tests`.
     """
     stage = "specified limits with each parameter set"
-    seed = models[0].evaluator.study.search.seed
+    seed = models[0].evaluator.seed
     corners = specified.corners(seed, 0)[:MAX_CORNERS]
     settings = np.concatenate([corners, specified.spread_and_corners(SPECIFICATION_POINTS, seed)])
     settings = np.unique(settings, axis=0)
@@ -171,7 +171,7 @@ def _keeps_its_margin(specified: Box, model: Model) -> bool:
     that keeps a margin, and nothing but less than it would be unsafe: then no encounter that counts
     can break them.
     """
-    members = model.evaluator.characteristics
+    members = model.characteristics
     is_original = (specified.lower == members.original) & (specified.upper == members.original)
     if not len(members.scenario) or not is_original[members.of_vehicle].all():
         return False
@@ -393,7 +393,7 @@ def budget_of_set(budget: int) -> int:
 
 
 def _nothing(model: Model) -> FloatArray:
-    return np.zeros((0, len(model.evaluator.characteristics)))
+    return np.zeros((0, len(model.characteristics)))
 
 
 def _learn(search: BoxSearch, validation: Validation) -> Iterator[tuple[Failures, FloatArray]]:

@@ -96,7 +96,7 @@ class Validator:
         self.tests = tests
         self.budget, self.budget_between = budgets
         self._with_phases = with_phases
-        self.seed = model.evaluator.study.search.seed
+        self.seed = model.evaluator.seed
         self._judge = NarrowedJudge(model, VALIDATION_STAGE)
         self._worst = list[tuple[MovingTest | None, FloatArray]]()
         """The worst settings of the last box, at the tests and between them."""

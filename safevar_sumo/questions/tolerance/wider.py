@@ -105,7 +105,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     judges = judges_of(models.members, WIDER_STAGE)
     stream = seed, Stream.WIDER_SCOPE
     lowest = None
-    with evaluator.stage(WIDER_STAGE, usual_settings(evaluator, budget, len(judges))):
+    with evaluator.phases.stage(WIDER_STAGE, usual_settings(evaluator, budget, len(judges))):
         found = falsify_limits(box, judges, budget, stream)
         if found.failures and study.scenario.search:
             searched = study.scenario.search
@@ -127,7 +127,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
 
 def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
     """A box of the vehicle's characteristics in all encounters of the wider study."""
-    members = models.own.evaluator.characteristics
+    members = models.own.characteristics
     own = evaluator.characteristics
     lower = members.lower.copy()
     upper = members.upper.copy()

@@ -135,7 +135,7 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
     yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
     for model in models.left_out:
         # Its words name the test and the parameter set.
-        described = describe(model, {"": model.evaluator.characteristics.original})
+        described = describe(model, {"": model.characteristics.original})
         words = described[""].words if described else f"parameter set {model.fit} is unsafe"
         yield f"With the original vehicle itself {words}: there no limit is claimed."
     if not asked.is_quick:
@@ -227,7 +227,7 @@ def _without_room(models: Models, together: LimitsTogether) -> list[str]:
     return [
         item.name
         for item, low, high, last in zip(
-            models.own.evaluator.characteristics, box.lower, box.upper, together.room, strict=True
+            models.own.characteristics, box.lower, box.upper, together.room, strict=True
         )
         if low == high and last and not item.is_scenario
     ]
