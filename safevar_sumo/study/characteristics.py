@@ -54,14 +54,13 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
-    """One row of the characteristics table; f_diff multiplies its change by `weight`.
+    """One row of the characteristics table.
 
     `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
     measures it, or, if `workshop` is false, who else does; `remedy` says what to do with a vehicle
     beyond its limit.
     """
 
-    weight: PositiveNumber = 1.0
     counterpart: ShortText = ""
     workshop: Annotated[bool, WITHOUT_EFFECT] = True
     measurement: ShortText = ""

@@ -35,10 +35,9 @@ class Characteristic:
     """One characteristic of the vehicle under test, or a searched parameter of the scenario
     (`is_scenario`); all quantities are in `unit`.
 
-    A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names
-    the part of a real vehicle that determines it, `measurement` says how a workshop measures it or,
-    unless `workshop`, who else does, and `remedy` what to do beyond a limit; all of them may be
-    empty. `short_name` is its name in sentences: by default the meaning up to the first comma or
+    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines
+    it, `measurement` says how a workshop measures it or, unless `workshop`, who else does, and
+    `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in sentences: by default the meaning up to the first comma or
     bracket, such as `engine drag`, or the name if the study gives no meaning.
     """
 
@@ -47,7 +46,6 @@ class Characteristic:
     original: float
     lower: float
     upper: float
-    weight: float = 1.0
     meaning: str = ""
     short_name: str = ""
     counterpart: str = ""
@@ -265,10 +263,6 @@ class CharacteristicSet:
     def threshold(self) -> FloatArray:
         return self._column("threshold")
 
-    @cached_property
-    def weight(self) -> FloatArray:
-        return self._column("weight")
-
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
         values = np.array(
@@ -304,16 +298,14 @@ class CharacteristicSet:
         }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w
-        (method section 3, where w = 1), of the vehicle's characteristics; the domain's width stands
-        for an original of 0.
+        """f_diff = max_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'' (method section
+        3), of the vehicle's characteristics; the domain's width stands for an original of 0.
         """
         vehicle = self.vehicle
         scale = np.where(
             vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
         )
-        change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
-        return np.max(vehicle.weight * change, axis=1)
+        return np.max(np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale, axis=1)
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method
