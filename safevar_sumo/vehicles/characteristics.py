@@ -37,8 +37,9 @@ class Characteristic:
 
     `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines
     it, `measurement` says how a workshop measures it or, unless `workshop`, who else does, and
-    `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in sentences: by default the meaning up to the first comma or
-    bracket, such as `engine drag`, or the name if the study gives no meaning.
+    `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in
+    sentences: by default the meaning up to the first comma or bracket, such as `engine drag`, or
+    the name if the study gives no meaning.
     """
 
     name: str
@@ -298,8 +299,9 @@ class CharacteristicSet:
         }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'' (method section
-        3), of the vehicle's characteristics; the domain's width stands for an original of 0.
+        """f_diff = max_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'' (method
+        section 3), of the vehicle's characteristics; the domain's width stands for an original
+        of 0.
         """
         vehicle = self.vehicle
         scale = np.where(
