@@ -32,6 +32,16 @@ class Box:
     lower: FloatArray
     upper: FloatArray
 
+    def end(self, side: int, column: int) -> float:
+        """An end of a column: 0, the lower one, or 1, the upper one."""
+        return float((self.lower, self.upper)[side][column])
+
+    def with_end(self, side: int, column: int, value: float) -> Box:
+        """The box with another value of an end."""
+        ends = [self.lower.copy(), self.upper.copy()]
+        ends[side][column] = value
+        return Box(self.region, *ends)
+
     def at(self, points: FloatArray) -> FloatArray:
         """The settings at points of the unit cube, shape (M, n)."""
         return self.lower + points * (self.upper - self.lower)

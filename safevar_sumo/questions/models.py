@@ -168,15 +168,22 @@ def limit_criterion(
     margin [m], which is by default that of the study; `SEARCHED_MARGIN` in one that searches its
     scenario, whose originals keep more.
     """
-    study = evaluator.study
     is_distance = unsafe is None and margin is not None
     criterion = evaluator.choose_criterion(COLLISION if is_distance else unsafe, subject, original)
+    return keeping_distance(evaluator, criterion, margin, is_stated=unsafe is not None)
+
+
+def keeping_distance(
+    evaluator: Evaluator, criterion: Unsafe, margin: float | None, *, is_stated: bool
+) -> Unsafe:
+    """A criterion of an evaluator's study, with the distance to keep from a collision; one that is
+    stated without a margin stands alone.
+    """
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
-    # A collision that is asked for stands alone.
-    if not criterion.is_collision or (margin is None and unsafe is not None):
+    if not criterion.is_collision or (margin is None and is_stated):
         return criterion
-    return replace(criterion, keep=distance_to_keep(study, margin))
+    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:

@@ -55,9 +55,8 @@ def falsify_limits(
     at_ends = box.with_ends(POINTS, rng)
     settings = np.concatenate([spread, at_ends])
     if end is not None:
-        side, column = end
         just_within = np.concatenate([spread[POINTS:], at_ends])
-        just_within[:, column] = (box.lower, box.upper)[side][column]
+        just_within[:, end[1]] = box.end(*end)
         settings = np.concatenate([settings, just_within])
     settings = np.unique(settings, axis=0)
     known = [settings] * len(judges)
@@ -81,7 +80,7 @@ def reach(
     """
     side, column = end
     item = box.region.characteristics.members[column]
-    value = float((box.lower, box.upper)[side][column])
+    value = box.end(*end)
     failures = list[tuple[int, FloatArray]]()
     new = dict(known or {})
     for number in range(MAX_STEPS):
@@ -96,7 +95,7 @@ def reach(
                 failures.append((judge, failure[np.newaxis]))
                 value = rounded_towards(start, last, item)
         # The failures within the limits with this value: first with the judges that failed last.
-        limits = _with_end(box, end, value)
+        limits = box.with_end(*end, value)
         stream = (*seed, number + 1)
         first = sorted(new)
         new = {}
@@ -116,14 +115,6 @@ def reach(
 
 def _are_unsafe(judge: Judge, settings: FloatArray) -> BoolArray:
     return judge(settings) < 0
-
-
-def _with_end(box: Box, end: End, value: float) -> Box:
-    """A box with another value of one of its ends."""
-    side, column = end
-    ends = [box.lower.copy(), box.upper.copy()]
-    ends[side][column] = value
-    return Box(box.region, *ends)
 
 
 def rounded_towards(start: float, value: float, item: Characteristic) -> float:

@@ -161,7 +161,9 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = _titles(evaluators)
+    # Sentences call A and B by the names of their studies if they differ.
+    names = (study.name, second.study.name)
+    titles = names if names[0] != names[1] else ("A", "B")
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
@@ -193,7 +195,12 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables=_tables(numbers, tested, titles, limits=alone, settings=_table(common, settings)),
+        tables={
+            "summary": summary_of(numbers, tested.pairs, tested.quantity, titles),
+            "limits": alone,
+            "pairs": tested.pairs,
+            "settings": _table(common, settings),
+        },
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
@@ -217,12 +224,6 @@ def _numbers(
         "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
         "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
     }
-
-
-def _titles(evaluators: Sequence[Evaluator]) -> tuple[str, ...]:
-    """What sentences call A and B: the names of their studies if they differ."""
-    names = tuple(side.study.name for side in evaluators)
-    return names if names[0] != names[1] else ("A", "B")
 
 
 def _criteria(
@@ -301,19 +302,6 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
     order = settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
     return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
-
-
-def _tables(
-    numbers: JsonObject,
-    tested: _PairedTest,
-    titles: Sequence[str],
-    *,
-    limits: pd.DataFrame,
-    settings: pd.DataFrame,
-) -> dict[str, pd.DataFrame]:
-    """The tables of an answer, the summary first."""
-    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
-    return {"summary": summary, "limits": limits, "pairs": tested.pairs, "settings": settings}
 
 
 class _PairedTest(NamedTuple):

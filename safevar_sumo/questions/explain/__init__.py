@@ -68,7 +68,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
-NO_COLLISION_NUMBERS: JsonObject = dict.fromkeys(COLLISION_NUMBERS)
 LIMIT, QUICK_LIMIT = 40_000, 4_000
 """Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
 if all would take more, a random sample is analysed.
@@ -179,7 +178,8 @@ def explain(
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
-        **(_collision_numbers(verdicts, collisions) if has_drivers else NO_COLLISION_NUMBERS),
+        **dict.fromkeys(COLLISION_NUMBERS),
+        **(_collision_numbers(verdicts, collisions) if has_drivers else {}),
         **(smallest.numbers if smallest is not None else {}),
     }
     verdict = verdict_on_failures(evaluator, population, tables["causes"])
@@ -248,13 +248,8 @@ def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
     """
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
-    return dict(
-        zip(
-            COLLISION_NUMBERS,
-            (collisions, int(is_avoided.sum()), int(unavoidable.sum())),
-            strict=True,
-        )
-    )
+    numbers = collisions, int(is_avoided.sum()), int(unavoidable.sum())
+    return dict(zip(COLLISION_NUMBERS, numbers, strict=True))
 
 
 def draw_needed(answer: Answer) -> Figure:

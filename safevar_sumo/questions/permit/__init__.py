@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
@@ -21,7 +19,7 @@ from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, ques
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
-from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
+from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of
@@ -114,7 +112,12 @@ def permit(
     members = evaluator.characteristics.vehicle
     _check_forms(cars, set, limits, out)
     fleet = read_cars(study, cars, set, limits, others, ignore)
-    criterion = _criterion(evaluator, unsafe, margin)
+    criterion = keeping_distance(
+        evaluator,
+        evaluator.parse_criterion(COLLISION if unsafe is None else unsafe),
+        margin,
+        is_stated=unsafe is not None,
+    )
     models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
     budget = 0 if quick else budget_of(quick=not limits)
@@ -268,13 +271,3 @@ def _within(
         lower[column] = item.lower if limit.at_least is None else limit.at_least
         upper[column] = item.upper if limit.at_most is None else limit.at_most
     return Cars.within(lower, upper, study.search.seed)
-
-
-def _criterion(evaluator: Evaluator, unsafe: str | None, margin: float | None) -> Unsafe:
-    """What is unsafe: the stated criterion, or else a collision or less than the margin."""
-    criterion = evaluator.parse_criterion(COLLISION if unsafe is None else unsafe)
-    check_margin(criterion, margin)
-    criterion = replace(criterion, contact=evaluator.system.contact)
-    if not criterion.is_collision or (margin is None and unsafe is not None):
-        return criterion
-    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))

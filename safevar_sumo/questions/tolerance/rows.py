@@ -124,7 +124,8 @@ def limit_rows(
         limit = limits.get(item.name)
         specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
         box = None if together is None else together.box
-        column = models[0].evaluator.characteristics.names.index(name)
+        members = models[0].characteristics
+        column = members.names.index(name)
         ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
         failure = (beyond_alone if box is None else beyond).get(name)
         is_kept = None if limit is None else _is_kept(each, specified, together)
@@ -132,18 +133,13 @@ def limit_rows(
             broken.append(
                 _broken_in_words(each, specified, together, beyond_alone.get(name), models)
             )
-        members = models[0].evaluator.characteristics
         rows.append(
             (
                 *(name, item.unit, item.original),
                 *(*(each.safe or NOWHERE), *(ends or NOWHERE), *specified),
                 is_kept,
                 None if failure is None else failure.words,
-                (
-                    None
-                    if failure is None
-                    else dict(zip(members.names, failure.setting.tolist(), strict=True))
-                ),
+                None if failure is None else members.named(failure.setting),
                 None if failure is None else failure.command,
                 (
                     None
@@ -203,7 +199,7 @@ def _broken_in_words(
     item = alone.characteristic
     by, end = _outside(alone, specified)
     if by:
-        members = models[0].evaluator.characteristics
+        members = models[0].characteristics
         # At the specified value itself the original encounter may be safe; then what fails beyond
         # the limit is said.
         for model in models:
@@ -238,7 +234,7 @@ def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:
 def _failures_beyond(together: LimitsTogether, models: Sequence[Model]) -> dict[str, Failure]:
     """How the car fails just beyond each limit of the box, by its name."""
     failures: dict[str, Failure] = {}
-    names = models[0].evaluator.characteristics.names
+    names = models[0].characteristics.names
     waiting = {names[column]: setting for (_, column), setting in together.beyond.items()}
     for model in together.searched:
         if not waiting:

@@ -204,6 +204,10 @@ class BoxSearch(BoxGeometry):
                 break
         self.models.insert(0, model)
 
+    def know(self, *settings: FloatArray) -> None:
+        """Know unsafe settings, each of shape (K, n): no later box holds one of them."""
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, *settings])
+
     @property
     def first_models(self) -> list[Model]:
         """The models in which a box is searched: those in which something failed last. Its test
@@ -257,7 +261,7 @@ class BoxSearch(BoxGeometry):
             if is_unsafe.any():
                 self.models.remove(model)
                 self.models.insert(0, model)
-            self.unsafe_settings = np.concatenate([self.unsafe_settings, rows[is_unsafe]])
+            self.know(rows[is_unsafe])
             has_unsafe[waiting] = is_unsafe.reshape(len(waiting), -1).any(axis=1)
         return has_unsafe
 
@@ -281,8 +285,7 @@ class BoxSearch(BoxGeometry):
         if len(known):
             return known
         points = self.points(sides, SEARCH_POINTS)
-        found = points[self.are_unsafe(points)]
-        return found
+        return points[self.are_unsafe(points)]
 
     def learn(self, settings: FloatArray, model: Model | None = None) -> FloatArray:
         """Add corners that are unsafe, from some settings that are unsafe in a model, or in any;
@@ -312,7 +315,7 @@ class BoxSearch(BoxGeometry):
         starts = ends.copy()
         starts[np.arange(len(rows)), columns] = self.original[columns]
         found = find_boundaries(starts, ends, partial(model.are_unsafe, stage=SEARCH_STAGE))
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, found.unsafe])
+        self.know(found.unsafe)
         nearest = causes.copy()
         nearest[rows, columns] = found.unsafe[np.arange(len(rows)), columns]
         return nearest
@@ -335,7 +338,7 @@ class BoxSearch(BoxGeometry):
             is_kept = ~(needs >= cause).all(axis=(1, 2))
             needs = needs[is_kept]
             self.unsafe_settings = self.unsafe_settings[is_kept]
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
+        self.know(np.unique(causes, axis=0))
 
     def _causes(self, settings: FloatArray, model: Model | None) -> FloatArray:
         """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in
@@ -460,8 +463,7 @@ class BoxSearch(BoxGeometry):
         settings = np.concatenate(
             [self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)]
         )
-        box = self.box(sides)
-        settings[:, column] = (box.lower, box.upper)[side][column]
+        settings[:, column] = self.box(sides).end(side, column)
         return settings
 
     def best(self, start: FloatArray) -> FloatArray | None:

@@ -262,11 +262,7 @@ class JointSearch:
         if self._outer is not None:
             # Without joint limits there are none here: no free side has any room.
             search.stay_within(self._outer.box or self._outer.specified)
-            known = [
-                search.unsafe_settings,
-                *(row[np.newaxis] for row in self._outer.beyond.values()),
-            ]
-            search.unsafe_settings = np.concatenate(known)
+            search.know(*(row[np.newaxis] for row in self._outer.beyond.values()))
         boxes = _Boxes(search, _start_of(search, self._columns, scans))
         validator = self._validator(self.own, self._budget)
         self._validators = [validator]
@@ -311,7 +307,7 @@ class JointSearch:
         if model.fit in self.found.broken or outer is None:
             return
         search = self._search
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_settings])
+        search.know(unsafe_settings)
         validator = self._validator(model, budget_of_set(self._budget), with_phases=True)
         extension = Extension(search)
         met = list[Model]()
@@ -400,7 +396,7 @@ def _learn(search: BoxSearch, validation: Validation) -> Iterator[tuple[Failures
     """Take failures, and the models in which they are, into a search; the causes of each."""
     for failures in validation.failures:
         search.join(failures.model)
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+        search.know(failures.settings)
         yield failures, search.learn(failures.settings, failures.model)
 
 

@@ -118,10 +118,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
             ]
             lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
-    members = other.characteristics
-    fails_at = (
-        None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True))
-    )
+    fails_at = None if failure is None else other.characteristics.named(failure.setting)
     return [(study.name, scope_of(study), not found.failures, verdict, fails_at)]
 
 
