@@ -78,6 +78,12 @@ setting collides, else half of the original's safety degree; of a rated study, a
 """
 CARS_FILE = "FILE.csv"
 """A list of cars: its path, or in the library also a DataFrame or a mapping."""
+LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']
+"""Limits of characteristics."""
+ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
+"""Values of characteristics."""
+Fits = Annotated[int | None, Range(0, 1000)]
+"""A number of parameter sets; None for all."""
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]

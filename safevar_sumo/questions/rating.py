@@ -19,7 +19,7 @@ from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import ValueTexts, question
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
@@ -99,7 +99,7 @@ def rating(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
+    set: ValueTexts = (),
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
 ) -> Answer:
     """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as

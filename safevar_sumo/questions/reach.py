@@ -32,13 +32,12 @@ End = tuple[int, int]
 
 
 class Reach(NamedTuple):
-    """The furthest value that holds, None if none does; the falsification that found nothing up to
-    it; and all unsafe settings that were found beyond it, with the numbers of their judges.
+    """The furthest value that holds, None if none does; and all unsafe settings that were found
+    beyond it, with the numbers of their judges.
     """
 
-    value: float | None = None
-    falsification: Falsification | None = None
-    failures: Sequence[tuple[int, FloatArray]] = ()
+    value: float | None
+    failures: Sequence[tuple[int, FloatArray]]
 
 
 def falsify_limits(
@@ -107,10 +106,10 @@ def reach(
             found = falsify_limits(limits, judges, budget, stream, end)
             new = found.failures
         if not new:
-            return Reach(value, found, failures)
+            return Reach(value, failures)
         if value == start:
             break
-    return Reach(None, None, [*failures, *new.items()])
+    return Reach(None, [*failures, *new.items()])
 
 
 def _are_unsafe(judge: Judge, settings: FloatArray) -> BoolArray:

@@ -17,6 +17,7 @@ from safevar_sumo.study.marks import WITHOUT_EFFECT, Table
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 ShortText = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
+LongText = Annotated[str, Meta(max_length=400)]
 MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
 
@@ -199,7 +200,7 @@ class Constraint(Table, frozen=True, kw_only=True):
     at_least: float | None = None
     at_most: float | None = None
     unit: str | None = None
-    meaning: Annotated[str, Meta(max_length=400)] = ""
+    meaning: LongText = ""
 
     def __post_init__(self) -> None:
         if 0 in self.sum.values():
@@ -283,7 +284,7 @@ class Limit(Table, frozen=True, kw_only=True):
 
     at_least: float | None = None
     at_most: float | None = None
-    source: Annotated[str, Meta(max_length=400)] = ""
+    source: LongText = ""
 
     def __post_init__(self) -> None:
         check_bounds(self.at_least, self.at_most)
@@ -301,7 +302,7 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
     """
 
     value: float
-    source: Annotated[str, Meta(max_length=400)] = ""
+    source: LongText = ""
 
 
 def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Count, Criterion, Margin, question
+from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
     BOTH,
@@ -115,7 +115,7 @@ def compare(
     other: Study | Case,
     *,
     samples: Count = 2000,
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    limits: LimitTexts = (),
     margin: Margin = None,
     unsafe: Criterion = None,
     at_tests: bool = False,

@@ -15,7 +15,16 @@ from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import (
+    CARS_FILE,
+    Criterion,
+    Fits,
+    LimitTexts,
+    Margin,
+    Range,
+    ValueTexts,
+    question,
+)
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
@@ -50,8 +59,8 @@ def permit(
     evaluator: Evaluator,
     *,
     cars: Annotated[Any, CARS_FILE] = None,
-    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    set: ValueTexts = (),
+    limits: LimitTexts = (),
     others: Literal["new"] | None = None,
     ignore: Annotated[tuple[str, ...], "COLUMN"] = (),
     need: Annotated[str | None, '"50 km/h"'] = None,
@@ -59,7 +68,7 @@ def permit(
     step: Annotated[float, Range(0, 1000, is_open=True)] = 1.0,
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int | None, Range(0, 1000)] = None,
+    fits: Fits = None,
     quick: bool = False,
     out: Annotated[str | None, "FILE.csv"] = None,
 ) -> Answer:

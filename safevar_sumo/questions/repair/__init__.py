@@ -27,7 +27,7 @@ from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
@@ -130,11 +130,11 @@ def repair(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    promise: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    promise: LimitTexts = (),
     margin: Margin = None,
     unsafe: Criterion = None,
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
-    fits: Annotated[int | None, Range(0, 1000)] = None,
+    fits: Fits = None,
     out: Annotated[str | None, "FILE.toml"] = None,
     at_tests: bool = False,
     quick: bool = False,

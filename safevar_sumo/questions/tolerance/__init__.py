@@ -10,7 +10,7 @@ from typing import Annotated
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
@@ -49,11 +49,11 @@ def tolerance(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    limits: LimitTexts = (),
     characteristics: Annotated[tuple[str, ...], "A,B"] = (),
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int | None, Range(0, 1000)] = None,
+    fits: Fits = None,
     up_to: Annotated[str | None, "NAME=V"] = None,
     at_tests: bool = False,
     quick: bool = False,

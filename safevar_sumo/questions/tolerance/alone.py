@@ -138,14 +138,16 @@ class AloneSearch:
         self.models.append(model)
         if not self.ends:
             return
-        has_moved = _move_before(self.ends, model, self._encounters, VALUES)
-        has_moved |= any([_move_between(self.ends, test) for test in tests])
-        # The ends as they are printed, until all are safe in all models: where one moves, it is new
-        # to the others.
-        while has_moved:
-            at_ends = [_move_before(self.ends, each, self._encounters, 2) for each in self.models]
-            has_moved = any(at_ends)
-            has_moved |= any([_move_between(self.ends, test) for test in tests])
+        # Then the ends as they are printed, until all are safe in all models: where one moves, it
+        # is new to the others.
+        models, number = [model], VALUES
+        while any(
+            [
+                *[_move_before(self.ends, each, self._encounters, number) for each in models],
+                *[_move_between(self.ends, test) for test in tests],
+            ]
+        ):
+            models, number = self.models, 2
 
     def attack(self, model: Model, budget: int) -> None:
         """Move ends in before what a falsification in a model finds in other encounters, in a study

@@ -243,9 +243,9 @@ def answer_limits(asked: Asked) -> Answer:
     models = found.models
     together = found.together
     scope = scope_of(study, between=not asked.at_tests)
-    rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
-    if asked.is_quick:
-        rows = rows.without_kept()
+    rows = limit_rows(
+        found.alone, together, asked.limits, models.members, scope, is_rough=asked.is_quick
+    )
     nearest = []
     if rows.broken and together is not None:
         nearest = nearest_limits(models, asked.limits)

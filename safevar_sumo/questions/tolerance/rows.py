@@ -91,17 +91,6 @@ class LimitRows(NamedTuple):
     rows: list[tuple[Any, ...]]
     broken: list[str]
 
-    def without_kept(self) -> LimitRows:
-        """The rows of limits that nothing searched for a counterexample: none of them is called
-        kept.
-        """
-        place = [*LIMITS].index("kept")
-        rows = [
-            (*row[:place], None if row[place] else row[place], *row[place + 1 :])
-            for row in self.rows
-        ]
-        return self._replace(rows=rows)
-
 
 def limit_rows(
     alone: Sequence[AloneLimit],
@@ -109,10 +98,13 @@ def limit_rows(
     limits: Mapping[str, Limit],
     models: Sequence[Model],
     scope: str,
+    *,
+    is_rough: bool,
 ) -> LimitRows:
     """The rows of the table of limits, whose sentences carry their scope.
 
-    `together` is None in a rated study, and around an unsafe original.
+    `together` is None in a rated study, and around an unsafe original. None is called kept where
+    the answer is rough.
     """
     beyond_alone = _failures_alone(alone)
     beyond = {} if together is None else _failures_beyond(together, models)
@@ -137,7 +129,7 @@ def limit_rows(
             (
                 *(name, item.unit, item.original),
                 *(*(each.safe or NOWHERE), *(ends or NOWHERE), *specified),
-                is_kept,
+                None if is_kept and is_rough else is_kept,
                 None if failure is None else failure.words,
                 None if failure is None else members.named(failure.setting),
                 None if failure is None else failure.command,
