@@ -10,13 +10,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.plugins.contract import user_errors
-from safevar_sumo.records import FloatArray, ResultColumns, differences
+from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import is_recorded
@@ -40,7 +39,7 @@ MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget, and largest population, of an algorithm's runs."""
-_Rows = npt.NDArray[np.intp]
+_Rows = IntArray
 
 
 class FailedCheck(NamedTuple):

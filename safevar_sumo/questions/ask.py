@@ -348,14 +348,8 @@ class Question:
             rough = f"Rough answer (--simulations {account.most}):"
         if self.has_rough_answer:
             numbers["rough"] = bool(rough or numbers.get("rough"))
-        undefined = ""
-        if account.undefined:
-            of_all = f"{account.undefined:,} of {account.judged:,} simulated settings"
-            undefined = (
-                f"Remark: {account.measure} is undefined, without a collision, in {of_all}, which"
-                " count as safe."
-            )
-        verdict = " ".join(filter(None, (reason, rough, answer.verdict, cites, undefined)))
+        sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
+        verdict = " ".join(filter(None, sentences))
         following = self._following(subjects[0], evaluator, called) or answer.next
         return replace(answer, verdict=verdict, numbers=numbers, next=following)
 

@@ -17,7 +17,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues, Outcome
 from safevar_sumo.results import FailedSetting, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
@@ -66,7 +66,7 @@ class Case:
 
     name: str
     study: Study
-    original: Mapping[str, float]
+    original: NamedValues
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
     finished_runs: tuple[tuple[str, int], ...]

@@ -8,7 +8,7 @@ inferred: all subsets are simulated, size by size, except those that contain a c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from itertools import combinations, islice, pairwise, takewhile
 from math import comb
@@ -23,7 +23,7 @@ from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -44,10 +44,10 @@ class Cause(NamedTuple):
     the scenario, in a study that searches them.
     """
 
-    changes: dict[str, float]
+    changes: NamedValues
     outcome: str
     safety_degree: float
-    encounter: dict[str, float]
+    encounter: NamedValues
 
 
 def find_minimal_causes(
@@ -205,7 +205,7 @@ def count_needed(
     )
 
 
-def directions(characteristics: CharacteristicSet, changes: Mapping[str, float]) -> tuple[str, ...]:
+def directions(characteristics: CharacteristicSet, changes: NamedValues) -> tuple[str, ...]:
     """The directions of changes, without their sizes, such as ('mass up', 'tireFric down')."""
     return tuple(
         f"{item.name} {'up' if changes[item.name] > item.original else 'down'}"
@@ -332,8 +332,8 @@ class Limits(NamedTuple):
         What lies just below the factor.
     """
 
-    boundary: dict[str, float]
-    single_boundary: dict[str, float]
+    boundary: NamedValues
+    single_boundary: NamedValues
     fraction: float
     end: BoundaryState
 

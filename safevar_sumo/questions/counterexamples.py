@@ -17,7 +17,7 @@ from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.words import EXACT, join_phrases
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import PHASE, unit_text
@@ -78,8 +78,8 @@ def describe(
 
 
 def values_as_printed(
-    model: Model, vehicles: Sequence[Mapping[str, float]], only: Sequence[str] = ()
-) -> list[dict[str, float]]:
+    model: Model, vehicles: Sequence[NamedValues], only: Sequence[str] = ()
+) -> list[NamedValues]:
     """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
     are where it prints none, and but for one characteristic of each if `only` names them.
     """
@@ -195,7 +195,7 @@ def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[st
 
 
 def where_in_words(
-    points: Sequence[Point], point: Point, scenario: Scenario, values: Mapping[str, float]
+    points: Sequence[Point], point: Point, scenario: Scenario, values: NamedValues
 ) -> str:
     """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`,
     from one of the points of a matrix, the values of searched parameters, and the scenario with

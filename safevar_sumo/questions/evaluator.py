@@ -4,7 +4,7 @@ domain.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -32,7 +32,7 @@ from safevar_sumo.questions.price import (
 )
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.measuring import criterion_of
 from safevar_sumo.sumo.system import System, assemble
@@ -117,7 +117,7 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, settings: Mapping[str, float]) -> None:
+    def plan(self, settings: NamedValues) -> None:
         """Plan the phases of a question, each with the number of settings that it is expected to
         simulate.
         """

@@ -62,6 +62,13 @@ class Account:
         """Simulations that may follow."""
         return float("inf") if self.most is None else self.most - self.spent
 
+    @property
+    def undefined_in_words(self) -> str:
+        """How often the metric was undefined, in a sentence; empty if it never was."""
+        of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
+        remark = f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+        return remark if self.undefined else ""
+
     def spend(self, simulations: int) -> None:
         """Count simulations that begin.
 

@@ -24,7 +24,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
 from safevar_sumo.questions.words import join_phrases
-from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.records import CellResults, FloatArray, NamedValues
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import MatrixTable, Study
@@ -297,7 +297,7 @@ def _cells(
     )
 
 
-def _changes(study: Study, setting: FloatArray) -> dict[str, float]:
+def _changes(study: Study, setting: FloatArray) -> NamedValues:
     characteristics = CharacteristicSet.of(study)
     pairs = zip(characteristics, setting.tolist(), strict=True)
     return {item.name: value for item, value in pairs if value != item.original}

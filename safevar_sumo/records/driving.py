@@ -20,6 +20,8 @@ Quantity = Any
 """A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N
 encounters.
 """
+NamedValues = dict[str, float]
+"""Values by name, such as those of characteristics."""
 JsonObject = dict[str, Any]
 """An object of JSON, or a table of TOML: plain values by key."""
 

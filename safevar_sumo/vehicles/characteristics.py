@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.records import BoolArray, FloatArray, Quantity
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
@@ -272,7 +272,7 @@ class CharacteristicSet:
         values.flags.writeable = False
         return values
 
-    def named(self, setting: FloatArray) -> dict[str, float]:
+    def named(self, setting: FloatArray) -> NamedValues:
         """The values of a setting, shape (n,), by name."""
         return dict(zip(self.names, setting.tolist(), strict=True))
 

@@ -161,9 +161,8 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    # Sentences call A and B by the names of their studies if they differ.
-    names = (study.name, second.study.name)
-    titles = names if names[0] != names[1] else ("A", "B")
+    titles = _titles(study.name, second.study.name)
+    table = _table(common, settings)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
@@ -178,11 +177,10 @@ def compare(
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **decided,
-        **_numbers(criteria[0], counts, tested, alone["change"]),
-        "outside": outside,
-        "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
+        **_numbers(criteria[0], counts, tested, alone["change"], pairs, outside),
         **of_originals,
     }
+    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         why,
@@ -195,16 +193,16 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={
-            "summary": summary_of(numbers, tested.pairs, tested.quantity, titles),
-            "limits": alone,
-            "pairs": tested.pairs,
-            "settings": _table(common, settings),
-        },
+        tables={"summary": summary, "limits": alone, "pairs": tested.pairs, "settings": table},
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
     )
+
+
+def _titles(*names: str) -> tuple[str, ...]:
+    """What sentences call A and B: the names of their studies if they differ."""
+    return names if names[0] != names[1] else ("A", "B")
 
 
 def _numbers(
@@ -212,6 +210,8 @@ def _numbers(
     counts: Mapping[str, int],
     tested: _PairedTest,
     changes_of_limits: pd.Series[str],
+    pairs: Pairs,
+    outside: int,
 ) -> JsonObject:
     """What was compared."""
     return {
@@ -223,6 +223,8 @@ def _numbers(
         "a12": tested.a12,
         "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
         "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
+        "outside": outside,
+        "not_simulated": int((~pairs.are_valid).sum()) - pairs.number_infeasible,
     }
 
 

@@ -178,8 +178,7 @@ def explain(
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
-        **dict.fromkeys(COLLISION_NUMBERS),
-        **(_collision_numbers(verdicts, collisions) if has_drivers else {}),
+        **_collision_numbers(verdicts, collisions if has_drivers else None),
         **(smallest.numbers if smallest is not None else {}),
     }
     verdict = verdict_on_failures(evaluator, population, tables["causes"])
@@ -242,10 +241,12 @@ def _counts(
     }
 
 
-def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
+def _collision_numbers(verdicts: pd.DataFrame, collisions: int | None) -> JsonObject:
     """The numbers of all collisions, of those assessed that some driver avoids, and that even full
-    braking does not.
+    braking does not; undefined where no driver was asked.
     """
+    if collisions is None:
+        return dict.fromkeys(COLLISION_NUMBERS)
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
     numbers = collisions, int(is_avoided.sum()), int(unavoidable.sum())

@@ -20,7 +20,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import Enumeration, enumerate_causes, staircase
 from safevar_sumo.questions.explain.robustness import robustness_in_words
 from safevar_sumo.questions.explain.tables import sureness
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate
 from safevar_sumo.questions.words import EXACT, join_phrases, number_of, percentage
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.vehicles import CharacteristicSet
@@ -210,7 +210,7 @@ class Smallest(NamedTuple):
         return sentence[:1].upper() + sentence[1:]
 
 
-def smallest_tables(smallest: Smallest | None) -> dict[str, pd.DataFrame]:
+def smallest_tables(smallest: Smallest | None) -> Frames:
     """The tables of causes and of the staircase; empty where the original itself is unsafe."""
     rows = [
         (

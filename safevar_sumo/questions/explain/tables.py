@@ -37,9 +37,9 @@ from safevar_sumo.questions.preventability import (
     drivers_frame,
     has_reference_drivers,
 )
-from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate, with_interval
 from safevar_sumo.questions.words import EXACT, number_of
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, NamedValues
 
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
@@ -230,7 +230,7 @@ def causes_table(
 
 def printed_limits(
     model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
-) -> list[dict[str, dict[str, float]]]:
+) -> list[dict[str, NamedValues]]:
     """The columns encounter, boundary and single_boundary of causes as they are printed: rounded to
     the unsafe side, with as many digits as the vehicle needs to be unsafe.
     """
@@ -290,7 +290,7 @@ def sureness(
 
 def statistics_tables(
     needed: pd.DataFrame, failures: int, verdicts: pd.DataFrame, collisions: int
-) -> dict[str, pd.DataFrame]:
+) -> Frames:
     """The tables of characteristics and of drivers."""
     return {
         "characteristics": tabulate(

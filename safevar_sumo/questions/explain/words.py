@@ -24,7 +24,7 @@ from safevar_sumo.questions.words import (
     number_of,
     share_in_words,
 )
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.study import Study
 
 BEYOND = 256
@@ -82,7 +82,7 @@ def verdict_on_failures(
 
 
 def _beyond_in_words(
-    evaluator: Evaluator, unsafe: Unsafe, cause: dict[str, float], encounter: dict[str, float]
+    evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
 ) -> str:
     """The share of vehicles beyond all values of a cause, all else as in the original, that are
     unsafe, in a sentence; empty if there are none, or too few may be simulated.

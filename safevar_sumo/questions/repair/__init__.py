@@ -10,7 +10,7 @@ driving system is the change of no parameter.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -40,7 +40,7 @@ from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parame
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import bound_in_words, encounter_in_words, join_phrases
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
 
@@ -254,7 +254,7 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     return rows[problem.holds(rows)]
 
 
-def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
+def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[NamedValues]:
     """What no driving system can survive: the minimal causes of failures of full braking, shrunk to
     the limit; for each characteristic of a cause the value from which on even full braking at once
     fails.
@@ -265,7 +265,7 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     unsafe = problem.unsafe
     evenly_spaced = np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)
     causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
-    parts: dict[tuple[object, ...], dict[str, float]] = {}
+    parts: dict[tuple[object, ...], NamedValues] = {}
     for limits, cause in zip(find_cause_limits(driver, causes, unsafe), causes, strict=True):
         # Of equal causes in many encounters only the first counts.
         kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
@@ -278,7 +278,7 @@ def _answer_of(
     models: Models,
     survivors: Survivors,
     worst_today: Evaluations,
-    not_repairable: list[dict[str, float]],
+    not_repairable: list[NamedValues],
 ) -> Answer:
     """The answer from the changes that survive, each with its proof: today's parameters alone if
     they do.
@@ -334,7 +334,7 @@ def _verdict(
     *,
     worst: float,
     repairs: list[JsonObject],
-    not_repairable: list[dict[str, float]],
+    not_repairable: list[NamedValues],
 ) -> str:
     """Whether a repair is necessary, the smallest that was found and its price, and what no driving
     system survives.
@@ -458,7 +458,7 @@ def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, 
     )
 
 
-def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
+def _limits_in_words(problem: RepairProblem, part: NamedValues) -> str:
     """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its
     encounter.
     """

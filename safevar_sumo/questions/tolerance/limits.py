@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tables import Column, Columns, Frames, Rows, tabulate
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.rows import (
@@ -48,7 +48,7 @@ from safevar_sumo.questions.tolerance.wider import (
 )
 from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles.region import REJECTIONS
 
@@ -130,9 +130,7 @@ class FoundLimits(NamedTuple):
         return all(one.safe is not None for one in self.scans)
 
 
-def phases_of(
-    evaluator: Evaluator, columns: int, budget: int, fits: int | None
-) -> dict[str, float]:
+def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None) -> NamedValues:
     """The phases of progress, each with the number of settings that it usually simulates."""
     study = evaluator.study
     points = len(evaluator.system.points)
@@ -290,12 +288,7 @@ def _numbers(found: FoundLimits) -> JsonObject:
     return {**found.together.numbers, "fits_tried": len(found.models.members)}
 
 
-def _tables(
-    found: FoundLimits,
-    rows: Sequence[tuple[Any, ...]],
-    nearest: Sequence[tuple[Any, ...]],
-    wider: Sequence[tuple[Any, ...]],
-) -> dict[str, pd.DataFrame]:
+def _tables(found: FoundLimits, rows: Rows, nearest: Rows, wider: Rows) -> Frames:
     """The tables of an answer, the limits first; those without rows are left out."""
     scans = found.scans
     # Joint limits lead, without those of the whole domain; else those of each alone.
@@ -378,7 +371,7 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)[[*INTERVALS]]
 
 
-def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
+def _fit_rows(models: Models, together: LimitsTogether) -> Rows:
     """A row of `FITS` for each parameter set."""
     states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
     states |= {model.fit: "left out" for model in models.left_out}
@@ -390,7 +383,7 @@ def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]
     return [(fit, state, corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
 
 
-def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:
+def _lost_points(scans: Sequence[OneAtATimeScan]) -> Rows:
     """A row of `POINTS` for each characteristic."""
     return [
         (

@@ -5,7 +5,7 @@ safe side.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases
@@ -88,7 +88,7 @@ class LimitRows(NamedTuple):
     Nothing is said of limits around an unsafe original.
     """
 
-    rows: list[tuple[Any, ...]]
+    rows: Rows
     broken: list[str]
 
 
@@ -143,7 +143,7 @@ def limit_rows(
     return LimitRows(rows, broken)
 
 
-def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
+def uncertainty_rows(alone: Sequence[AloneLimit]) -> Rows:
     """A row of `UNCERTAINTY` for each characteristic whose limit alone is closer than in the
     scan.
     """
@@ -168,7 +168,7 @@ def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None
     )
 
 
-def _outside(alone: AloneLimit, specified: Ends) -> tuple[float, float]:
+def _outside(alone: AloneLimit, specified: Ends) -> Interval:
     """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end
     that is.
     """

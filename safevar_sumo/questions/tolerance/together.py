@@ -13,7 +13,7 @@ from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.sampling import Interval, Stream
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import BoxSearch
@@ -101,7 +101,7 @@ class LimitsTogether(NamedTuple):
     beyond: Mapping[tuple[int, int], FloatArray] = {}
 
     @property
-    def least(self) -> tuple[float, float]:
+    def least(self) -> Interval:
         """The least that the falsification found [m]: over all parameter sets, and with the study's
         own; undefined without one.
         """

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
@@ -17,7 +16,7 @@ from safevar_sumo.questions.models import Model, Models, judges_of, limit_criter
 from safevar_sumo.questions.reach import falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.tolerance.up_to import study_up_to
@@ -82,7 +81,7 @@ def usual_settings(evaluator: Evaluator, budget: int, sets: int) -> float:
     return number * len(there) / len(evaluator.system.points)
 
 
-def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any, ...]]:
+def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
     """The row of `WIDER` for a study that names a wider one: an attack on the limits together in
     the wider scope, or without such limits on the specified ones.
     """

@@ -5,7 +5,6 @@ which scope.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS
@@ -13,6 +12,7 @@ from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tables import Rows
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
@@ -26,8 +26,8 @@ def verdict_sentences(
     together: LimitsTogether | None,
     asked: Asked,
     broken: Sequence[str],
-    nearest: Sequence[tuple[Any, ...]],
-    wider: Sequence[tuple[Any, ...]],
+    nearest: Rows,
+    wider: Rows,
     refusal: str,
 ) -> Iterator[str]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
@@ -95,7 +95,7 @@ def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
         yield f"The specified limits hold in {kept} parameter sets of the vehicle, not in {fits}."
 
 
-def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
+def _nearest_in_words(nearest: Rows) -> Iterator[str]:
     """Which values would hold in place of the specified limits."""
     would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
     if would_do:
