@@ -34,8 +34,7 @@ QUESTIONS = {
 @pytest.mark.parametrize("command", QUESTIONS)
 def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command: str) -> None:
     words = f"{command} {QUESTIONS[command]}".split()
-    answers = {run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}
-    assert len(answers) == 1
+    assert len({run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}) == 1
 
 
 @pytest.mark.usefixtures("small", "worker_processes")

@@ -136,8 +136,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             row["together_low"],
             row["together_high"],
         )
-    rng = np.random.default_rng(5)
-    points = rng.random((300, len(members)))
+    points = np.random.default_rng(5).random((300, len(members)))
     points[:100] = np.round(points[:100])
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])
     (test,) = study.matrix.tests

@@ -395,8 +395,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
-    blind = {"model": "aeb", "parameters": {"reach": 0.001}}
-    system = assemble(sv.load_study(name, ads=blind))
+    system = assemble(sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}}))
     benign = replace(system, matrix=tuple(benign_scenes(sv.load_study(name), system)))
     assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
     for result in simulate_all_points(benign, system.characteristics.original[None]):

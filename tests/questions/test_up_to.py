@@ -106,8 +106,7 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
     assert between.numbers["up_to"] == 45
     cut = assemble(study_up_to(ahead, "speed=45"))
     settings = np.tile(cut.characteristics.original, (2, 1))
-    column = cut.characteristics.names.index("brakeTorque")
-    settings[:, column] = least[1], least[0]
+    settings[:, cut.characteristics.names.index("brakeTorque")] = least[1], least[0]
     is_kept = drive_and_score(cut, settings).f_safe >= between.numbers["margin"]
     assert is_kept.tolist() == [True, False]
 

@@ -117,8 +117,7 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     there = data.take(np.arange(24) < 6)._replace(metrics=published)
     here = made_up_evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12)))
     collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
-    loss = fit.loss_of_file(there, here, nearer, collisions)
-    assert loss == pytest.approx(6 * 2 / 6), (
+    assert fit.loss_of_file(there, here, nearer, collisions) == pytest.approx(6 * 2 / 6), (
         "four there and four here, three of them the same: two rows of six differ"
     )
 
@@ -206,9 +205,8 @@ def test_the_sets_are_simulated_one_by_one() -> None:
         for gap in (OWN, OWN - 1, OWN + 1)
     ]
     (band,) = compute_model_spreads(study, setting)
-    degrees = [float(one.f_safe[0]) for one in alone]
     assert (band.lower, band.upper) == pytest.approx(
-        np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6
+        np.quantile([float(one.f_safe[0]) for one in alone], [0.05, 0.95]).tolist(), abs=1e-6
     )
     assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
 
