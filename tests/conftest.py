@@ -19,6 +19,7 @@ from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.protocol.rater import is_rated
+from safevar_sumo.questions import falsify
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
@@ -118,6 +119,12 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     monkeypatch.setattr("safevar_sumo.questions.tolerance.scans.SCAN_VALUES", 21)
     monkeypatch.setattr(import_module("safevar_sumo.questions.risk"), "BASE_POINTS", 64)
+
+
+@pytest.fixture
+def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claims are falsified with the fewest simulations that are enough to print them."""
+    monkeypatch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
 
 
 SLOW_STUDIES = ("wear_idm", "wear_rss")

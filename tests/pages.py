@@ -8,8 +8,9 @@ what the block of code before it prints. A part is `verdict`, all that stands be
 table, or the beginning of a table's title or of a line; a number limits its rows. Without parts
 the block has everything.
 
-`<!-- in tests: --runs 1 -->` above a block of commands: it takes long. Tests add these options,
-and do not compare its output. `<!-- exit code 3 -->`: the commands end with it.
+`<!-- in tests: --runs 1 -->` above a block of commands: it takes long. Tests add these options, if
+any, search for counterexamples with the fewest simulations, and do not compare its output. `<!--
+exit code 3 -->`: the commands end with it.
 """
 
 from __future__ import annotations
@@ -29,9 +30,11 @@ from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
+import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
+from safevar_sumo.questions import falsify
 from tests.manual import PROGRAM, ROOT, Block, blocks
 
 PAGES = [
@@ -110,12 +113,15 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
                 exec(compile(block.text, page, "exec"), names)
             printed, is_shortened = out.getvalue(), False
         elif block.language == "bash":
-            added = block.comment.partition("in tests: ")[2]
             code = int(block.comment.partition("exit code ")[2][:1] or 0)
-            is_shortened = bool(added)
+            is_shortened = block.comment.startswith("in tests")
             is_shown = below is not None and below.comment.startswith("output")
-            extra = f" {added}" if options_of_tests or not is_shown else ""
-            printed = "".join(_run(line, extra, code) for line in block.text.splitlines())
+            added = ""
+            with pytest.MonkeyPatch.context() as patch:
+                if is_shortened and (options_of_tests or not is_shown):
+                    patch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
+                    added = block.comment.removeprefix("in tests").replace(":", "", 1)
+                printed = "".join(_run(line, added, code) for line in block.text.splitlines())
         else:
             assert block.language in ("text", "bibtex"), (
                 f"{page}: a block of {block.language!r} that nothing runs"

@@ -62,8 +62,7 @@ class Machine:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         subprocess.run([sys.executable, "-m", "venv", folder / "env"], check=True)
-        checkout = ["git", "clone", "--quiet", ROOT, folder / "checkout"]
-        subprocess.run(checkout, check=True)
+        subprocess.run(["git", "clone", "--quiet", ROOT, folder / "checkout"], check=True)
 
     def run(self, line: str, place: str, codes: Sequence[int] = (0,)) -> str:
         """Run a line of a shell in a directory; returns what it prints.

@@ -59,9 +59,8 @@ def script_of_docs(name: str) -> Any:
 
 def test_every_picture_has_its_command_and_its_page() -> None:
     texts = "".join((ROOT / page).read_text() for page in PAGES)
-    names = {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
     assert (
-        names
+        {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
         == script_of_docs("pictures").COMMANDS.keys()
         == set(re.findall(r"pictures/([\w.]+)\)", texts))
     )
@@ -177,8 +176,7 @@ def test_the_page_on_results_lists_every_key_that_may_change() -> None:
     (listed,) = re.findall(
         r"You may change these keys at any time[^:]*: (.*?)\. ", page, flags=re.DOTALL
     )
-    keys = re.findall(r"`\[*(\w+)\]*`", listed)
-    assert sorted(keys) == sorted(
+    assert sorted(re.findall(r"`\[*(\w+)\]*`", listed)) == sorted(
         key
         for record in (Study, CharacteristicTable, SearchTable)
         for key in keys_with(WITHOUT_EFFECT, record)

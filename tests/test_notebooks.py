@@ -47,8 +47,7 @@ def test_a_notebook_needs_only_the_public_names(name: str) -> None:
 
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
-    file = NOTEBOOKS / f"{name}.ipynb"
-    notebook = nbformat.read(file, as_version=4)
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     nbformat.validate(notebook)
     assert _shown(notebook) == SHOWN[name]
 
@@ -74,8 +73,7 @@ def test_a_notebook_shows_its_tables_and_pictures(
     """With a smaller study than the one that its stored outputs come from."""
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
-    notebook = _executed(name, place, timeout=240)
-    assert _shown(notebook) == SHOWN[name]
+    assert _shown(_executed(name, place, timeout=240)) == SHOWN[name]
 
 
 @pytest.mark.slow

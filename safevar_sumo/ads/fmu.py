@@ -16,7 +16,7 @@ import numpy as np
 from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
 from safevar_sumo.errors import InputError, check_name, missing_extra, unknown_name
 from safevar_sumo.plugins import UserCode
-from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.records import NamedValues, Nominal, Observation
 from safevar_sumo.study.schema import ModelTable
 
 NOMINAL = "nominal_"
@@ -195,7 +195,7 @@ class FmuAds(ScalarAds):
         self._trim = self._trim or trim_at(self.nominal, seen)
         return self.pedals(outputs["acceleration"], seen.speed, self._trim)
 
-    def _step(self, values: Mapping[str, float]) -> dict[str, float]:
+    def _step(self, values: Mapping[str, float]) -> NamedValues:
         """Advance the instance with observed values; returns its outputs."""
         slave = self._slave
         time = self._calls * self.step

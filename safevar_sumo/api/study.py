@@ -9,7 +9,7 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from shlex import quote
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -39,6 +39,7 @@ from safevar_sumo.questions.research_questions.answer import (
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
 from safevar_sumo.questions.subject import Results, load
+from safevar_sumo.questions.tables import Rows
 from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
@@ -229,7 +230,7 @@ def _found(
             "a smaller scenario.margin, or original values of scenario.search with which the"
             " original vehicle is safe, as questions demand"
         )
-    changes = list[tuple[Any, ...]]()
+    changes: Rows = []
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         following = ""
     if breach := _breach_of_original(case):
@@ -326,7 +327,7 @@ def _breach_of_original(case: Case) -> str:
     return f"The original vehicle itself {case.unsafe.breach_in_words(original)}"
 
 
-def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, list[tuple[Any, ...]]]:
+def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]:
     """How many solutions of a case of the results are unsafe, and how few changes are enough; and
     the rows of `CHANGES` of a vehicle with these.
     """

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import default_rng
 
 from safevar_sumo.ads import PerVehicleAds
 from safevar_sumo.campaign.evaluation import (
@@ -229,7 +230,7 @@ def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]
     rows = rows[np.unique(solutions.settings[rows], axis=0, return_index=True)[1]]
 
     # Others after them, of all runs.
-    rng = np.random.default_rng(study.search.seed)
+    rng = default_rng(study.search.seed)
     drawn = Evaluations.concatenate([run.sample for run in runs])
     drawn = drawn.take(rng.permutation(len(drawn)))
     unsafe = solutions.take(rng.permutation(rows)[:UNSAFE_REPEATED])
@@ -333,7 +334,7 @@ def _random_settings(study: Study, *shape: int) -> FloatArray:
     """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
     region = region_of(study)
     characteristics = region.characteristics
-    rng = np.random.default_rng(study.search.seed)
+    rng = default_rng(study.search.seed)
 
     def draw(count: int) -> FloatArray:
         return rng.uniform(

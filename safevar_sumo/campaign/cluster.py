@@ -58,7 +58,7 @@ class ClusterWorker:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         # Dask's own serialization turns records into lists
-        return self._executor.submit(_carry_out, pickle.dumps((function, arguments)))  # type: ignore[no-any-return]
+        return self._executor.submit(_carry_out, pickle.dumps((function, arguments)))
 
     def cause_of_death(self, error: BaseException) -> str:
         from distributed import KilledWorker

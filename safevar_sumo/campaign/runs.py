@@ -9,6 +9,7 @@ import zlib
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from safevar_sumo.errors import InputError, about, unknown_name
 from safevar_sumo.metrics import METRICS, Scoring
@@ -147,12 +148,12 @@ def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
     )
 
 
-def random_generator_of(study: Study, key: RunKey) -> np.random.Generator:
+def random_generator_of(study: Study, key: RunKey) -> Generator:
     """The random generator of a run, independent of those of other runs."""
     sequence = np.random.SeedSequence(
         study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run)
     )
-    return np.random.Generator(np.random.PCG64(sequence))
+    return Generator(np.random.PCG64(sequence))
 
 
 class Run:
@@ -221,9 +222,7 @@ class Run:
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)
-        return np.asarray(
-            self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
-        )
+        return self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
 
     def receive(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of missing settings."""
@@ -244,7 +243,7 @@ class Run:
             evaluations=Evaluations.concatenate([known, evaluations]),
         )
 
-    def finish(self, rng: np.random.Generator) -> RunResult:
+    def finish(self, rng: Generator) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""
         if not self.is_finished:
             rows = [self._row_of[setting.tobytes()] for setting in self.solutions.settings]

@@ -10,12 +10,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.plugins.contract import user_errors
-from safevar_sumo.records import FloatArray, ResultColumns, differences
+from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import is_recorded
@@ -39,7 +39,7 @@ MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget, and largest population, of an algorithm's runs."""
-_Rows = npt.NDArray[np.intp]
+_Rows = IntArray
 
 
 class FailedCheck(NamedTuple):
@@ -196,9 +196,9 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
         np.where(is_odd, lower, upper),
         np.where(is_odd, upper, lower),
     ]
-    return np.concatenate(
-        [corners, np.random.default_rng(0).uniform(lower, upper, (count, len(lower)))]
-    )[:count]
+    return np.concatenate([corners, default_rng(0).uniform(lower, upper, (count, len(lower)))])[
+        :count
+    ]
 
 
 def _system(study: Study) -> System:
@@ -238,7 +238,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
         with user_errors(study.source):  # of a method that is no generator
-            search = algorithm.search(problem, np.random.default_rng(seed))
+            search = algorithm.search(problem, default_rng(seed))
         settings = []
         try:
             settings.append(next(search))

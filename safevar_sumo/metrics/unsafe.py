@@ -185,13 +185,13 @@ class Unsafe:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
         every bound.
         """
-        return np.asarray(self._holds(evaluations.outcome, evaluations.column))
+        return self._holds(evaluations.outcome, evaluations.column)
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
         """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
         unsafe.
         """
-        return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
+        return self._holds(solutions["outcome"], solutions.__getitem__)
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
         if self.points is not None:

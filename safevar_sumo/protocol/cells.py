@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, NamedValues
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study.schema import Parameters
 
@@ -223,8 +223,8 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
 
     calculator_version: str
     colours: dict[str, str]
-    starts_by_vut_speed: dict[str, dict[str, float]]
-    starts_by_measure: dict[str, dict[str, float]]
+    starts_by_vut_speed: dict[str, NamedValues]
+    starts_by_measure: dict[str, NamedValues]
     points_by_test: dict[str, tuple[float, float, float]]
     matrices: tuple[CellMatrix, ...]
     layers: tuple[Layer, ...]
@@ -317,7 +317,7 @@ class Protocol(Struct, frozen=True, eq=False, forbid_unknown_fields=True, dict=T
         return [layer for layer in self.layers if layer.test_name == test]
 
     @property
-    def points_not_simulated(self) -> dict[str, float]:
+    def points_not_simulated(self) -> NamedValues:
         """Points of tests that this package cannot simulate, by test."""
         return {
             test: sum(points)

@@ -78,6 +78,12 @@ setting collides, else half of the original's safety degree; of a rated study, a
 """
 CARS_FILE = "FILE.csv"
 """A list of cars: its path, or in the library also a DataFrame or a mapping."""
+LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']
+"""Limits of characteristics."""
+ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
+"""Values of characteristics."""
+Fits = Annotated[int | None, Range(0, 1000)]
+"""A number of parameter sets; None for all."""
 PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
@@ -321,9 +327,9 @@ class Question:
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
-                evaluator.measure = unsafe.bound.measure if unsafe.bound else ""
-                if evaluator.measure:
-                    evaluator.check_measured(evaluator.measure)
+                if unsafe.bound:
+                    account.measure = unsafe.bound.measure
+                    evaluator.check_measured(account.measure)
 
             # The question's own function.
             with user_errors(self.name):
@@ -342,9 +348,8 @@ class Question:
             rough = f"Rough answer (--simulations {account.most}):"
         if self.has_rough_answer:
             numbers["rough"] = bool(rough or numbers.get("rough"))
-        verdict = " ".join(
-            filter(None, (reason, rough, answer.verdict, cites, _undefined_in_words(evaluator)))
-        )
+        sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
+        verdict = " ".join(filter(None, sentences))
         following = self._following(subjects[0], evaluator, called) or answer.next
         return replace(answer, verdict=verdict, numbers=numbers, next=following)
 
@@ -510,18 +515,6 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     choices = get_args(hint) if get_origin(hint) is Literal else ()
     return Option(
         parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
-    )
-
-
-def _undefined_in_words(evaluator: Evaluator) -> str:
-    """How often the metric of the criterion was undefined, in a sentence; empty if it never was."""
-    undefined = sum(count for count, _ in evaluator.undefined)
-    total = sum(number for _, number in evaluator.undefined)
-    of_all = f"{undefined:,} of {total:,} simulated settings, which count as safe"
-    return (
-        f"Remark: {evaluator.measure} is undefined, without a collision, in {of_all}."
-        if undefined
-        else ""
     )
 
 

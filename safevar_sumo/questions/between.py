@@ -86,7 +86,7 @@ class MovingTest:
 
     def spread(self, vehicles: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Vehicles, shape (K, n), each at `PLACES` random places, shape (K PLACES, n + axes)."""
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         settings = np.zeros((PLACES * len(vehicles), len(members)))
         settings[:, : vehicles.shape[1]] = np.repeat(vehicles, PLACES, axis=0)
         places = rng.random((len(settings), len(self.axes)))

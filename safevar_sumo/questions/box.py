@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator, default_rng
 
 from safevar_sumo.questions.sampling import CONFIDENCE, Stream, sobol_points
 from safevar_sumo.records import BoolArray, FloatArray
@@ -31,6 +32,16 @@ class Box:
     lower: FloatArray
     upper: FloatArray
 
+    def end(self, side: int, column: int) -> float:
+        """An end of a column: 0, the lower one, or 1, the upper one."""
+        return float((self.lower, self.upper)[side][column])
+
+    def with_end(self, side: int, column: int, value: float) -> Box:
+        """The box with another value of an end."""
+        ends = [self.lower.copy(), self.upper.copy()]
+        ends[side][column] = value
+        return Box(self.region, *ends)
+
     def at(self, points: FloatArray) -> FloatArray:
         """The settings at points of the unit cube, shape (M, n)."""
         return self.lower + points * (self.upper - self.lower)
@@ -40,19 +51,19 @@ class Box:
         is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
         return is_within & self.region.feasible(settings)
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+    def draw(self, number: int, rng: Generator) -> FloatArray:
         """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
         return self.region.draw_feasible(
             lambda count: self.at(rng.random((count, len(self.lower)))), number
         )
 
-    def with_ends(self, number: int, rng: np.random.Generator) -> FloatArray:
+    def with_ends(self, number: int, rng: Generator) -> FloatArray:
         """Random settings with half of their values at ends, shape (number, n); fewer where not all
         are feasible.
         """
         points = rng.random((number, len(self.lower)))
         settings = self.at(np.where(rng.random(points.shape) < 0.5, np.round(points), points))
-        return np.asarray(settings[self.region.feasible(settings)])
+        return settings[self.region.feasible(settings)]
 
     def spread_and_corners(self, number: int, seed: int) -> FloatArray:
         """Settings at Sobol points, and at as many corners, where all changes of the vehicle add
@@ -72,7 +83,7 @@ class Box:
         of_vehicle = self.region.characteristics.of_vehicle
         is_open = self.lower < self.upper
         worn = np.flatnonzero(of_vehicle & is_open)
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         size = len(worn)
         numbers = (
             np.arange(2**size)

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,7 +17,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues, Outcome
 from safevar_sumo.results import FailedSetting, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
@@ -24,6 +25,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 NSGA2 = "nsga2"
 """The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
+OF_ALGORITHMS = ("titles", "stop_by_themselves")
+"""What a manifest says of algorithms."""
 ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
@@ -63,11 +66,11 @@ class Case:
 
     name: str
     study: Study
-    original: Mapping[str, float]
+    original: NamedValues
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
     finished_runs: tuple[tuple[str, int], ...]
-    has_runs: bool
+    has_runs: bool = True
     failures: tuple[FailedSetting, ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
@@ -287,21 +290,18 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 if "scoring" in manifest
                 else PUBLISHED_SCORING
             )
-            has_runs = "imported" not in manifest
-            case = build_case(
-                study,
-                manifest["original"],
-                solutions,
-                evaluations,
-                finished,
-                has_runs,
-                failures,
-                scoring,
-            )
-            stop_by_themselves = manifest.get("stop_by_themselves", case.stop_by_themselves)
+            stated = {name: manifest[name] for name in OF_ALGORITHMS if name in manifest}
             cases.append(
-                replace(
-                    case, titles=manifest.get("titles", {}), stop_by_themselves=stop_by_themselves
+                build_case(
+                    study,
+                    manifest["original"],
+                    solutions,
+                    evaluations,
+                    finished,
+                    scoring=scoring,
+                    has_runs="imported" not in manifest,
+                    failures=tuple(failures),
+                    **stated,
                 )
             )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
@@ -325,9 +325,8 @@ def build_case(
     solutions: pd.DataFrame,
     evaluations: pd.DataFrame,
     finished: Sequence[tuple[str, int]],
-    has_runs: bool = True,
-    failures: Sequence[FailedSetting] = (),
     scoring: Scoring = PUBLISHED_SCORING,
+    **others: Any,
 ) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     # Columns that all cases of the study have.
@@ -351,7 +350,6 @@ def build_case(
         solutions=solutions,
         evaluations=evaluations,
         finished_runs=tuple(finished),
-        has_runs=has_runs,
-        failures=tuple(failures),
         scoring=scoring,
+        **others,
     )

@@ -42,7 +42,7 @@ NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
 SCENARIO: Columns = DESCRIBED | {"search": "what [scenario.search] may vary, and its widest domain"}
 STUDIES: Columns = NAME | {
-    key: Column("", f"its {key}") for key in ("title", "vehicle", "ads", "scenario", "weather")
+    key: f"its {key}" for key in ("title", "vehicle", "ads", "scenario", "weather")
 }
 DOMAINS: Columns = {
     "unit": "its unit",

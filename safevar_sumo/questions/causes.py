@@ -8,7 +8,7 @@ inferred: all subsets are simulated, size by size, except those that contain a c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from itertools import combinations, islice, pairwise, takewhile
 from math import comb
@@ -23,7 +23,7 @@ from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -44,10 +44,10 @@ class Cause(NamedTuple):
     the scenario, in a study that searches them.
     """
 
-    changes: dict[str, float]
+    changes: NamedValues
     outcome: str
     safety_degree: float
-    encounter: dict[str, float]
+    encounter: NamedValues
 
 
 def find_minimal_causes(
@@ -72,7 +72,7 @@ def find_minimal_causes(
 
     # Subsets by size, those of all settings together, without those that contain a cause.
     expected = sum(_subset_counts([*map(len, changed)], complete))
-    with evaluator.stage(SUBSETS, expected):
+    with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
             subsets = (
                 (row, list(columns))
@@ -124,7 +124,7 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), OTHER_SETS))
     # The first setting of a group, with all changes, is the only unsafe one.
-    return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
+    return is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
 
 
 def _subset_counts(numbers: Sequence[int], most: int | None = None) -> list[int]:
@@ -145,7 +145,7 @@ def select_affordable_rows(
     costs = np.array(_subset_counts(changes), dtype=float)
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
-    order = np.random.default_rng(evaluator.study.search.seed).permutation(len(settings))
+    order = np.random.default_rng(evaluator.seed).permutation(len(settings))
     return sorted(order[np.cumsum(costs[order]) <= max_evaluations].tolist())
 
 
@@ -205,7 +205,7 @@ def count_needed(
     )
 
 
-def directions(characteristics: CharacteristicSet, changes: Mapping[str, float]) -> tuple[str, ...]:
+def directions(characteristics: CharacteristicSet, changes: NamedValues) -> tuple[str, ...]:
     """The directions of changes, without their sizes, such as ('mass up', 'tireFric down')."""
     return tuple(
         f"{item.name} {'up' if changes[item.name] > item.original else 'down'}"
@@ -332,8 +332,8 @@ class Limits(NamedTuple):
         What lies just below the factor.
     """
 
-    boundary: dict[str, float]
-    single_boundary: dict[str, float]
+    boundary: NamedValues
+    single_boundary: NamedValues
     fraction: float
     end: BoundaryState
 
@@ -368,7 +368,7 @@ def find_cause_limits(
     number = len(starts) * settings_of_line(PARTS)
     is_coarse = evaluator.left is not None and evaluator.left < 2 * number
     parts = COARSE_PARTS if is_coarse else PARTS
-    with evaluator.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
+    with evaluator.phases.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
         shares, limits, states = _first_unsafe_shares(
             evaluator, starts, ends, unsafe, thresholds.max(axis=1), parts
         )

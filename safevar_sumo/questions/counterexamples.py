@@ -6,25 +6,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.words import EXACT, join_phrases
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
 from safevar_sumo.study import PHASE, unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
 """Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is
@@ -66,7 +64,7 @@ def describe(
     for further in FURTHER_DIGITS:
         if not waiting:
             break
-        members = model.evaluator.characteristics
+        members = model.characteristics
         rows = np.array(
             [
                 as_printed(members, setting, further, within, only.get(name, ""))
@@ -80,12 +78,12 @@ def describe(
 
 
 def values_as_printed(
-    model: Model, vehicles: Sequence[Mapping[str, float]], only: Sequence[str] = ()
-) -> list[dict[str, float]]:
+    model: Model, vehicles: Sequence[NamedValues], only: Sequence[str] = ()
+) -> list[NamedValues]:
     """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
     are where it prints none, and but for one characteristic of each if `only` names them.
     """
-    members = model.evaluator.characteristics
+    members = model.characteristics
     settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
     printed = describe(model, settings, only=dict(zip(settings, only, strict=False)))
     settings |= {name: failure.setting for name, failure in printed.items()}
@@ -149,7 +147,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
     points = model.evaluator.system.points
     points = tuple(points[number] for number in model.points) or points
-    members = model.evaluator.characteristics
+    members = model.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
     fit = f" (parameter set {model.fit})" if model.fit else ""
@@ -197,7 +195,7 @@ def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[st
 
 
 def where_in_words(
-    points: Sequence[Point], point: Point, scenario: Scenario, values: Mapping[str, float]
+    points: Sequence[Point], point: Point, scenario: Scenario, values: NamedValues
 ) -> str:
     """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`,
     from one of the points of a matrix, the values of searched parameters, and the scenario with

@@ -4,8 +4,8 @@ domain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 
@@ -32,7 +32,7 @@ from safevar_sumo.questions.price import (
 )
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.records import CellResults, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.measuring import criterion_of
 from safevar_sumo.sumo.system import System, assemble
@@ -60,11 +60,7 @@ class Evaluator:
     simulated
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     account
-        The simulations that the question may do.
-    measure, undefined
-        The metric of the question's criterion, if it has one; for each call, also of evaluators of
-        other studies, the number of settings without a collision that have no such value, and of
-        all.
+        What the question may simulate and has simulated, with evaluators of other studies, too.
     """
 
     def __init__(
@@ -73,18 +69,22 @@ class Evaluator:
         pool: Pool,
         progress: Progress = show_no_progress,
         verified: int = VERIFIED_SETTINGS,
+        account: Account | None = None,
     ) -> None:
         self.study = study
         with about(study.source):
             self.region = region_of(study)
         self.characteristics = self.region.characteristics
         self._pool = pool
-        self.phases = Phases(progress)
         self._verified = verified
         self.simulated = 0
-        self.account = Account()
-        self.measure = ""
-        self.undefined = list[tuple[int, int]]()
+        self.account = account or Account(Phases(progress))
+        self.phases = self.account.phases
+
+    @property
+    def seed(self) -> int:
+        """The study's seed."""
+        return self.study.search.seed
 
     @cached_property
     def system(self) -> System:
@@ -117,7 +117,7 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, settings: Mapping[str, float], least: int = 1) -> None:
+    def plan(self, settings: NamedValues, least: int = 1) -> None:
         """Plan the phases of a question, each with the number of settings that it is expected to
         simulate; below the `least` number there is no answer.
         """
@@ -148,14 +148,6 @@ class Evaluator:
     def _each(self) -> int:
         return simulations_of_setting(self.system)
 
-    def stage(
-        self, name: str, total: float | None = None
-    ) -> AbstractContextManager[Callable[[float], None]]:
-        """Show all that is evaluated within the context, by evaluators of other studies, too, as
-        one phase, as `Phases.stage` says.
-        """
-        return self.phases.stage(name, total)
-
     def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters
         of the ADS.
@@ -185,13 +177,11 @@ class Evaluator:
             begin=self._compile,
         )
         self.simulated += total
-        if self.measure:
-            is_undefined = (
-                np.isnan(evaluations.column(self.measure))
-                & evaluations.valid
-                & ~evaluations.collided
-            )
-            self.undefined.append((int(np.count_nonzero(is_undefined)), len(evaluations)))
+        if measure := self.account.measure:
+            is_safe = evaluations.valid & ~evaluations.collided
+            is_undefined = np.isnan(evaluations.column(measure)) & is_safe
+            self.account.undefined += int(np.count_nonzero(is_undefined))
+            self.account.judged += len(evaluations)
         if selection != EVERYTHING:
             return evaluations
         return self._without_unsafe_originals(evaluations)
@@ -396,14 +386,8 @@ class Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in
         SUMO, too.
         """
-        other = Evaluator(
-            study, self._pool, verified=self._verified if verified is None else verified
-        )
-        other.phases = self.phases
-        other.measure = self.measure
-        other.undefined = self.undefined
-        other.account = self.account
-        return other
+        verified = self._verified if verified is None else verified
+        return Evaluator(study, self._pool, verified=verified, account=self.account)
 
 
 @contextmanager

@@ -8,16 +8,15 @@ from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.questions.box import Box
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, IntArray
 
 LEAST_SIMULATIONS = 1000
 """Fewest simulations that search for a counterexample before a value is printed as one that holds.
 """
 USUAL_BUDGET = 5000
-"""Simulations that search for a counterexample to a claim, unless an option says otherwise."""
+"""Simulations that search for a counterexample to a claim."""
 GENERATION, PARENTS = 512, 32
 """Settings of a generation; the worst ones so far, which are its parents."""
 STEP, PULL = 0.1, 0.5
@@ -33,7 +32,6 @@ Judge = Callable[[FloatArray], FloatArray]
 """What each of M settings leaves to the limit in a model, shape (M,): below 0 it is unsafe;
 infinite where it does not count.
 """
-Rows = npt.NDArray[np.intp]
 
 
 class Falsification(NamedTuple):
@@ -49,7 +47,7 @@ class Falsification(NamedTuple):
     """
 
     settings: FloatArray
-    judges: Rows
+    judges: IntArray
     robustness: FloatArray
     simulated: int
 
@@ -63,11 +61,9 @@ class Falsification(NamedTuple):
         }
 
 
-def enough(budget: int) -> int:
-    """The number of simulations with which a value that is printed is tested; 0 leaves the
-    falsification out.
-    """
-    return max(budget, LEAST_SIMULATIONS) if budget else 0
+def budget_of(*, quick: bool) -> int:
+    """Simulations that search for a counterexample to a claim, few for a rough answer."""
+    return LEAST_SIMULATIONS if quick else USUAL_BUDGET
 
 
 def falsify(
@@ -144,7 +140,7 @@ class _Generation(NamedTuple):
     """Settings, shape (M, n), and the numbers of the judges that they are to meet."""
 
     settings: FloatArray
-    judges: Rows
+    judges: IntArray
 
 
 def _steps(
@@ -192,7 +188,7 @@ def _steps(
     return found
 
 
-def _pair(least: FloatArray, generation: int) -> Rows:
+def _pair(least: FloatArray, generation: int) -> IntArray:
     """The judges of a generation: that with the least left, and another one in turn."""
     first, *others = np.argsort(least, kind="stable").tolist()
     second = others[(generation - 1) % len(others)] if others else first
@@ -202,12 +198,12 @@ def _pair(least: FloatArray, generation: int) -> Rows:
 def _new_ones(
     box: Box,
     settings: FloatArray,
-    numbers: Rows,
-    choice: Rows,
+    numbers: IntArray,
+    choice: IntArray,
     size: int,
     seen: set[tuple[int, bytes]],
     rng: np.random.Generator,
-) -> tuple[FloatArray, Rows]:
+) -> tuple[FloatArray, IntArray]:
     """Up to `size` settings of the box that their judges have not met; random ones where there are
     too few.
     """
@@ -228,7 +224,7 @@ def _new_ones(
 
 
 def _worst(
-    found: Falsification, settings: FloatArray, numbers: Rows, robustness: FloatArray
+    found: Falsification, settings: FloatArray, numbers: IntArray, robustness: FloatArray
 ) -> Falsification:
     """The falsification after a generation, with the worst settings that count, and all unsafe
     ones.
@@ -268,4 +264,4 @@ def _children(box: Box, found: Falsification, number: int, rng: np.random.Genera
         + DIFFERENCE * (parents[third] - parents[fourth])
     )
     is_moved = (np.arange(number) % 2 == 1)[:, np.newaxis]
-    return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))
+    return np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper)

@@ -12,6 +12,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import WRITABLE, whole_file
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import JsonObject
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ differ in a print without colours too.
 
 
 def new_figure(
-    title: str, rows: int, columns: int, size: tuple[float, float], **options: Any
+    title: str, rows: int, columns: int, size: Interval, **options: Any
 ) -> tuple[Figure, np.ndarray]:
     """A figure, which pyplot does not know, and its axes, shape (rows, columns).
 
@@ -57,7 +58,7 @@ def new_panels(
     title: str,
     number: int,
     max_columns: int,
-    panel_size: tuple[float, float],
+    panel_size: Interval,
     min_width: float,
     title_height: float,
 ) -> tuple[Figure, list[Axes]]:

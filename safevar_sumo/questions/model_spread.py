@@ -4,14 +4,14 @@ published data equally well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
+from safevar_sumo.records import Evaluations, FloatArray, NamedValues, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
 from safevar_sumo.sumo.matrix import at_point, drive_and_score
@@ -99,7 +99,7 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
     changes = (settings - characteristics.original) / (
         characteristics.upper - characteristics.lower
     )
-    return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
+    return np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE)
 
 
 def prediction_band(
@@ -183,7 +183,7 @@ def remarks_on_sets(study: Study) -> list[str]:
     ]
 
 
-def with_values(study: Study, values: Mapping[str, float]) -> Study:
+def with_values(study: Study, values: NamedValues) -> Study:
     """A study with other values of some parameters, which are named by their keys in the study
     file.
 

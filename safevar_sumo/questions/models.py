@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -22,9 +23,7 @@ from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import Study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
+from safevar_sumo.vehicles import CharacteristicSet
 
 SEARCHED_MARGIN = 0.1
 """Distance to keep in a study that searches its scenario [m]: where the original keeps just its
@@ -56,6 +55,11 @@ class Model(NamedTuple):
     at_worst_phase: bool = False
 
     @property
+    def characteristics(self) -> CharacteristicSet:
+        """Those of its study."""
+        return self.evaluator.characteristics
+
+    @property
     def numbers_of_points(self) -> Sequence[int]:
         """Numbers of the points that count."""
         return self.points or range(len(self.evaluator.system.points))
@@ -70,7 +74,7 @@ class Model(NamedTuple):
         evaluator = self.evaluator.in_phases
         if evaluator is None or self.unsafe.is_of_points:
             return None
-        is_searched = len(self.evaluator.characteristics.scenario) > 0
+        is_searched = len(self.characteristics.scenario) > 0
         points = self.points if is_searched else tuple(self.numbers_of_points)
         return self._replace(evaluator=evaluator, points=points, at_worst_phase=False)
 
@@ -97,7 +101,7 @@ class Model(NamedTuple):
         )
         failing = np.flatnonzero(robustness < 0)
         if self.new_car is not None and len(failing):
-            members = self.evaluator.characteristics
+            members = self.characteristics
             originals = self.evaluate(members.with_original_vehicle(settings[failing]), stage)
             counts = originals.valid & ~self.new_car.of(originals)
             robustness[failing[~counts]] = np.inf
@@ -115,7 +119,7 @@ class Model(NamedTuple):
         """The model at the points of the study's matrix at which settings are worst; without a
         matrix, and in a study that searches its scenario, as it is.
         """
-        if len(self.evaluator.characteristics.scenario):
+        if len(self.characteristics.scenario):
             return self
         worst = self.evaluate(settings, stage).worst_points
         if worst is None:
@@ -164,15 +168,22 @@ def limit_criterion(
     margin [m], which is by default that of the study; `SEARCHED_MARGIN` in one that searches its
     scenario, whose originals keep more.
     """
-    study = evaluator.study
     is_distance = unsafe is None and margin is not None
     criterion = evaluator.choose_criterion(COLLISION if is_distance else unsafe, subject, original)
+    return keeping_distance(evaluator, criterion, margin, is_stated=unsafe is not None)
+
+
+def keeping_distance(
+    evaluator: Evaluator, criterion: Unsafe, margin: float | None, *, is_stated: bool
+) -> Unsafe:
+    """A criterion of an evaluator's study, with the distance to keep from a collision; one that is
+    stated without a margin stands alone.
+    """
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
-    # A collision that is asked for stands alone.
-    if not criterion.is_collision or (margin is None and unsafe is not None):
+    if not criterion.is_collision or (margin is None and is_stated):
         return criterion
-    return replace(criterion, keep=distance_to_keep(study, margin))
+    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:

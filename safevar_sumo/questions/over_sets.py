@@ -12,6 +12,7 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import models_of
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.words import percentage
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
@@ -70,7 +71,7 @@ class SharesOverSets(NamedTuple):
         """The share of all vehicles, by the number of the set; `own` is that of the study's own."""
         return [own, *self.others[:, 0].tolist()]
 
-    def ends(self, group: int, own: float) -> tuple[float, float]:
+    def ends(self, group: int, own: float) -> Interval:
         """The least and the greatest share of a group."""
         shares = [own, *self.others[:, group]]
         return float(np.fmin.reduce(shares)), float(np.fmax.reduce(shares))

@@ -102,7 +102,7 @@ def _ways(model: Model, settings: FloatArray) -> FloatArray:
     values = system.characteristics.scenario.columns(system.cut(settings)[1])
     points = (encounter(system.points[number], values) for number in model.numbers_of_points)
     speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
-    return np.asarray(system.step * np.maximum.reduce(speeds))
+    return system.step * np.maximum.reduce(speeds)
 
 
 def at_worst_phases(
@@ -121,7 +121,7 @@ def remark_on_phases(claim: Model | None) -> str:
     """
     if claim is None:
         return AT_ONE_PHASE
-    rows = np.repeat(claim.evaluator.characteristics.original_settings, 2, axis=0)
+    rows = np.repeat(claim.characteristics.original_settings, 2, axis=0)
     rows[1, -1] = 1.0
     at_begin, at_end = claim.robustness(rows, "phases of the original")
     return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS

@@ -102,7 +102,7 @@ def assess_sample(
     drawn with the study's seed.
     """
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
-    shuffled = np.random.default_rng(evaluator.study.search.seed).permutation(distinct)
+    shuffled = np.random.default_rng(evaluator.seed).permutation(distinct)
     sample = shuffled[: max(max_simulations // len(TITLES), 1)]
     return assess_collisions(evaluator, collisions.take(sample)), len(distinct)
 

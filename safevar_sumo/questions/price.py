@@ -13,6 +13,7 @@ from rich.console import Console
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.progress import Phases
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
@@ -34,6 +35,8 @@ class Account:
 
     Attributes
     ----------
+    phases
+        Their progress.
     asked
         The largest number that the user allows; None if he says nothing.
     is_question
@@ -42,17 +45,31 @@ class Account:
         The largest number of simulations; None if there is none.
     spent
         Simulations so far.
+    measure, undefined, judged
+        The metric of the question's criterion, if it has one; the numbers of settings without a
+        collision that have no such value, and of all.
     """
 
+    phases: Phases
     asked: int | None = None
     is_question: bool = False
     most: int | None = None
     spent: int = 0
+    measure: str = ""
+    undefined: int = 0
+    judged: int = 0
 
     @property
     def left(self) -> float:
         """Simulations that may follow."""
         return float("inf") if self.most is None else self.most - self.spent
+
+    @property
+    def undefined_in_words(self) -> str:
+        """How often the metric was undefined, in a sentence; empty if it never was."""
+        of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
+        remark = f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+        return remark if self.undefined else ""
 
     def spend(self, simulations: int) -> None:
         """Count simulations that begin.

@@ -19,12 +19,12 @@ from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import ValueTexts, question
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
 from safevar_sumo.questions.words import join_phrases
-from safevar_sumo.records import CellResults, FloatArray
+from safevar_sumo.records import CellResults, FloatArray, NamedValues
 from safevar_sumo.results import SolutionId, row_of_handle
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import MatrixTable, Study
@@ -99,7 +99,7 @@ def rating(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
+    set: ValueTexts = (),
     solution: Annotated[str | None, "ALG:RUN:N"] = None,
 ) -> Answer:
     """Rate the crash avoidance (frontal collisions) of a vehicle and of a worn variant of it as
@@ -297,7 +297,7 @@ def _cells(
     )
 
 
-def _changes(study: Study, setting: FloatArray) -> dict[str, float]:
+def _changes(study: Study, setting: FloatArray) -> NamedValues:
     characteristics = CharacteristicSet.of(study)
     pairs = zip(characteristics, setting.tolist(), strict=True)
     return {item.name: value for item, value in pairs if value != item.original}

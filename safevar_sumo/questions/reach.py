@@ -32,13 +32,12 @@ End = tuple[int, int]
 
 
 class Reach(NamedTuple):
-    """The furthest value that holds, None if none does; the falsification that found nothing up to
-    it; and all unsafe settings that were found beyond it, with the numbers of their judges.
+    """The furthest value that holds, None if none does; and all unsafe settings that were found
+    beyond it, with the numbers of their judges.
     """
 
-    value: float | None = None
-    falsification: Falsification | None = None
-    failures: Sequence[tuple[int, FloatArray]] = ()
+    value: float | None
+    failures: Sequence[tuple[int, FloatArray]]
 
 
 def falsify_limits(
@@ -55,9 +54,8 @@ def falsify_limits(
     at_ends = box.with_ends(POINTS, rng)
     settings = np.concatenate([spread, at_ends])
     if end is not None:
-        side, column = end
         just_within = np.concatenate([spread[POINTS:], at_ends])
-        just_within[:, column] = (box.lower, box.upper)[side][column]
+        just_within[:, end[1]] = box.end(*end)
         settings = np.concatenate([settings, just_within])
     settings = np.unique(settings, axis=0)
     known = [settings] * len(judges)
@@ -81,7 +79,7 @@ def reach(
     """
     side, column = end
     item = box.region.characteristics.members[column]
-    value = float((box.lower, box.upper)[side][column])
+    value = box.end(*end)
     failures = list[tuple[int, FloatArray]]()
     new = dict(known or {})
     for number in range(MAX_STEPS):
@@ -96,7 +94,7 @@ def reach(
                 failures.append((judge, failure[np.newaxis]))
                 value = rounded_towards(start, last, item)
         # The failures within the limits with this value: first with the judges that failed last.
-        limits = _with_end(box, end, value)
+        limits = box.with_end(*end, value)
         stream = (*seed, number + 1)
         first = sorted(new)
         new = {}
@@ -108,22 +106,14 @@ def reach(
             found = falsify_limits(limits, judges, budget, stream, end)
             new = found.failures
         if not new:
-            return Reach(value, found, failures)
+            return Reach(value, failures)
         if value == start:
             break
-    return Reach(None, None, [*failures, *new.items()])
+    return Reach(None, [*failures, *new.items()])
 
 
 def _are_unsafe(judge: Judge, settings: FloatArray) -> BoolArray:
     return judge(settings) < 0
-
-
-def _with_end(box: Box, end: End, value: float) -> Box:
-    """A box with another value of one of its ends."""
-    side, column = end
-    ends = [box.lower.copy(), box.upper.copy()]
-    ends[side][column] = value
-    return Box(box.region, *ends)
 
 
 def rounded_towards(start: float, value: float, item: Characteristic) -> float:
@@ -143,8 +133,8 @@ def nearest_limits(
     """Rows of name, unit, specified value and the nearest one at which the specified limits hold in
     all models, the others as specified; None where they do not hold even with the original's value.
     """
-    members = models.own.evaluator.characteristics
-    seed = models.own.evaluator.study.search.seed
+    members = models.own.characteristics
+    seed = models.own.evaluator.seed
     judges = judges_of(models.members, NEAREST_STAGE)
     # The specified limits in all encounters, all other characteristics as in the original.
     ends = [members.with_original_vehicle(last) for last in (members.lower, members.upper)]

@@ -17,6 +17,7 @@ from rich.console import Console
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
+    Frames,
     csv_cell,
     html_table,
     latex_notes,
@@ -74,7 +75,7 @@ class Screen(NamedTuple):
     unsaid: int
     lead: pd.DataFrame
     notes: list[str]
-    others: dict[str, pd.DataFrame]
+    others: Frames
 
 
 def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
@@ -240,7 +241,7 @@ def _details_in_words(answer: Answer) -> Iterator[str]:
     yield from filter(None, (_tested_in_words(answer), " ".join(sentences)))
 
 
-def _shown_tables(answer: Answer) -> dict[str, pd.DataFrame]:
+def _shown_tables(answer: Answer) -> Frames:
     """The tables of all details, by name; without remarks on others, and without a table of no
     remark.
     """
@@ -256,7 +257,7 @@ def _shown_tables(answer: Answer) -> dict[str, pd.DataFrame]:
     }
 
 
-def _short_tables(answer: Answer) -> dict[str, pd.DataFrame]:
+def _short_tables(answer: Answer) -> Frames:
     return {name: frame for name, frame in _shown_tables(answer).items() if len(frame) <= MAX_ROWS}
 
 

@@ -14,11 +14,11 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import combinations, combinations_with_replacement, compress
-from typing import TYPE_CHECKING
 from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
+from numpy.random import default_rng
 from scipy.stats import norm, zscore
 
 from safevar_sumo.errors import SimulationError
@@ -34,18 +34,23 @@ from safevar_sumo.questions.answer import (
     with_interval,
 )
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, JsonObject
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    IntArray,
+    JsonObject,
+    NamedValues,
+)
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 SAMPLING, SENSITIVITY = "sampling vehicles", "sensitivity analysis"
 """Phases of progress."""
@@ -132,11 +137,11 @@ def risk(
     model = VariationModel(study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
-    planned = {SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block}
+    planned: NamedValues = {SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block}
     evaluator.plan(planned, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = model.draw(samples, np.random.default_rng(study.search.seed))
+    vehicles = model.draw(samples, default_rng(study.search.seed))
     drawn = evaluator.evaluate(vehicles, SAMPLING)
 
     # How many are unsafe.
@@ -278,7 +283,7 @@ def _design(evaluator: Evaluator, model: VariationModel) -> Evaluations:
     """Saltelli's design, in which each characteristic varies alone and with all others."""
     from SALib.sample import sobol as design
 
-    seed = evaluator.study.search.seed % 2**32
+    seed = evaluator.seed % 2**32
     points = design.sample(_problem(evaluator), BASE_POINTS, calc_second_order=False, seed=seed)
     return evaluator.evaluate(model.settings(points), SENSITIVITY)
 
@@ -291,7 +296,7 @@ def regression_indices(
     than `LEAST_EXPLAINED` of the variance of vehicles that were left out.
     """
     names = list(evaluator.characteristics.names)
-    rng = np.random.default_rng(evaluator.study.search.seed)
+    rng = default_rng(evaluator.seed)
     others = VariationModel(evaluator.study).draw(REGRESSED, rng)
     inputs = np.nan_to_num(zscore(np.vstack([evaluations.settings, others])))
 
@@ -348,7 +353,7 @@ def sobol_indices(
 
     problem = _problem(evaluator)
     names = problem["names"]
-    seed = evaluator.study.search.seed % 2**32
+    seed = evaluator.seed % 2**32
     block = len(names) + 2
     is_complete = np.repeat(evaluations.valid.reshape(-1, block).all(axis=1), block)
 
@@ -383,7 +388,7 @@ def given_data_indices(
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:
-        seed = evaluator.study.search.seed % 2**32
+        seed = evaluator.seed % 2**32
         with (
             warnings.catch_warnings(),
             patch.object(warnings, "formatwarning"),

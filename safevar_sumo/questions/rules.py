@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,6 +18,7 @@ import pandas as pd
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.price import LEAST_SETTINGS
@@ -27,9 +28,6 @@ from safevar_sumo.questions.words import join_phrases, percentage, with_scope
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 SAMPLED_STAGE = "vehicles sampled over the whole domain"
 """The phase of progress."""
@@ -329,4 +327,4 @@ def _drop_useless_conditions(
 
 def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
     """Whether each of M settings lies within a box; shape (M,)."""
-    return np.asarray(((settings >= box[0]) & (settings <= box[1])).all(axis=1))
+    return ((settings >= box[0]) & (settings <= box[1])).all(axis=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
-import numpy as np
+from numpy.random import Generator, default_rng
 
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
@@ -38,9 +38,9 @@ class Stream(IntEnum):
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
     PERMIT = 18  # falsification of the speed up to which a car may drive
 
-    def generator(self, seed: int, *counts: int) -> np.random.Generator:
+    def generator(self, seed: int, *counts: int) -> Generator:
         """The generator of a draw, by the seed of the study's search and what counts the draws."""
-        return np.random.default_rng((seed, self, *counts))
+        return default_rng((seed, self, *counts))
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
@@ -49,9 +49,9 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """
     import scipy  # takes longer to load than a simulation
 
-    sequence = scipy.stats.qmc.Sobol(dimensions, rng=np.random.default_rng(seed))
+    sequence = scipy.stats.qmc.Sobol(dimensions, rng=default_rng(seed))
     exponent = max(0, math.ceil(math.log2(number)))
-    return np.asarray(sequence.random_base2(exponent)[:number])
+    return sequence.random_base2(exponent)[:number]
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:

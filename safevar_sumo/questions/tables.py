@@ -59,6 +59,10 @@ class Column(NamedTuple):
 
 Columns = dict[str, Column | str]
 """Columns by name; a text is the meaning of one without a unit."""
+Rows = Sequence[tuple[Any, ...]]
+"""The rows of a table."""
+Frames = dict[str, pd.DataFrame]
+"""Tables by name."""
 
 
 class Wide(NamedTuple):

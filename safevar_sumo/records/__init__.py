@@ -20,6 +20,7 @@ from safevar_sumo.records.driving import (
     FloatArray as FloatArray,
     IntArray as IntArray,
     JsonObject as JsonObject,
+    NamedValues as NamedValues,
     Nominal as Nominal,
     Observation as Observation,
     Outcome as Outcome,

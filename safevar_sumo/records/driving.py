@@ -20,6 +20,8 @@ Quantity = Any
 """A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N
 encounters.
 """
+NamedValues = dict[str, float]
+"""Values by name, such as those of characteristics."""
 JsonObject = dict[str, Any]
 """An object of JSON, or a table of TOML: plain values by key."""
 
@@ -208,7 +210,7 @@ class Trace:
     @property
     def last_active(self) -> IntArray:
         """The last active sample of each of N vehicles, shape (N,)."""
-        return np.asarray(len(self.time) - 1 - np.argmax(self.active[::-1], axis=0))
+        return len(self.time) - 1 - np.argmax(self.active[::-1], axis=0)
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
@@ -278,7 +280,7 @@ class SimulationRuns:
         trace = self.trace
         has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
         has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
-        return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
+        return trace.active & self.encounter.in_conflict & ~has_stopped
 
     @cached_property
     def time_to_collision(self) -> FloatArray:
@@ -381,6 +383,4 @@ class SimulationRuns:
 
         # Otherwise the speed at the end of the step.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
-        return np.asarray(
-            np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
-        )
+        return np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)

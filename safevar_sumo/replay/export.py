@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import EnvironmentFault, InputError, about
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.questions.ask import PointName
-from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject
+from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject, NamedValues
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
 from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.replay.simulate import load_target
@@ -192,7 +192,7 @@ def converted(network: NetworkFiles) -> str:
     )
 
 
-def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
     """The values of CARLA's physics and of each wheel, by attribute.
 
     Raises
@@ -224,7 +224,7 @@ def carla_physics(setting: Mapping[str, float]) -> dict[str, dict[str, float]]:
 
 
 def carla_scene(
-    comparison: Comparison, physics: Mapping[str, Mapping[str, float]], handle: str
+    comparison: Comparison, physics: Mapping[str, NamedValues], handle: str
 ) -> JsonObject:
     """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings
     counter-clockwise) and pedals.
@@ -315,11 +315,7 @@ def export(
 
 
 def write_files(
-    comparison: Comparison,
-    to: str,
-    out: Path,
-    handle: str,
-    physics: Mapping[str, Mapping[str, float]],
+    comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, NamedValues]
 ) -> None:
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
     "openscenario".

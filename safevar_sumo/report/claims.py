@@ -31,7 +31,6 @@ from safevar_sumo.questions.ask import has_criterion, with_criterion
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
-from safevar_sumo.questions.tables import Column
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
@@ -76,11 +75,11 @@ CONTEXT, SHOWN = 40, 200
 
 
 CLAIMS = {
-    "study": Column("", "study of the pack"),
-    "claim": Column("", "what the pack holds"),
-    "verdict": Column("", f"{SAME}, {DIFFERS} or {CANNOT}"),
-    "packed": Column("", "value in the pack, if it differs"),
-    "here": Column("", "value here, or the reason why there is none"),
+    "study": "study of the pack",
+    "claim": "what the pack holds",
+    "verdict": f"{SAME}, {DIFFERS} or {CANNOT}",
+    "packed": "value in the pack, if it differs",
+    "here": "value here, or the reason why there is none",
 }
 
 

@@ -27,7 +27,7 @@ from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.words import change_texts, counted_in_words, number_of, question_command
-from safevar_sumo.records import FloatArray, JsonObject, Outcome
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
@@ -342,7 +342,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         settings[handle] = setting
 
     # Causes that answers name, each set of changed characteristics once.
-    changes: dict[tuple[str, ...], tuple[Mapping[str, float], Mapping[str, float]]] = {}
+    changes: dict[tuple[str, ...], tuple[NamedValues, NamedValues]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
             for row, encounter in zip(

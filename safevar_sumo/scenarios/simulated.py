@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.scenarios.base import Scenario
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -104,7 +104,7 @@ def _checked_metrics(
 
 def _numbers(
     code: UserCode, method: str, values: Mapping[str, Any], legal: Mapping[str, Legal]
-) -> dict[str, float]:
+) -> NamedValues:
     return {
         name: float(code.check_numbers(method, name, value, (), legal[name]))
         for name, value in values.items()

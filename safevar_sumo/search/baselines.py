@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.random import Generator
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Scoring
 from safevar_sumo.metrics.base import F_SAFE
@@ -21,7 +22,7 @@ class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_
     evaluations.
     """
 
-    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+    def search(self, problem: Problem, rng: Generator) -> Search:
         settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
         archive = problem.original.take([])
         for start in range(0, len(settings), problem.population):
@@ -65,7 +66,7 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     generations_without_improvement: PositiveCount = 5
     safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = 6.0
 
-    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+    def search(self, problem: Problem, rng: Generator) -> Search:
         # Random settings, generation by generation.
         ranges = Ranges(problem)
         generations = []
@@ -107,7 +108,7 @@ class Ranges:
         self.upper = problem.characteristics.upper.copy()
         self.max_changes = len(problem.characteristics.vehicle)
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
+    def draw(self, number: int, rng: Generator) -> FloatArray:
         """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to
         `max_changes`, in an encounter drawn uniformly.
         """
@@ -115,7 +116,7 @@ class Ranges:
             np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
         )
 
-    def _draw_feasible_setting(self, rng: np.random.Generator) -> FloatArray:
+    def _draw_feasible_setting(self, rng: Generator) -> FloatArray:
         """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the
         original until it is feasible.
         """
@@ -123,9 +124,9 @@ class Ranges:
             setting = self._draw_setting(rng)
             if self._problem.feasible(setting[np.newaxis])[0]:
                 return setting
-        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
+        return self._problem.repaired(setting[np.newaxis])[0]
 
-    def _draw_setting(self, rng: np.random.Generator) -> FloatArray:
+    def _draw_setting(self, rng: Generator) -> FloatArray:
         setting = self._characteristics.original.copy()
         count = len(self._characteristics.vehicle)
         for i in rng.choice(
@@ -136,7 +137,7 @@ class Ranges:
             setting[i] = self._draw_value(i, rng)
         return setting
 
-    def _draw_value(self, i: int, rng: np.random.Generator) -> float:
+    def _draw_value(self, i: int, rng: Generator) -> float:
         """A value of characteristic `i`, drawn uniformly from the values in its range that the
         filter keeps.
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
+from numpy.random import Generator, default_rng
 
 from safevar_sumo.errors import InputError, check_name, describe_error, missing_extra
 from safevar_sumo.records import Evaluations, FloatArray
@@ -101,7 +102,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
 
     name: ClassVar[str]
 
-    def search(self, problem: Problem, rng: np.random.Generator) -> Search:
+    def search(self, problem: Problem, rng: Generator) -> Search:
         randomness = _Randomness(self.name, rng)
 
         # What is left of the budget, and all that was evaluated.
@@ -150,7 +151,7 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         if size is not UNSET and size > problem.evaluations:
             legal = f"at most the {problem.evaluations} evaluations of a run"
             raise InputError(self.name, f"pop_size = {size}", legal)
-        with _Randomness(self.name, np.random.default_rng(0)):
+        with _Randomness(self.name, default_rng(0)):
             self.begin(problem, 0)
 
     def begin(self, problem: Problem, seed: int) -> Any:
@@ -229,15 +230,15 @@ class _Randomness:
     pymoo and pycma draw from numpy's global state, and from generators without a seed, too.
     """
 
-    def __init__(self, name: str, rng: np.random.Generator) -> None:
+    def __init__(self, name: str, rng: Generator) -> None:
         self._name = name
         self._unseeded = rng.spawn(1)[0]
         self.seed = int(rng.integers(2**31))
         self._inside = np.random.RandomState(self.seed).get_state()
 
-    def default_rng(self, seed: int | None) -> np.random.Generator:
+    def default_rng(self, seed: int | None) -> Generator:
         """What pymoo takes for numpy's function."""
-        return self._unseeded if seed is None else np.random.default_rng(seed)
+        return self._unseeded if seed is None else default_rng(seed)
 
     def __enter__(self) -> None:
         import pymoo.util
@@ -276,7 +277,7 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
     algorithm: Any = msgspec.defstruct(
         label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace
     )
-    return algorithm  # type: ignore[no-any-return]
+    return algorithm
 
 
 def _class_of(name: str) -> Any:

@@ -17,6 +17,7 @@ from safevar_sumo.study.marks import WITHOUT_EFFECT, Table
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 ShortText = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
+LongText = Annotated[str, Meta(max_length=400)]
 MAX_MAGNITUDE = 1e12
 """Largest magnitude of a characteristic."""
 
@@ -54,14 +55,13 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
-    """One row of the characteristics table; f_diff multiplies its change by `weight`.
+    """One row of the characteristics table.
 
     `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
     measures it, or, if `workshop` is false, who else does; `remedy` says what to do with a vehicle
     beyond its limit.
     """
 
-    weight: PositiveNumber = 1.0
     counterpart: ShortText = ""
     workshop: Annotated[bool, WITHOUT_EFFECT] = True
     measurement: ShortText = ""
@@ -200,7 +200,7 @@ class Constraint(Table, frozen=True, kw_only=True):
     at_least: float | None = None
     at_most: float | None = None
     unit: str | None = None
-    meaning: Annotated[str, Meta(max_length=400)] = ""
+    meaning: LongText = ""
 
     def __post_init__(self) -> None:
         if 0 in self.sum.values():
@@ -284,7 +284,7 @@ class Limit(Table, frozen=True, kw_only=True):
 
     at_least: float | None = None
     at_most: float | None = None
-    source: Annotated[str, Meta(max_length=400)] = ""
+    source: LongText = ""
 
     def __post_init__(self) -> None:
         check_bounds(self.at_least, self.at_most)
@@ -302,7 +302,7 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
     """
 
     value: float
-    source: Annotated[str, Meta(max_length=400)] = ""
+    source: LongText = ""
 
 
 def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:

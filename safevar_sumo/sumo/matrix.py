@@ -10,7 +10,6 @@ from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, check_text
@@ -19,6 +18,7 @@ from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import (
     Evaluations,
     FloatArray,
+    IntArray,
     JsonObject,
     Outcome,
     SimulationRuns,
@@ -170,7 +170,7 @@ def drive_and_score(
 
 def _beside(
     system: System, settings: FloatArray, originals: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+) -> tuple[FloatArray, IntArray, IntArray]:
     """Settings and the original vehicle in the encounter of each, both of shape (N, n), in one
     array; the rows of each setting and of its original in it.
     """
@@ -196,8 +196,7 @@ def evaluate_matrix(
     # Every point once, in groups.
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
-        for group in simulate_groups(system, settings, engine)
-        for result in group
+        for result in simulate_points(system, settings, engine)
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
 
@@ -272,18 +271,14 @@ def simulate_all_points(
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the
     errors of `drive_all`.
     """
-    by_name = {
-        result.point.name: result
-        for group in simulate_groups(system, settings, engine)
-        for result in group
-    }
+    by_name = {result.point.name: result for result in simulate_points(system, settings, engine)}
     return [by_name[point.name] for point in system.points]
 
 
-def simulate_groups(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
-) -> Iterator[list[PointResult]]:
-    """Yield the results of settings at every point, in groups of points that share a simulation."""
+def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Iterator[PointResult]:
+    """Yield the results of settings at every point, group by group of points that share a
+    simulation.
+    """
     n = len(settings)
 
     # Points with tracks drive together.
@@ -294,14 +289,9 @@ def simulate_groups(
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        yield [
-            PointResult(
-                point,
-                evaluations.take(np.arange(start, start + n)),
-                runs.of(slice(start, start + n)),
-            )
-            for point, start in zip(points, range(0, len(points) * n, n), strict=True)
-        ]
+        for point, start in zip(points, range(0, len(points) * n, n), strict=True):
+            rows = slice(start, start + n)
+            yield PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(rows))
 
 
 def worst_point(system: System, setting: FloatArray) -> Point:
@@ -368,7 +358,7 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
             yield tuple(group[start : start + size])
 
 
-def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArray[np.intp]:
+def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     """The number of each setting's worst point; `at_points` are the evaluations of the settings at
     all points.
 
@@ -397,4 +387,4 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> npt.NDArra
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf
-    return np.asarray(order[np.argmin(values, axis=0)])
+    return order[np.argmin(values, axis=0)]

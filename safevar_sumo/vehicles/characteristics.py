@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.records import BoolArray, FloatArray, Quantity
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
@@ -35,11 +35,11 @@ class Characteristic:
     """One characteristic of the vehicle under test, or a searched parameter of the scenario
     (`is_scenario`); all quantities are in `unit`.
 
-    A change counts `weight` times in f_diff. `meaning` describes the quantity, `counterpart` names
-    the part of a real vehicle that determines it, `measurement` says how a workshop measures it or,
-    unless `workshop`, who else does, and `remedy` what to do beyond a limit; all of them may be
-    empty. `short_name` is its name in sentences: by default the meaning up to the first comma or
-    bracket, such as `engine drag`, or the name if the study gives no meaning.
+    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines
+    it, `measurement` says how a workshop measures it or, unless `workshop`, who else does, and
+    `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in
+    sentences: by default the meaning up to the first comma or bracket, such as `engine drag`, or
+    the name if the study gives no meaning.
     """
 
     name: str
@@ -47,7 +47,6 @@ class Characteristic:
     original: float
     lower: float
     upper: float
-    weight: float = 1.0
     meaning: str = ""
     short_name: str = ""
     counterpart: str = ""
@@ -265,10 +264,6 @@ class CharacteristicSet:
     def threshold(self) -> FloatArray:
         return self._column("threshold")
 
-    @cached_property
-    def weight(self) -> FloatArray:
-        return self._column("weight")
-
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
         values = np.array(
@@ -277,7 +272,7 @@ class CharacteristicSet:
         values.flags.writeable = False
         return values
 
-    def named(self, setting: FloatArray) -> dict[str, float]:
+    def named(self, setting: FloatArray) -> NamedValues:
         """The values of a setting, shape (n,), by name."""
         return dict(zip(self.names, setting.tolist(), strict=True))
 
@@ -293,7 +288,7 @@ class CharacteristicSet:
 
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
-        return np.asarray(filtered != self.original)
+        return filtered != self.original
 
     def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
         """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
@@ -304,16 +299,15 @@ class CharacteristicSet:
         }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i w_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'', weights w
-        (method section 3, where w = 1), of the vehicle's characteristics; the domain's width stands
-        for an original of 0.
+        """f_diff = max_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'' (method
+        section 3), of the vehicle's characteristics; the domain's width stands for an original
+        of 0.
         """
         vehicle = self.vehicle
         scale = np.where(
             vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
         )
-        change = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
-        return np.asarray(np.max(vehicle.weight * change, axis=1))
+        return np.max(np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale, axis=1)
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method

@@ -271,8 +271,7 @@ def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_plac
         brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0
     )
     short = max(-0.4 - lateral, 0.0)
-    past = max(lateral + 0.4, 0.0)
-    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * past)
+    limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * max(lateral + 0.4, 0.0))
     assume(abs(gap - limit) > 1e-9)
     now = seen(1.0, speed, gap, lateral, 0.9)
     command, memory = ads.drive(now, ads.start(1, KNOWN, STEP))
@@ -353,12 +352,11 @@ def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     ramp = deceleration / jerk
     while_ramp = speed * ramp - jerk * ramp**3 / 6
     after = speed - jerk * ramp**2 / 2
-    stop = speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration)
     margins = (
         speed * ads.t_response
         + speed**2 / (2 * ads.a_ego_min)
         + ads.longitudinal_offset_margin
-        - stop
+        - (speed * ads.command_delay + while_ramp + after**2 / (2 * deceleration))
     )
     assert margins == pytest.approx([3.6, -1.3, 4.5, -3.2, 6.1, -8.5], abs=0.06)
     gap = ads.distance(speed, np.zeros(6)) - 1e-9

@@ -66,8 +66,7 @@ def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
         "    def pedals(self, wish):\n        return 0.0, min(-wish, 1.0)\n\n"
         "    def drive(self, seen):\n        return self.pedals(-0.5)\n"
     )
-    study = load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
-    system = assemble(study)
+    system = assemble(load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"}))
     assert drive_and_score(system, original_of(system)).outcome.tolist() == ["stopped"]
 
 

@@ -50,13 +50,12 @@ def mass(
         is_dangerous, hardest = driver(v, u, gap, acceleration)
         return is_dangerous & (gap > 0) & (np.minimum(lateral, at_arrival) <= CORRIDOR), hardest
 
-    beside = (LANE - PATH) / sideways
     return point_mass(
         v,
         gap,
         lambda time: np.maximum(u - braking * np.maximum(time - brakes_at, 0), 0),
         rule,
-        beside,
+        (LANE - PATH) / sideways,
     )
 
 

@@ -67,8 +67,7 @@ def test_ad_rss_brakes_below_the_published_safe_distance(
 def test_ad_rss_holds_its_speed_before_it_brakes_and_releases_the_accelerator_after() -> None:
     driver = AdRss()
     driver.start(KNOWN, 0.05)
-    hold = COASTING / (FULL + COASTING)
-    assert driver.drive(seen(10.0, 200.0)) == pytest.approx((hold, 0.0))
+    assert driver.drive(seen(10.0, 200.0)) == pytest.approx(((COASTING / (FULL + COASTING)), 0.0))
     assert driver.drive(seen(9.0, 200.0)) == pytest.approx(((1 + COASTING) / (FULL + COASTING), 0))
     assert driver.drive(seen(10.0, 5.0, lateral=3.0))[1] == 0, "beside its corridor"
     assert driver.drive(seen(10.0, 5.0)) == (0.0, 1.0)
@@ -144,8 +143,7 @@ def test_numbers_that_its_library_refuses_are_refused_without_its_log(
     """The library logs past Python's stderr."""
     with open("own.toml", "w", encoding="utf-8") as file:
         file.write(f'extends = "wear_rss"\nname = "own"\n[ads.parameters]\n{name} = {value}\n')
-    told = run("simulate", "own.toml", expect=2).stderr
-    first, second = told.strip().splitlines()
+    first, second = run("simulate", "own.toml", expect=2).stderr.strip().splitlines()
     assert first.endswith(f"own.toml: ads.parameters.{name} = {float(value):g}")
     assert second == f"expected: {legal}"
     assert capfd.readouterr().err.count("[error]") == 0

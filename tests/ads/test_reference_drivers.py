@@ -198,8 +198,7 @@ def test_r157_brakes_with_6_at_once_when_the_regulation_says() -> None:
 
 
 def test_rss_brakes_a_reaction_time_after_its_safe_distance() -> None:
-    b = 0.774 * 9.81
-    safe = 12 * 0.75 + (12**2 - 5**2) / (2 * b)
+    safe = 12 * 0.75 + (12**2 - 5**2) / (2 * (0.774 * 9.81))
     assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(safe)
     onset_gap, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
     assert onset_gap == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)

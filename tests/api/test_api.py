@@ -101,15 +101,13 @@ def test_evaluate_is_simulate_row_by_row() -> None:
     one = sv.simulate("sun", {"tireFric": 1.2, "mass": 2500.0})
     for name, value in {**one.metrics, **one.objectives}.items():
         assert frame.loc["a", name] == value
-    names = list(one.setting)
-    again = sv.evaluate("sun", frame[names].to_numpy(), jobs=1)
+    again = sv.evaluate("sun", frame[list(one.setting)].to_numpy(), jobs=1)
     pd.testing.assert_frame_equal(again, frame.reset_index(drop=True))
 
 
 def test_a_value_that_is_missing_is_the_originals() -> None:
     """Mappings name only what is changed; an empty mapping is the original vehicle."""
-    asked = [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}]
-    frame = sv.evaluate("sun", asked, jobs=1)
+    frame = sv.evaluate("sun", [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}], jobs=1)
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
 
@@ -138,8 +136,7 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
         assert vehicle.trace["speed [m/s]"].to_numpy() == pytest.approx(
             comparison.runs.trace.speed[: comparison.moments[row].end + 1, row], abs=0
         )
-    at_point = sv.load_study("wear", matrix={"point": name})
-    alone = sv.simulate(at_point, {"brakeTorque": 0.6})
+    alone = sv.simulate(sv.load_study("wear", matrix={"point": name}), {"brakeTorque": 0.6})
     assert (alone.original.numbers, alone.numbers) == (one.original.numbers, one.numbers)
     pd.testing.assert_frame_equal(alone.trace, one.trace)
 

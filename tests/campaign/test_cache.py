@@ -112,8 +112,7 @@ def test_results_in_the_cells_of_a_rating_are_kept_to_the_bit() -> None:
         evaluate_all(study, some_settings(study, 4), InlinePool(), verified=0),
         cells=CellResults(impact, warning, rng.random((4, 9)) < 0.5),
     )
-    kept = evaluations_in(content_of(evaluations))
-    assert_equal(kept, evaluations)
+    assert_equal(evaluations_in(content_of(evaluations)), evaluations)
 
 
 def test_what_differs_is_simulated(folder: Path, simulated: list[int]) -> None:

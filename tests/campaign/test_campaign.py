@@ -83,8 +83,7 @@ def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: 
     carried_out(study, tmp_path / "out", keys=[RunKey("rs", 1)])
     path = journal_file(tmp_path / "out", "rs-01")
     theirs = path.read_bytes()
-    head = evaluation.msgspec.json.decode(theirs.partition(b"\n")[0])
-    journal = Journal(path, head)
+    journal = Journal(path, evaluation.msgspec.json.decode(theirs.partition(b"\n")[0]))
     with pytest.raises(SafevarError, match=r"rs-01\.jsonl: another process works on this run"):
         carried_out(study, tmp_path / "out")
     journal.close()
@@ -107,8 +106,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(second, tmp_path / "fresh")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
     results = load_runs(tmp_path / "out")
-    fresh = load_runs(tmp_path / "fresh")
-    pd.testing.assert_frame_equal(results.evaluations, fresh.evaluations)
+    pd.testing.assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
     assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 

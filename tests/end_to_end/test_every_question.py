@@ -181,8 +181,7 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
     answered("study kind.toml --out results", must=True)
     few = FEW.format(260 * (4 if study.scenario.search or study.matrix else 1))
     first, row = next(iter(study.vehicle.characteristics.items()))
-    worn = WORN.get(study.vehicle.model, f"{first}={row.lower!r}")
-    values = f"{first}={row.original!r}", worn
+    values = f"{first}={row.original!r}", WORN.get(study.vehicle.model, f"{first}={row.lower!r}")
     questions = () if name == RATED else QUESTIONS
     assert_next_answers(*(answered(each.format("results", *values, few=few)) for each in questions))
     # The usual questions where they take little time: a rating, and none that has an answer.
@@ -196,7 +195,7 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
 def test_the_speed_of_a_packed_sheet_is_that_of_its_own_limits() -> None:
     search = "--algorithms rs --runs 1 --evaluations 50 --out results"
     answered(f"study autoware_july {search}", must=True)
-    limits = "tolerance --quick --attack 0 --at-tests --characteristics brakeTorque"
+    limits = "tolerance --quick --at-tests --characteristics brakeTorque"
     asked = f'--ask "{limits}" --ask "permit --quick --set brakeTorque=0.5 --others new"'
     answered(f"evidence results {asked} --out it.zip", must=True)
     with ZipFile("it.zip") as pack:

@@ -152,8 +152,7 @@ def test_a_temporary_folder_is_removed_once_its_process_was_killed(
     holders[0].wait()
     time.sleep(2 * SETTLING_TIME)
     with open_pool(1):
-        own = {*tmp_path.glob("safevar-*")} - {*folders}
-        assert len(own) == 1
+        assert len({*tmp_path.glob("safevar-*")} - {*folders}) == 1
         assert [folder.exists() for folder in folders] == [False, True]
     holders[1].communicate("", timeout=60)
     assert not [*tmp_path.glob("safevar-*")]

@@ -329,8 +329,7 @@ def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_sec
 
 
 def test_rms_agrees_with_scipys_filters() -> None:
-    rng = np.random.default_rng(1)
-    speed = np.cumsum(rng.normal(size=(200, 3)), axis=0)
+    speed = np.cumsum(np.random.default_rng(1).normal(size=(200, 3)), axis=0)
     high = 2 * np.pi * 0.4
     corner = 2 * np.pi * 2
     first = signal.bilinear(*signal.butter(2, high, "high", analog=True), fs=1 / SAMPLED)

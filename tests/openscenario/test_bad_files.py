@@ -111,8 +111,7 @@ def test_an_event_that_could_not_begin_again_is_played_once(
     events = group(event(speed(5, "linear", "time", 2), trigger(condition, edge=edge)))
     once = events.replace(' maximumExecutionCount="1"', "")
     often = once.replace(f"<{counted} ", f'<{counted} maximumExecutionCount="3" ')
-    remarks = " ".join(staged(tmp_path, events=often).remarks)
-    assert "is played once, of up to 3 times" in remarks
+    assert "is played once, of up to 3 times" in " ".join(staged(tmp_path, events=often).remarks)
 
 
 def line_to(x: float) -> str:

@@ -65,8 +65,7 @@ def test_a_file_that_does_not_play_says_why_and_what_is_expected(tmp_path: Path)
     file = write(tmp_path, car=(teleport(at(-9, 100)), speed(10)))
     output = run("check", file, expect=1)
     assert "road 1 has no lane -9 at s = 100.0 m. Expected: one of -2, -1, 1, 2" in output.stdout
-    answer = json.loads(run("check", file, "--json", expect=1).stdout)
-    (finding,) = rows(answer, "findings")
+    (finding,) = rows(json.loads(run("check", file, "--json", expect=1).stdout), "findings")
     assert finding["expected"] == "one of -2, -1, 1, 2"
 
 

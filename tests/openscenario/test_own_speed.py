@@ -68,8 +68,7 @@ def test_a_speed_that_is_met_at_the_end_of_the_profile_is_known(tmp_path: Path) 
     assert begins(played(tmp_path, step, car=car)) == pytest.approx(1.01)
     stop = trigger(watching("Ego", '<StandStillCondition duration="1"/>'), "")
     slow = event(speed(10, "linear", "time", 20), AT_ONCE.format(3), "Slow")
-    groups = group(slow, actor="Ego") + group(car)
-    file = write(tmp_path, groups=groups, ego=STANDING, stop=stop)
+    file = write(tmp_path, groups=group(slow, actor="Ego") + group(car), ego=STANDING, stop=stop)
     assert play(file, {}).duration == pytest.approx(5)
 
 
@@ -110,8 +109,7 @@ def test_a_master_arrives_when_its_speeds_say(tmp_path: Path) -> None:
         '<FinalSpeed><AbsoluteSpeed value="12"/></FinalSpeed></SynchronizeAction>'
     )
     start = trigger(AT_ONCE.format(1))
-    scene = played(tmp_path, FASTER, car=event(action, start, priority="parallel"))
-    (car,) = scene.others
+    (car,) = played(tmp_path, FASTER, car=event(action, start, priority="parallel")).others
     index = round(8.5 / STEP)
     assert (car.place - 1.5 * car.facing)[index].real == pytest.approx(10 + 200, abs=0.05)
     assert car.speed[index] == pytest.approx(12)
@@ -135,8 +133,7 @@ def test_a_robot_drives_the_profile_and_holds_its_last_speed(
     file = write(tmp_path, groups=group(FASTER, actor="Ego"), ego=STANDING, stop=STOP)
     run = driven(OpenScenario(file), system=system)  # type: ignore[arg-type]
     times, speeds = run.trace.time, run.trace.speed[:, 0]
-    led = times <= 6.0
-    assert np.abs(speeds - 4 * np.clip(times - 1, 0, 5))[led].max() < 1e-6
+    assert np.abs(speeds - 4 * np.clip(times - 1, 0, 5))[(times <= 6.0)].max() < 1e-6
     assert abs(run.test_speed_error[0]) < 1.0 / 3.6
     assert run.outcome[0] in ("passed", "timeout")
 
@@ -149,8 +146,7 @@ def test_the_first_brake_ends_the_profile(tmp_path: Path) -> None:
     waits = when('<TraveledDistanceCondition value="90"/>')
     for car, outcome in (("", "stopped"), (waits, "invalid-test")):
         groups = group(FASTER, actor="Ego") + (group(car) if car else "")
-        scenario = OpenScenario(write(tmp_path, groups=groups, ego=STANDING, stop=STOP))
-        run = driven(scenario, brakes)
+        run = driven(OpenScenario(write(tmp_path, groups=groups, ego=STANDING, stop=STOP)), brakes)
         assert run.trace.speed.max() == pytest.approx(8, abs=0.3)
         assert run.outcome[0] == outcome
     releases = Pedals(lambda seen: (np.where(seen.time < 2, 1.0, 0.0), 0.0))
@@ -162,25 +158,21 @@ def test_the_first_brake_ends_the_profile(tmp_path: Path) -> None:
 def test_the_driving_system_sees_while_the_robot_leads(tmp_path: Path) -> None:
     """A car stands 30 m ahead: the system brakes before Ego is at its test speed."""
     car = teleport(at(-1, 84)), speed(0)
-    groups = group(FASTER, actor="Ego")
-    file = write(tmp_path, groups=groups, ego=STANDING, stop=STOP, car=car)
+    file = write(tmp_path, groups=group(FASTER, actor="Ego"), ego=STANDING, stop=STOP, car=car)
     study = tmp_path / "mine.toml"
     study.write_text(f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\n')
-    text = run("simulate", str(study)).stdout
-    assert "The original vehicle stops" in text
+    assert "The original vehicle stops" in run("simulate", str(study)).stdout
 
 
 @pytest.mark.slow
 def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -> None:
     """Ego accelerates to v in 5 s; a Car stands 200 m ahead. At 6 m/s Ego does not get there."""
-    parameter = '<ParameterDeclaration name="v" parameterType="double" value="15"/>'
-    faster = event(speed("$v", "linear", "time", 5), AT_ONCE.format(1))
     file = write(
         tmp_path,
-        groups=group(faster, actor="Ego"),
+        groups=group(event(speed("$v", "linear", "time", 5), AT_ONCE.format(1)), actor="Ego"),
         ego=STANDING,
         stop=STOP,
-        parameters=parameter,
+        parameters='<ParameterDeclaration name="v" parameterType="double" value="15"/>',
         car=(teleport(at(-1, 250)), speed(0)),
     )
     search = {"v": {"lower": 5.0, "upper": 30.0, "original": 15.0}}
@@ -195,8 +187,7 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
     assert searched.outcome.tolist() == ["invalid-test", "stopped", "stopped", "collision"]
     for value, degree in list(zip(values, searched.f_safe, strict=True))[1:]:
         own = assemble(load_study("wear", scenario={"file": file, "values": {"v": value}}))
-        alone = drive_and_score(own, original_of(own))
-        assert alone.f_safe[0] == pytest.approx(degree, abs=1e-9)
+        assert drive_and_score(own, original_of(own)).f_safe[0] == pytest.approx(degree, abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["AssignRouteAction", "AcquirePositionAction"])

@@ -75,14 +75,11 @@ def test_a_lane_change_has_its_shape_and_the_body_keeps_its_speed(
 ) -> None:
     car = car_of(tmp_path, event(lane_change(-1, shape, "time", 4.0), AT_ONCE.format(1)))
     times, place = times_of(car), origin(car)
-    since = times >= 1
-    left = 20 - 6 + 4 * SHAPES[shape](np.clip((times - 1) / 4, 0, 1)) * since
+    left = 20 - 6 + 4 * SHAPES[shape](np.clip((times - 1) / 4, 0, 1)) * (times >= 1)
     assert np.abs(place.imag - left).max() < 1e-9
     if shape != "step":
-        steps = np.abs(np.diff(place))
-        assert np.abs(steps - 10 * STEP).max() < 1e-9
-        aside = np.gradient(place.imag, STEP)
-        assert np.abs(car.facing.imag - aside / 10)[105:495].max() < 0.01
+        assert np.abs(np.abs(np.diff(place)) - 10 * STEP).max() < 1e-9
+        assert np.abs(car.facing.imag - np.gradient(place.imag, STEP) / 10)[105:495].max() < 0.01
 
 
 @pytest.mark.parametrize(
@@ -195,8 +192,7 @@ VERTICES = (0.0, 100.0, 0.0), (2.0, 106.0, 8.0), (5.0, 118.0, 8.0)
 
 def test_a_trajectory_with_times_and_without(tmp_path: Path) -> None:
     timing = "<Timing domainAbsoluteRelative='relative' scale='2' offset='1'/>"
-    car = car_of(tmp_path, car=(polyline(*VERTICES, timing=timing),))
-    place = origin(car)
+    place = origin(car_of(tmp_path, car=(polyline(*VERTICES, timing=timing),)))
     at_times = {0.5: 100, 1.0: 100, 3.0: 103 + 4j, 5.0: 106 + 8j, 8.0: 112 + 8j, 11.0: 118 + 8j}
     for time, where in at_times.items():
         assert abs(place[round(time / STEP)] - where) < 0.03
@@ -221,8 +217,7 @@ def test_who_leaves_a_trajectory_with_times_keeps_its_speed(tmp_path: Path) -> N
     timing = "<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>"
     change = event(lane_change(-1, "linear", "time", 2), AT_ONCE.format(1))
     car = car_of(tmp_path, change, car=(polyline(*vertices, timing=timing),))
-    steps = np.abs(np.diff(origin(car)))
-    assert np.abs(steps - 6 * STEP).max() < 1e-6
+    assert np.abs(np.abs(np.diff(origin(car))) - 6 * STEP).max() < 1e-6
     assert origin(car)[300:].imag == pytest.approx(18)
 
 
@@ -231,8 +226,7 @@ def test_a_clothoid_has_times(tmp_path: Path) -> None:
     clothoid = f'<Clothoid curvature="0" curvaturePrime="0" length="24" startTime="1" stopTime="4"><Position>{world(100, 14)}</Position></Clothoid>'
     action = polyline(timing="<Timing domainAbsoluteRelative='absolute' scale='1' offset='0'/>")
     action = re.sub("<Polyline>.*</Polyline>", clothoid, action)
-    car = car_of(tmp_path, car=(action,))
-    assert origin(car)[[0, 100, 250, 400]] == pytest.approx(
+    assert origin(car_of(tmp_path, car=(action,)))[[0, 100, 250, 400]] == pytest.approx(
         np.array([100, 100, 112, 124]) + 14j, abs=0.05
     )
     closed = action.replace('closed="false"', 'closed="true"')
@@ -244,8 +238,7 @@ def test_a_distance_is_kept_between_bodies(tmp_path: Path) -> None:
     action = """<LongitudinalAction><LongitudinalDistanceAction entityRef="Ego" freespace="true" distance="30"
     displacement="leadingReferencedEntity" continuous="false"/></LongitudinalAction>"""
     played = staged(tmp_path, car=(action, teleport(at(-1, 500)), speed(20)))
-    car = only(played)
-    assert car.place[0].real - 2.5 - played.start.place.real == pytest.approx(30)
+    assert only(played).place[0].real - 2.5 - played.start.place.real == pytest.approx(30)
 
 
 @pytest.mark.parametrize(
@@ -287,8 +280,7 @@ def test_a_trigger_that_watches_ego(tmp_path: Path, condition: str, when: float)
 )
 def test_edges_and_delays(tmp_path: Path, edge: str, delay: float, when: float) -> None:
     rule = "lessThan' value='5" if edge == "falling" else "greaterOrEqual' value='3"
-    condition = f"<SimulationTimeCondition rule='{rule}'/>"
-    start = trigger(condition, edge=edge, delay=delay)
+    start = trigger(f"<SimulationTimeCondition rule='{rule}'/>", edge=edge, delay=delay)
     car = car_of(tmp_path, event(speed(20, "linear", "rate", 2), start))
     assert np.flatnonzero(car.speed > 10)[0] * STEP == pytest.approx(when, abs=2 * STEP)
 
@@ -474,5 +466,4 @@ def test_who_acquires_a_position_straight_ahead_drives_on(tmp_path: Path) -> Non
     goal = f"<RoutingAction><AcquirePositionAction><Position>{at(-2, 900)}</Position></AcquirePositionAction></RoutingAction>"
     end = trigger(watching("Ego", '<EndOfRoadCondition duration="1"/>'), "")
     found = car_of(tmp_path, car=(goal, teleport(at(-2, 100)), speed(10)), stop=end)
-    without = car_of(tmp_path, stop="")
-    assert np.array_equal(found.place, without.place)
+    assert np.array_equal(found.place, car_of(tmp_path, stop="").place)

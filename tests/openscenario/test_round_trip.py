@@ -80,5 +80,4 @@ def test_an_exported_run_is_the_same_from_its_file(
         ), column
     for column in ("collision_speed", "closing_speed"):
         before = getattr(runs, column)
-        found = getattr(again, column)
-        assert found == pytest.approx(before, abs=1e-3, nan_ok=True), column
+        assert getattr(again, column) == pytest.approx(before, abs=1e-3, nan_ok=True), column

@@ -160,8 +160,7 @@ def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Pat
         tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER
     )
     search = {"v": {"lower": 0.0, "upper": 99.0, "original": 3.0}}
-    study = load_study("wear", scenario={"file": file, "search": search})
-    system = assemble(study)
+    system = assemble(load_study("wear", scenario={"file": file, "search": search}))
     members = system.characteristics
     settings = np.tile(members.original, (4, 1))
     settings[:, members.names.index("v")] = 3.0, 50.0, 99.0, 3.0

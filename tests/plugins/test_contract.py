@@ -26,8 +26,7 @@ CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 def throttle(study: Path) -> float:
     system = assemble(load_study(str(study)))
     drive_and_score(system, original_of(system))
-    driver = system.ads.start(1, system.nominal, 0.05)[0]
-    return float(driver.drive(None)[0])
+    return float(system.ads.start(1, system.nominal, 0.05)[0].drive(None)[0])
 
 
 def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder: Path) -> None:

@@ -55,8 +55,6 @@ def test_an_algorithm_whose_runs_do_not_learn_from_each_other_is_not_accused(
 SIX = """
 extends = "cart.toml"
 name = "six"
-[vehicle.characteristics.mass]
-weight = 0.5
 [ads]
 model = "my_ads:Careful"
 parameters = { margin = 4.0 }
@@ -92,7 +90,6 @@ def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
     solutions = load_runs("out").solutions
     assert set(solutions["algorithm"]) == {"nsga2", "Halving"}
     assert np.isfinite(solutions[["jerk", "mean_change"]].to_numpy()).all()
-    assert solutions["f_diff"].max() <= 1 / 2 + 1e-9, "the weight of mass halves its changes"
     tables = json_of("tables", "out")["tables"]
     for question in ("rq1", "rq2"):
         assert "jerk" in {row["metric"] for row in tables[question]["rows"]}

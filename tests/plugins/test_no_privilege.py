@@ -280,7 +280,7 @@ def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
     """But for the simulations that find out whether a user's system drives many vehicles with
     different parameters.
     """
-    monkeypatch.setattr("safevar_sumo.questions.repair.USUAL_BUDGET", 300)
+    monkeypatch.setattr("safevar_sumo.questions.falsify.USUAL_BUDGET", 300)
     monkeypatch.setattr("safevar_sumo.questions.repair.SOBOL_VEHICLES", 32)
     scenario = {"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
     change = {

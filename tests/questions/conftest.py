@@ -155,7 +155,6 @@ def box_of(
     region: Region,
     limits: dict[str, Limit],
     others: Sequence[Region] = (),
-    budget: int = 2000,
     outer: LimitsTogether | None = None,
 ) -> LimitsTogether:
     """The box of a planted region, and of those of further fits, within an outer one."""
@@ -176,7 +175,7 @@ def box_of(
     known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
     nothing = known[:0]
     search = JointSearch(
-        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, budget, outer
+        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, 2000, outer
     )
     search.find(scans, known)
     for model in fits[1:]:

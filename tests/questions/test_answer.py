@@ -94,8 +94,7 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     text = answer.render("text")
     assert len(text.splitlines()) <= MAX_LINES
     assert "constant" not in text
-    left_out = re.search(r"^(\d+) more rows: --details\.$", text, re.MULTILINE)
-    last = 14 - int(left_out[1])
+    last = 14 - int(re.search(r"^(\d+) more rows: --details\.$", text, re.MULTILINE)[1])
     assert f"{last} " in text
     assert f"│ {last + 1} " not in text
     assert "same" in answer.render("text", details=True)
@@ -174,8 +173,7 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     assert "\\noindent" not in latex, "nothing was tested"
     tested = replace(ANSWER, tested="1,228 vehicles; 5 % failed.").render("latex")
     assert "How this was tested: 1,228 vehicles; 5 \\% failed." in tested
-    text = ANSWER.render("csv", "parts")
-    assert pd.read_csv(io.StringIO(text))["length"][0] == 1.234
+    assert pd.read_csv(io.StringIO(ANSWER.render("csv", "parts")))["length"][0] == 1.234
 
 
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:

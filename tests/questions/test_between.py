@@ -106,11 +106,12 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ahead.toml", "rain"])
+@pytest.mark.usefixtures("few_simulations")
 def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
     ahead: Study, name: str
 ) -> None:
     names = "treadDepth,sensorLatency" if name == "ahead.toml" else "tireFric,maxBrakeTorque"
-    options = ("--characteristics", names, "--attack", "1000")
+    options = ("--characteristics", names)
     rows = [
         json_of("tolerance", name, *options, "--fits", fits)["tables"]["limits"]["rows"]
         for fits in (("0", "2", "3") if name == "ahead.toml" else ("0", "2", "6", "12"))
@@ -135,8 +136,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             row["together_low"],
             row["together_high"],
         )
-    rng = np.random.default_rng(5)
-    points = rng.random((300, len(members)))
+    points = np.random.default_rng(5).random((300, len(members)))
     points[:100] = np.round(points[:100])
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])
     (test,) = study.matrix.tests
@@ -150,16 +150,14 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             assert kept[0] < least or kept.min() >= least, (number, result.point.name)
 
 
+@pytest.mark.usefixtures("few_simulations")
 def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(ahead: Study) -> None:
     text = Path("ahead.toml").read_text()
     spread = '[spread]\n"vehicle.parameters.tyre_friction" = [1.079, 0.2]\n'
     Path("slippery.toml").write_text(f"{text}{spread}".replace('"ahead"', '"slippery"'))
     study = load_study("slippery.toml")
     answer = tolerance.compute(
-        study,
-        Evaluator(study, InlinePool(), verified=0),
-        attack=1000,
-        characteristics=("treadDepth",),
+        study, Evaluator(study, InlinePool(), verified=0), characteristics=("treadDepth",)
     )
     assert "With the original vehicle itself the car hits a pedestrian ahead" in answer.verdict
     assert "(parameter set 1): there no limit is claimed." in answer.verdict

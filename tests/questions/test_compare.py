@@ -187,10 +187,11 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_simulations")
 def test_margin_and_rounding_are_those_of_tolerance() -> None:
     smoke, later = load_study("smoke"), load_study("smoke", name="later")
     answer = sv.compare(smoke, later, samples=8, pool=POOL)
-    of_tolerance = sv.tolerance(smoke, characteristics="tireFric", attack=100, pool=POOL)
+    of_tolerance = sv.tolerance(smoke, characteristics="tireFric", pool=POOL)
     ends = answer.tables["limits"].set_index("characteristic").loc["tireFric", ["b_low", "b_high"]]
     alone = of_tolerance.tables["limits"].loc[0, ["alone_low", "alone_high"]]
     assert ends.tolist() == alone.tolist()

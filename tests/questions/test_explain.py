@@ -91,8 +91,7 @@ def test_the_most_frequent_robust_cause_leads(explained: Answer) -> None:
     causes = explained.tables["causes"]
     robust = causes[causes["robust_share"] >= MIN_ROBUST_SHARE]
     column = "robust_share" if robust.empty else "share"
-    leading = (causes if robust.empty else robust)[column].max()
-    assert causes[column].iloc[0] == leading
+    assert causes[column].iloc[0] == (causes if robust.empty else robust)[column].max()
     shares = explained.tables["distinct_causes"]["share"]
     assert causes["share"].isin(shares).all() or len(shares) == MAX_DISTINCT
 
@@ -107,9 +106,8 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
     }
     assert by_reason["fewest changes"]["changed"] == crashes["f_num_diff"].min()
     assert by_reason["most severe"]["safety_degree"] == crashes["safety_degree"].min()
-    distinct = len(crashes[list(case.characteristics.names)].drop_duplicates())
     assert [explained.numbers[name] for name in ("failures", "analysed", "collisions")] == [
-        distinct
+        len(crashes[list(case.characteristics.names)].drop_duplicates())
     ] * 3
     assert explained.numbers["explained"] == len(explained.tables["solutions"]) == 3
 
@@ -144,8 +142,7 @@ def test_every_boundary_is_unsafe_as_it_is_printed(case: Case, explained: Answer
         case.characteristics.setting({name: float(value) for name, value in one.items()})
         for one in typed
     ]
-    system = assemble(case.study)
-    assert case.unsafe.of(drive_and_score(system, np.array(settings))).all()
+    assert case.unsafe.of(drive_and_score(assemble(case.study), np.array(settings))).all()
 
 
 @pytest.mark.slow
@@ -195,9 +192,8 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
         f"Of {numbers['settings']} different solutions of the search,"
         f" {numbers['failures']} collide." in verdict
     )
-    drivers = explained.tables["drivers"].set_index("driver")["avoided"]
     assert (
-        drivers["competent_driver"]
+        explained.tables["drivers"].set_index("driver")["avoided"]["competent_driver"]
         <= numbers["avoidable"]
         == numbers["collisions"] - numbers["unavoidable"]
     )
@@ -225,8 +221,7 @@ def test_all_minimal_unsafe_subsets_and_no_other_whatever_the_outcomes(
     ]
     minimal = [each for each in unsafe if not any(other < each for other in unsafe)]
     (result,) = find_minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
-    found = [set(map("abcde".index, cause.changes)) for cause in result]
-    assert found == minimal
+    assert [set(map("abcde".index, cause.changes)) for cause in result] == minimal
 
 
 def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> None:
@@ -262,8 +257,7 @@ def limits(evaluator: Evaluator, *setting: float) -> Limits:
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
-    evaluator = made_up_evaluator(3, two_islands)
-    result = limits(evaluator, 9.5, 1.0, 8.0)
+    result = limits(made_up_evaluator(3, two_islands), 9.5, 1.0, 8.0)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.boundary["a"] > 6.5 >= result.boundary["a"] - 2 * RESOLUTION * 4.5
     assert result.single_boundary == result.boundary
@@ -362,8 +356,7 @@ def test_needed_and_changed_over_failures() -> None:
     assert sampled[["needed_low", "needed_high"]].tolist() == pytest.approx(ends), (
         "2 of a sample of 3"
     )
-    distinct = count_distinct_causes(members, causes)
-    assert distinct[["cause", "failures"]].to_numpy().tolist() == [
+    assert count_distinct_causes(members, causes)[["cause", "failures"]].to_numpy().tolist() == [
         [("a up", "b down"), 3],
         [("c up",), 1],
     ]
@@ -409,10 +402,10 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
     evaluator.plan({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
-    with evaluator.stage("all calls", 4):
+    with evaluator.phases.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
         another.evaluate(np.array([[4.0], [5.0]]), "another")
-    with evaluator.stage("first"):
+    with evaluator.phases.stage("first"):
         another.evaluate(np.array([[7.0]]), "as many as it takes")
     shown = [one for one in shown if one[0] != COMPILING]
     assert {stage for stage, _, _ in shown} == {"all calls"}

@@ -47,26 +47,21 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
     "wear": (
         "wear",
         {"matrix": FEW_TESTS},
-        {"limits": ("treadDepth >= 3",), "fits": 2, "attack": 300},
+        {"limits": ("treadDepth >= 3",), "fits": 2},
         600,
         "at least 3 mm",
     ),
     "a metric, worst in a matrix": (
         "wear",
         {"matrix": FEW_TESTS},
-        {"unsafe": "drac > 8", "fits": 2, "attack": 300},
+        {"unsafe": "drac > 8", "fits": 2},
         600,
         "in 2 of 2 parameter sets",
     ),
     "a user's metric": (
         "rain",
         {"metrics": {"also": ["hardest_braking:HARDEST"]}},
-        {
-            "unsafe": "hardest > 6.8",
-            "fits": 0,
-            "attack": 500,
-            "characteristics": ("tireFric,maxBrakeTorque",),
-        },
+        {"unsafe": "hardest > 6.8", "fits": 0, "characteristics": ("tireFric,maxBrakeTorque",)},
         600,
         "hardest > 6.8",
     ),
@@ -140,6 +135,7 @@ def worst_within(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("claim", CLAIMS)
+@pytest.mark.usefixtures("few_simulations")
 def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
     claim: str, in_tmp: Path
 ) -> None:

@@ -86,8 +86,7 @@ def test_a_limit_alone_ends_before_a_failure_that_the_search_for_limits_together
         return (rows[:, 0] > 7.01) & (rows[:, 0] < 7.04)
 
     own, other = made_up_model(2, nowhere), made_up_model(2, pocket, 1)
-    scans = scan(own.evaluator, [0, 1], Unsafe())
-    alone = AloneSearch(scans, [0, 1], own)
+    alone = AloneSearch(scan(own.evaluator, [0, 1], Unsafe()), [0, 1], own)
     alone.add(own)
     alone.add(other)
     assert [each.safe for each in alone.limits()] == [(0.0, 10.0), (0.0, 10.0)]
@@ -109,14 +108,11 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
         return (np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1)
 
     found = box_of(3, tooth, {"a": Limit(at_least=3, at_most=7)})
-    points = found.box.at(np.random.default_rng(1).random((20_000, 3)))
-    assert not tooth(points).any()
+    assert not tooth(found.box.at(np.random.default_rng(1).random((20_000, 3)))).any()
     assert relative_volume(found) > 0.02
     assert found.validations[0].attacked == (1 + CONFIRMATIONS) * 2000
-    region = region_of(made_up_study(3))
-    whole = Box(region, np.zeros(3), np.full(3, 10.0))
     hit = falsify(
-        whole,
+        Box(region_of(made_up_study(3)), np.zeros(3), np.full(3, 10.0)),
         [lambda rows: np.where(tooth(rows), -1.0, np.abs(rows - 6.3).max(axis=1))],
         [],
         2000,

@@ -63,8 +63,7 @@ def rows(first: int, last: int) -> FloatArray:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_least_are_known_at_all_points(seed: int) -> None:
     """What is printed as the least of a search is what a vehicle leaves at its worst point."""
-    rng = np.random.default_rng(seed)
-    left = rng.uniform(1, 2, (400, POINTS))
+    left = np.random.default_rng(seed).uniform(1, 2, (400, POINTS))
     left[:, [3, 7]] -= 1
     matrix = Matrix(left)
     judge = judge_of(matrix)
@@ -73,8 +72,7 @@ def test_the_least_are_known_at_all_points(seed: int) -> None:
     later = judge(rows(80, 400))
     assert (later >= true[80:]).all(), "nobody leaves more than he is said to leave"
     number = int(320 * LEAST_SHARE)
-    order = np.argsort(later, kind="stable")
-    assert (later == true[80:])[order[:number]].all()
+    assert (later == true[80:])[np.argsort(later, kind="stable")[:number]].all()
     asked_later = matrix.asked[1:]
     assert asked_later[0] == ((3, 7), 320), "only at points that were worst"
     assert judge.at_all_points == 80 + asked_later[1][1] < 200
@@ -96,8 +94,7 @@ def test_a_worst_point_that_appears_later_is_met_from_then_on() -> None:
 
 
 def test_in_a_searched_scenario_all_meet_everything() -> None:
-    left = np.ones((60, POINTS))
-    matrix = Matrix(left, scenario=("speed",))
+    matrix = Matrix(np.ones((60, POINTS)), scenario=("speed",))
     judge = judge_of(matrix)
     judge(rows(0, 30))
     judge(rows(30, 60))

@@ -179,8 +179,7 @@ def test_a_speed_that_is_needed(short: Study) -> None:
     typed = ["permit", "short.toml", "--set", "brakeTorque=0.6", "--others", "new", "--fits", "0"]
     slow = json_of(*typed)["tables"]["cars"]["rows"][0]["up_to"]
     assert json_of(*typed, "--need", f"{slow:g} km/h")["numbers"]["drive"] == 1
-    faster = run(*typed, "--need", f"{slow + 1:g} km/h", "--json", expect=3)
-    found = json.loads(faster.stdout)
+    found = json.loads(run(*typed, "--need", f"{slow + 1:g} km/h", "--json", expect=3).stdout)
     assert "1 car may not drive" in found["verdict"]
     assert found["numbers"]["need"] == slow + 1
 
@@ -204,8 +203,7 @@ def test_all_cars_within_limits(short: Study) -> None:
 
 
 def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
-    cars = {"new": {}, "worn": {"treadDepth": 3}}
-    answer = permit(short, cars=cars, others="new", quick=True)
+    answer = permit(short, cars={"new": {}, "worn": {"treadDepth": 3}}, others="new", quick=True)
     assert answer.numbers["rough"]
     assert "the study's own parameter set alone" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
@@ -292,16 +290,14 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     study = load_study("wear_joint")
 
     def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
-        members = self.model.evaluator.characteristics
-        columns = members.columns(self.as_printed(settings))
+        columns = self.model.evaluator.characteristics.columns(self.as_printed(settings))
         speed, location = columns["speed"], columns["impact_location"]
         fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
         return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EncounterRange, "robustness", robustness)
-        search = own_search(study, 2 * LEAST_SIMULATIONS)
-        (found,) = search.reach(
+        (found,) = own_search(study, 2 * LEAST_SIMULATIONS).reach(
             [Cars.one(assemble(study).characteristics.vehicle.original)], [None]
         )
     (reached,) = found.reached

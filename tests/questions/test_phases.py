@@ -69,8 +69,7 @@ def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
         scenario = system.points[0].scenario.at({"time_to_impact": 6 + phase * STEP})
         later = system.points[0]._replace(scenario=scenario)
         expected = degrees(replace(system, matrix=(later,)), settings)
-        found = degrees(at_phase(system, phase), settings)
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+        np.testing.assert_allclose(degrees(at_phase(system, phase), settings), expected, atol=1e-9)
 
 
 def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
@@ -113,8 +112,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     settings = np.tile(original, (len(speeds), 1))
     settings[:, evaluator.characteristics.names.index("speed")] = speeds
     left = model.robustness(settings, "speeds")
-    jumps = np.abs(np.diff(left)) > 0.3
-    tips = np.flatnonzero(jumps[:-1])
+    tips = np.flatnonzero((np.abs(np.diff(left)) > 0.3)[:-1])
     lower = np.where(left[tips] < left[tips + 1], tips, tips + 1)
     assert len(lower) > 3
     some = np.arange(lower[0], lower[-1], 97)
@@ -150,18 +148,16 @@ def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
 
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
-    answer = json_of("permit", "autoware_july", *car)
-    (row,) = answer["tables"]["cars"]["rows"]
+    (row,) = json_of("permit", "autoware_july", *car)["tables"]["cars"]["rows"]
     assert row["phase"] > 0
     assert f"phase {row['phase']:.10g}" in row["because"]
 
     # The failure can be typed, and is none at phase 0.
-    speed = float(row["encounter"].split()[1])
     study = {
         "extends": "autoware_july",
         "name": "there",
         "matrix": False,
-        "scenario": {"parameters": {"test": "CCRs", "speed": speed}},
+        "scenario": {"parameters": {"test": "CCRs", "speed": float(row["encounter"].split()[1])}},
     }
     changes = {"brakeTorque": 0.93}
     assert sv.simulate(study, changes).gap >= 0.3
@@ -200,7 +196,7 @@ def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
     ("question", "options"),
     [
         (sv.permit, {"set": ("brakeTorque=1",), "others": "new", "step": 30}),
-        (sv.tolerance, {"characteristics": ("brakeTorque",), "attack": 1000, "at_tests": True}),
+        (sv.tolerance, {"characteristics": ("brakeTorque",), "at_tests": True}),
         pytest.param(sv.repair, {"promise": ("brakeTorque >= 0.9",)}, marks=pytest.mark.slow),
     ],
 )

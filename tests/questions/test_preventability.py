@@ -125,8 +125,7 @@ def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not() -> Non
 @pytest.mark.slow
 def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
     """He hits it in the original vehicle."""
-    found = avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99))
-    assert found == ["full braking"]
+    assert avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99)) == ["full braking"]
 
 
 @pytest.mark.slow
@@ -270,12 +269,10 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
 def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
     study = load_study("alks_joint")
     evaluator = Evaluator(study, InlinePool(), verified=0)
-    settings = drawn(assemble(study), 24, 3)
-    collisions = evaluator.evaluate(settings, "settings")
+    collisions = evaluator.evaluate(drawn(assemble(study), 24, 3), "settings")
     collisions = collisions.take(collisions.collided)
     verdicts = assess_collisions(evaluator, collisions)
     rows = drivers_frame(verdicts, len(collisions)).set_index("driver")
     assert {"competent_driver", "rss", "fuzzy_safety", "r157"} < {*rows.index}
-    counts = rows["avoided"] + rows["no_longer"] + rows["no_verdict"]
-    assert (counts == len(collisions)).all()
+    assert ((rows["avoided"] + rows["no_longer"] + rows["no_verdict"]) == len(collisions)).all()
     assert rows["no_verdict"]["full_braking"] == rows["no_verdict"].min()

@@ -13,6 +13,8 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions import price
 from safevar_sumo.questions.price import Account, round_down
+from safevar_sumo.questions.progress import Phases
+from safevar_sumo.terminal import show_no_progress
 from tests.in_process import InlinePool, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
@@ -136,7 +138,7 @@ def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(rig: str)
 
 
 def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
-    account = Account(asked=120)
+    account = Account(Phases(show_no_progress), asked=120)
     account.open(100, None)
     assert account.most is None
     account.spend(120)
@@ -162,11 +164,11 @@ def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig:
 def test_what_takes_long_by_default_is_limited_and_said_first(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    account = Account(is_question=True)
+    account = Account(Phases(show_no_progress), is_question=True)
     account.open(10_000, 0.4)
     assert account.most == 2200
     assert "at most 2,200 simulations, about 0:14:40, of about 10,000" in capsys.readouterr().err
-    other = Account(is_question=True)
+    other = Account(Phases(show_no_progress), is_question=True)
     other.open(1000, 0.4)
     assert other.most is None
     assert "about 1,000 simulations, about 0:06:40" in capsys.readouterr().err

@@ -29,7 +29,7 @@ FAST: list[tuple[Callable[..., Any], Mapping[str, Any]]] = [
     (sv.rules, {"samples": 200}),
 ]
 SLOW: list[tuple[Callable[..., Any], Mapping[str, Any]]] = [
-    (sv.tolerance, {"attack": 1000, "fits": 1}),
+    (sv.tolerance, {"quick": True}),
     (sv.repair, {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1}),
 ]
 

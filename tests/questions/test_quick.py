@@ -21,8 +21,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     done = run(*asked, "--json", expect=3)
     answer = json.loads(done.stdout)
     assert answer["verdict"].startswith("Rough answer (--quick")
-    numbers = [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")]
-    assert numbers == [True, None, 1]
+    assert [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")] == [True, None, 1]
     assert {row["kept"] for row in answer["tables"]["limits"]["rows"]} == {None}
     assert "no limit is called kept" in done.stderr
 

@@ -17,7 +17,7 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions import repair as question
+from safevar_sumo.questions import falsify, repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.repair import (
     full_braking,
@@ -145,7 +145,7 @@ grip = { at_least = 5 }
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module, name, number in (
-        (question, "USUAL_BUDGET", 300),
+        (falsify, "USUAL_BUDGET", 300),
         (validation, "MAX_UNSAFE_SHARE", 0.01),
         (question, "SOBOL_VEHICLES", 32),
     ):
@@ -188,7 +188,7 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     """The gap of today decides the fastest of them; from there the worst promised sled needs a
     longer one.
     """
-    monkeypatch.setattr(question, "USUAL_BUDGET", 2000)
+    monkeypatch.setattr(falsify, "USUAL_BUDGET", 2000)
     search = 'search.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
     planted.write_text(
         STUDY.replace("speed = 72.0, ", "").replace(
@@ -395,8 +395,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
-    blind = {"model": "aeb", "parameters": {"reach": 0.001}}
-    system = assemble(sv.load_study(name, ads=blind))
+    system = assemble(sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}}))
     benign = replace(system, matrix=tuple(benign_scenes(sv.load_study(name), system)))
     assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
     for result in simulate_all_points(benign, system.characteristics.original[None]):

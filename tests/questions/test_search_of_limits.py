@@ -24,8 +24,7 @@ from tests.questions.conftest import made_up_study
 
 
 def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
-    study = load_study("smoke")
-    region = region_of(study)
+    region = region_of(load_study("smoke"))
     members = region.characteristics
     boxes = [
         Box(region, members.lower, members.upper),
@@ -93,5 +92,4 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
 def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
     study = at_point(load_study("wear"), point)
     assert scope_of(study).startswith(scope)
-    model = Model(0, Evaluator(study, InlinePool()), Unsafe())
-    assert moving_tests(model, Unsafe()) == []
+    assert moving_tests(Model(0, Evaluator(study, InlinePool()), Unsafe()), Unsafe()) == []

@@ -118,8 +118,7 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
 
     def region(settings: FloatArray) -> BoolArray:
         moved = settings - ORIGINAL
-        pair = (moved[:, 0] > 3) & (moved[:, 1] > 3)
-        return pair | ((moved[:, 1:] < -3).all(axis=1))
+        return ((moved[:, 0] > 3) & (moved[:, 1] > 3)) | ((moved[:, 1:] < -3).all(axis=1))
 
     evaluator = made_up_evaluator(4, region)
     smallest = Smallest.of(evaluator, COLLISION, 0)

@@ -98,8 +98,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
         None
     ] * 3
     results = SimpleNamespace(case=case, study=case.study, directory="results")
-    stated = replace(case, stated=Unsafe(points=points - 1e-3))
-    verdict, _ = _verdict(results, stated, None)
+    verdict, _ = _verdict(results, replace(case, stated=Unsafe(points=points - 1e-3)), None)
     assert "With 1 change, the fewest that were found, the vehicle earns " in verdict
     assert "brakeTorque 1 -> 0." in verdict
 
@@ -116,8 +115,7 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     ]  # worse, better, unknown before, unknown after, worst
     monkeypatch.setattr(Evaluator, "at_each_point", lambda self, settings, stage: None)
     monkeypatch.setattr(rater.Rater, "points", lambda self, cells: SimpleNamespace(colours=colours))
-    original = original_of(evaluator)
-    ((endings, worse_cells),) = compare_at_cells(evaluator, original)
+    ((endings, worse_cells),) = compare_at_cells(evaluator, original_of(evaluator))
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert endings.startswith(f"At {matrix[4].name}: ")
 

@@ -58,8 +58,7 @@ def test_every_number_is_what_it_says() -> None:
 
 def test_collisions_are_counted_on_each_side_and_on_both() -> None:
     there = reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6)
-    counts = agreement_counts(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6))
-    assert counts == {
+    assert agreement_counts(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6)) == {
         "rows": 6,
         "collisions_here": 4,
         "collisions_reference": 4,

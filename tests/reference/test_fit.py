@@ -117,8 +117,7 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     there = data.take(np.arange(24) < 6)._replace(metrics=published)
     here = made_up_evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12)))
     collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
-    loss = fit.loss_of_file(there, here, nearer, collisions)
-    assert loss == pytest.approx(6 * 2 / 6), (
+    assert fit.loss_of_file(there, here, nearer, collisions) == pytest.approx(6 * 2 / 6), (
         "four there and four here, three of them the same: two rows of six differ"
     )
 
@@ -206,9 +205,8 @@ def test_the_sets_are_simulated_one_by_one() -> None:
         for gap in (OWN, OWN - 1, OWN + 1)
     ]
     (band,) = compute_model_spreads(study, setting)
-    degrees = [float(one.f_safe[0]) for one in alone]
     assert (band.lower, band.upper) == pytest.approx(
-        np.quantile(degrees, [0.05, 0.95]).tolist(), abs=1e-6
+        np.quantile([float(one.f_safe[0]) for one in alone], [0.05, 0.95]).tolist(), abs=1e-6
     )
     assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
 
@@ -220,6 +218,7 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_simulations")
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)
     gap = "ads.parameters.brake_gap"
@@ -234,7 +233,7 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.M
     of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
     assert len({*of_each}) > 1, "the fits differ"
     asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
-    answer = tolerance(study, **asked, attack=200)
+    answer = tolerance(study, **asked)
     (row,) = answer.to_dict()["tables"]["limits"]["rows"]
     assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, (
         "the strictest fit decides, rounded to the safe side"

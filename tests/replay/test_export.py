@@ -135,8 +135,7 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
     lanes = [lane for lane in comparison.road if lane.kind == "road"]
     for sample in range(comparison.moments[row].end + 1):
         x, y, heading = (float(values[sample, row]) for values in (track.x, track.y, track.heading))
-        place = carla.Location(x, -y, 0.0)
-        waypoint = road.get_waypoint(place, project_to_road=False)
+        waypoint = road.get_waypoint(carla.Location(x, -y, 0.0), project_to_road=False)
         assert waypoint.lane_type == carla.LaneType.Driving
         assert any(np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes)
         assert np.isclose(

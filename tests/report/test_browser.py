@@ -185,8 +185,7 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("axe")
     subprocess.run([program("npm"), "pack", AXE, "--silent"], check=True, cwd=folder)
     with tarfile.open(next(folder.glob("axe-core-*.tgz"))) as archive:
-        member = archive.extractfile("package/axe.min.js")
-        return member.read().decode()
+        return archive.extractfile("package/axe.min.js").read().decode()
 
 
 BROKEN_NAMES = """

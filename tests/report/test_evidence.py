@@ -299,8 +299,7 @@ def test_a_damage_is_refused_or_named(damage: dict[str, Any], bare: Path, tmp_pa
     if "removed" not in damage:
         texts[path] = damaged(before or b"", damage)
         assert texts[path] != before
-    named = damage.get("named", path != DESCRIPTION)
-    pack = written(tmp_path / "it.zip", texts, named=named)
+    pack = written(tmp_path / "it.zip", texts, named=damage.get("named", path != DESCRIPTION))
     if "told" in damage:
         refused("verify", pack, message=("it.zip", damage["told"]))
     else:
@@ -311,8 +310,7 @@ def test_a_damage_is_refused_or_named(damage: dict[str, Any], bare: Path, tmp_pa
 def test_what_differs_is_shown_from_both_sides(bare: Path, tmp_path: Path) -> None:
     texts = texts_of(bare)
     page = texts["1-slippery/report.html"] + b"\n"
-    path = written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page})
-    (claim,) = not_same(path)
+    (claim,) = not_same(written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page}))
     assert (claim["claim"], claim["packed"], claim["here"]) == ("report", "'\\n'", "nothing")
     answers = {"1-slippery/answers.json": texts["1-slippery/answers.json"] + b" "}
     (claim, *_) = not_same(written(tmp_path / "it.zip", {**texts, **answers}, named=False))

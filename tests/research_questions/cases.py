@@ -94,7 +94,12 @@ def made_up(
     seen = frame(evaluations)
     seen.insert(2, "evaluation", [one["evaluation"] for one in evaluations])
     return build_case(
-        study or made_up_study(), original, frame(rows), seen, done if has_runs else (), has_runs
+        study or made_up_study(),
+        original,
+        frame(rows),
+        seen,
+        done if has_runs else (),
+        has_runs=has_runs,
     )
 
 

@@ -48,8 +48,7 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
     )
     assert sorted(reference_front(case).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
     result = compute_indicators(case)
-    apart = math.hypot(0.5, 0.2)
-    assert result.loc[("nsga2", 0), "igd"] == pytest.approx(apart / 2)
+    assert result.loc[("nsga2", 0), "igd"] == pytest.approx(math.hypot(0.5, 0.2) / 2)
     assert result.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
     assert result.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), (
         "a whole width of f_safe away from one of two"
@@ -119,9 +118,8 @@ def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:
 
 def test_signed_ranks_of_a_sample_without_a_difference_and_with_ties() -> None:
     assert signed_rank_test([0.0, 0.0])[:2] == (1.0, 0.5)
-    tied = signed_rank_test([-1.0, -1.0, 1.0, 2.0])
     assert (
-        tied.p_value
+        signed_rank_test([-1.0, -1.0, 1.0, 2.0]).p_value
         == scipy.stats.wilcoxon([-1, -1, 1, 2], correction=True, method="approx").pvalue
     )
 
@@ -174,8 +172,7 @@ def test_the_interval_of_samples_apart_has_a_width() -> None:
     low, high = effect_interval(1.0, 10, 10, 0.05)
     # Hanley and McNeil's (1982), for exponential values
     q1 = low / (2 - low)
-    q2 = 2 * low**2 / (1 + low)
-    variance = (low * (1 - low) + 9 * (q1 - low**2) + 9 * (q2 - low**2)) / 100
+    variance = (low * (1 - low) + 9 * (q1 - low**2) + 9 * ((2 * low**2 / (1 + low)) - low**2)) / 100
     assert (1 - low) / math.sqrt(variance) == pytest.approx(scipy.stats.norm.ppf(0.975))
     assert high == 1
     assert effect_interval(0.0, 10, 10, 0.05) == pytest.approx((0, 1 - low))
@@ -369,10 +366,9 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     )
     answer = answer_questions([case])
     few = "significant for NSGA-II, RS: a test needs at least 8 runs of each algorithm."
-    over_runs = answer.only("rq1-runs").tables["remarks"]["remark"]
     assert (
         "None of the 8 tests of RQ1 can be significant: after Holm's correction, a test needs at"
-        " least 11 runs" in "".join(over_runs)
+        " least 11 runs" in "".join(answer.only("rq1-runs").tables["remarks"]["remark"])
     )
     for name, stands_out in (("rq1", False), ("rq2", True)):
         table, remarks = answer.only(name).tables.values()

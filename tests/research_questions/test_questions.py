@@ -251,8 +251,7 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
     case = made_up(
         points["a"], points["b"], evaluations=seen, finished=[*product(journals, (0, 1, 2))]
     )
-    answer = answer_questions([case], Choices(alpha=0.05), ["budget"])
-    table = answer.tables["budget"]
+    table = answer_questions([case], Choices(alpha=0.05), ["budget"]).tables["budget"]
     assert "; 95 % intervals)" in table.attrs["title"]
     names = ["simulations", "effect_size", "runs_needed", "hypervolume", "hypervolume_baseline"]
     assert table[[*names, "unsafe"]].to_numpy() == pytest.approx(

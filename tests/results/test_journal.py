@@ -131,8 +131,7 @@ def test_a_truncated_journal_loads_its_whole_lines_and_continues(
     for number in range(max(0, whole - 1), BATCHES):
         journal.append(places(number), batch(number))
     journal.close()
-    content = read_journal(path, HEAD)
-    assert holds_the_first(BATCHES, content)
+    assert holds_the_first(BATCHES, read_journal(path, HEAD))
 
 
 def edited(line: bytes, **columns: object) -> bytes:

@@ -153,8 +153,7 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         with_search(study, time_limit=7, runs=3, evaluations=900),
         with_search(study, algorithms=["rs"]),
     ):
-        directory = results_directory(tmp_path, other)
-        assert identity_digest(directory.manifest) == identity_digest(
+        assert identity_digest(results_directory(tmp_path, other).manifest) == identity_digest(
             results_directory(tmp_path, study).manifest
         )
 
@@ -448,8 +447,7 @@ def test_the_status_of_a_study_agrees_with_its_journals(slippery: Path, case: Ca
 
 def test_a_study_under_way(copied: Path) -> None:
     nsga2 = copied / "runs/nsga2-00.jsonl"
-    rs = copied / "runs/rs-00.jsonl"
-    rs.unlink()
+    (copied / "runs/rs-00.jsonl").unlink()
     (copied / "solutions.csv").unlink()  # written after the last run
     nsga2.write_bytes(
         nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3]

@@ -126,8 +126,7 @@ def test_a_cut_out_hides_the_standing_car_until_the_leader_is_aside() -> None:
     assert gap[shown] == pytest.approx(
         20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0)
     )
-    impact = 1.0 + (20.0 + CAR.length + 60.0) / 20.0
-    assert at_contact(run, run.trace.time) == pytest.approx(impact)
+    assert at_contact(run, run.trace.time) == pytest.approx(1.0 + (20.0 + CAR.length + 60.0) / 20.0)
 
 
 def test_whose_collision_it_is() -> None:
@@ -208,8 +207,7 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
     verify_everywhere(system, vehicles)
     assert (run.trace.speed[0] == system.points[0].scenario.test_speed).all()
     assert (np.abs(run.test_speed_error) < 0.1).all()
-    acts = (np.abs(np.diff(run.trace.speed, axis=0)) > 0.01).any(axis=0)
-    assert acts.any()
+    assert (np.abs(np.diff(run.trace.speed, axis=0)) > 0.01).any(axis=0).any()
 
 
 def test_a_leader_brakes_down_to_a_stop() -> None:
@@ -218,6 +216,5 @@ def test_a_leader_brakes_down_to_a_stop() -> None:
     """
     one = CarToCar(test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0)
     run = driven(one, Hold(), system=WEAR)
-    impact = at_contact(run, run.trace.time)
-    assert impact == pytest.approx((40.0 + 60.0 + 20.0**2 / 16.0) / 20.0)
+    assert at_contact(run, run.trace.time) == pytest.approx((40.0 + 60.0 + 20.0**2 / 16.0) / 20.0)
     assert one.duration >= 3.0 + 20.0 / 8.0

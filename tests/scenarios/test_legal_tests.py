@@ -27,8 +27,7 @@ def test_what_a_braking_leader_leaves_is_that_of_the_closed_form(reaction: float
     test = CarToCar(
         test="CCRb", speed=80.0, headway=12 / speed, target_deceleration=5.0, final_speed=0.0
     )
-    times = np.arange(0.0, 12.0, 0.01)[:, np.newaxis]
-    (leader,) = test.tracks(times)
+    (leader,) = test.tracks(np.arange(0.0, 12.0, 0.01)[:, np.newaxis])
     rear = float(leader.x[-1, 0]) - leader.length / 2
     own = speed * (test.brakes_at + reaction) + speed**2 / (2 * 10.0)
     assert rear - own == pytest.approx(36.7 - 22.2 * reaction, abs=0.05)
@@ -52,8 +51,7 @@ def test_r152_allows_the_impact_of_the_higher_row() -> None:
 @pytest.mark.parametrize("name", ["r152", "r152_laden", "fmvss127"])
 def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
     system = assemble(load_study(name))
-    original = drive_and_score(system, original_of(system))
-    assert not original.collided[0]
+    assert not drive_and_score(system, original_of(system)).collided[0]
     mass = system.nominal.mass
     assert mass - assemble(load_study("wear")).nominal.mass == (450 if name == "r152_laden" else 0)
 

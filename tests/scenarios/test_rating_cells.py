@@ -112,8 +112,7 @@ def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
     """
     for headway, deceleration in ((1, 4), (1.5, 4), (0.5, 4), (1, 6), (1, 2)):
         gap = headway * speed * KMH
-        speed_loss = (speed - 2) * KMH
-        closing = min(math.sqrt(2 * deceleration * gap), speed_loss)
+        closing = min(math.sqrt(2 * deceleration * gap), (speed - 2) * KMH)
         braking_time = (
             closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
         )
@@ -210,8 +209,7 @@ def test_targets_are_hit_on_a_lane_as_in_sumo_to_the_last_bit(scenario: Any) -> 
 def hit_at_any_time(scenario: Any) -> list[str]:
     """The outcomes of such vehicles, which are the same in SUMO."""
     n = 30
-    unbraked = driven(scenario)
-    arrival = unbraked.trace.time[-1]
+    arrival = driven(scenario).trace.time[-1]
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
     system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
     return assert_same(system, np.repeat(original_of(system), n, axis=0))

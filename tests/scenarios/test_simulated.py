@@ -151,8 +151,7 @@ def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
 
 def test_metrics_that_a_trace_does_not_define_are_undefined(wall: Path) -> None:
     change = "lambda r: {k: r[k] for k in ('time', 'speed', 'separation', 'outcome')}"
-    system = wrong_system(wall, change)
-    found = drive_and_score(system, np.array([[8.0, 0.0]]))
+    found = drive_and_score(wrong_system(wall, change), np.array([[8.0, 0.0]]))
     assert np.isnan([found.metrics[name][0] for name in METRICS if name != "safety_degree"]).all()
     assert found.f_safe[0] > 0
 
@@ -266,8 +265,7 @@ def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
 
 
 def test_runs_of_one_batch_have_one_time_step(wall: Path) -> None:
-    change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
-    system = wrong_system(wall, change)
+    system = wrong_system(wall, "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}")
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
         simulators.simulate_each(system, np.array([[9.0, 0.0], [4.0, 0.5]]))
 
@@ -352,8 +350,7 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wal
     assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
     wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
     assert json_of("check", "wall.toml")["numbers"]["passed"]
-    system = system_of(wall)
-    found = drive_and_score(system, np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
+    found = drive_and_score(system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
     rounds = np.stack([found.metrics[f"safety_degree_{k}"] for k in range(1, 5)])
     assert found.f_safe == pytest.approx(rounds.mean(axis=0))
     assert len({*rounds[:, 0]}) == 4

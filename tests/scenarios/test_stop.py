@@ -17,14 +17,13 @@ from safevar_sumo.sumo.system import System, assemble
 
 def stops(weather: Any, *speeds: float, **tables: Any) -> System:
     """The worn car's stops from `speeds` [km/h]."""
-    tests = [{"name": "stop", "over": {"speed": [*speeds]}}]
     return assemble(
         load_study(
             {
                 "extends": "stop",
                 "name": "some",
                 "weather": weather,
-                "matrix": {"tests": tests},
+                "matrix": {"tests": [{"name": "stop", "over": {"speed": [*speeds]}}]},
                 **tables,
             }
         )
@@ -71,8 +70,7 @@ def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> 
 
 def test_simulate_prints_the_stop_from_every_speed() -> None:
     answer = show_simulation("stop", set=("treadDepth=1.6",))
-    points = answer.tables["points"]
-    assert points["stopping_distance"].tolist() == pytest.approx(
+    assert answer.tables["points"]["stopping_distance"].tolist() == pytest.approx(
         distances(stops("wet", 30, 50, 80, 100, 120), treadDepth=1.6)
     )
     assert "times that of the original" in answer.verdict

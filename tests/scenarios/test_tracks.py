@@ -94,8 +94,7 @@ def test_a_driver_watches_his_corridor_up_to_the_bodys_side(kind: str, middle: f
 
 def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
     """A leader at 60 m moves aside and shows a standing car at 110 m."""
-    leader = moving("leader", 60.0, 0.0, 0.01, 1.75)
-    run = held(leader, standing(110.0, name="standing"))
+    run = held(moving("leader", 60.0, 0.0, 0.01, 1.75), standing(110.0, name="standing"))
     gap = run.trace.gap[:, 0]
     shown = int(np.argmax(np.abs(np.diff(gap)) > 10)) + 1
     lateral = 1.75 * run.trace.time[shown]
@@ -159,8 +158,7 @@ def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
     outside = np.maximum(
         np.abs(points) - np.array([LENGTH, WIDTH])[:, np.newaxis, np.newaxis] / 2, 0.0
     )
-    by_grid = float(np.sqrt((outside**2).sum(axis=0)).min())
-    assert distance == pytest.approx(by_grid, abs=0.06)
+    assert distance == pytest.approx(float(np.sqrt((outside**2).sum(axis=0)).min()), abs=0.06)
     own = Body(
         np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([LENGTH]), np.array([WIDTH]), np.zeros(1)
     )

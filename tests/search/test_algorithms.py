@@ -92,10 +92,9 @@ def begun(
     scoring: Scoring = PUBLISHED_SCORING,
     characteristics: CharacteristicSet = SUN,
 ) -> Iterator[Any]:
-    original = sphere(characteristics, characteristics.original_settings)
     problem = Problem(
         characteristics=characteristics,
-        original=original,
+        original=sphere(characteristics, characteristics.original_settings),
         evaluations=evaluations,
         population=POPULATION,
         scoring=scoring,

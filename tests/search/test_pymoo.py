@@ -82,8 +82,7 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
 
     standard = PROBLEMS["dtlz2"]
     evaluations = 364
-    population = 91
-    problem = standard_problem(standard, evaluations, population)
+    problem = standard_problem(standard, evaluations, 91)
 
     class Theirs(PymooProblem):
         def __init__(self) -> None:
@@ -212,8 +211,7 @@ def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.Monk
 
 
 def test_an_algorithm_may_come_later_but_not_with_another_pymoo(tmp_path: Path) -> None:
-    study = with_pymoo(["nsga2"], evaluations=30)
-    carried_out(study, tmp_path)
+    carried_out(with_pymoo(["nsga2"], evaluations=30), tmp_path)
     assert "pymoo" not in read_manifest(tmp_path)["versions"]
     both = with_pymoo(["nsga2", "pymoo:GA"], evaluations=30)
     carried_out(both, tmp_path)

@@ -92,9 +92,10 @@ def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
         "<OpenSCENARIO><Catalog name='other'/></OpenSCENARIO>"
     )
     concrete = tmp_path / "files/cut_in.xosc"
-    text = concrete.read_text()
     concrete.write_text(
-        text.replace('catalogName="bodies"', 'catalogName="$catalog"').replace(
+        concrete.read_text()
+        .replace('catalogName="bodies"', 'catalogName="$catalog"')
+        .replace(
             "<ParameterDeclarations>",
             '<ParameterDeclarations><ParameterDeclaration name="catalog" parameterType="string" value="bodies"/>',
             1,

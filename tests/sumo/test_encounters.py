@@ -124,8 +124,7 @@ def searched_study(case: str) -> Study:
 @pytest.mark.parametrize("case", CASES)
 def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
     """Its scene is one that SUMO has played, and its original vehicle drives there."""
-    joint = searched_study(case)
-    system = assemble(joint)
+    system = assemble(searched_study(case))
     settings = drawn(system, 4, 3)
     evaluations = drive_and_score(system, settings)
     of_vehicle = system.characteristics.of_vehicle
@@ -276,13 +275,13 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("coarse")
+@pytest.mark.usefixtures("coarse", "few_simulations")
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
     """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap
     of the brakes.
     """
     study = planted()
-    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0, attack=100)
+    answer = tolerance.compute(study, Evaluator(study, InlinePool()), fits=0)
     (limit,) = answer.tables["limits"].to_dict("records")
     border = 1 - (MARGIN - 0.1) / GAP  # it keeps 0.1 m
     assert limit["together_low"] == pytest.approx(border, rel=0.01)
@@ -303,8 +302,7 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
     for cause in answer.tables["causes"].to_dict("records"):
         assert [*cause["changes"]] == ["brakes"]
         speed = cause["encounter"]["speed"] * KMH
-        friction = cause["encounter"]["road_friction"]
-        stop = speed**2 / (2 * BRAKING * friction)
+        stop = speed**2 / (2 * BRAKING * cause["encounter"]["road_friction"])
         assert stop <= GAP - MARGIN + 0.5, "the original is safe there"
         assert cause["boundary"]["brakes"] == pytest.approx(stop / GAP, rel=0.03)
     at_original = (50 * KMH) ** 2 / (2 * BRAKING) / GAP

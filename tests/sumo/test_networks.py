@@ -192,10 +192,9 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
     """A network with sidewalks, crossings, traffic lights and opposite lanes: its copies contain no
     id of the original.
     """
-    netgenerate = str(BINARIES / "netgenerate")
     subprocess.run(
         [
-            netgenerate,
+            str(BINARIES / "netgenerate"),
             "--grid",
             "--grid.number",
             "3",

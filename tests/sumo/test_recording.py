@@ -142,8 +142,7 @@ def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_o
     ads = {"model": "idm", "parameters": {}}
     car = {"model": "car_to_car", "parameters": {}}
     system = assemble(load_study("wear", ads=ads, scenario=car, matrix={"tests": tests}))
-    outcomes = drive_and_score(system, original_of(system)).outcome.tolist()
-    assert outcomes == ["timeout"]
+    assert drive_and_score(system, original_of(system)).outcome.tolist() == ["timeout"]
     verify_everywhere(system, original_of(system))
 
 

@@ -165,8 +165,7 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
 
 def test_between_two_actions_sumos_driver_asks_for_what_he_decided(in_tmp: Path) -> None:
     """A lag lets through a part of it in the first step, and more in the next ones."""
-    lag = {"actuatorLag": {"original": 0.2}}
-    vehicle = {**NO_DELAYS, "characteristics": {**NO_DELAY, **lag}}
+    vehicle = {**NO_DELAYS, "characteristics": {**NO_DELAY, **{"actuatorLag": {"original": 0.2}}}}
     for action in ("0.1", "1"):
         traffic = with_attributes(in_tmp / action, f'sigma="0" actionStepLength="{action}"')
         scenario = {"parameters": {"network": str(traffic.parent)}}

@@ -97,8 +97,7 @@ def changed(of: System, **values: float) -> np.ndarray:
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
     Path("helper.py").write_text(HELPER)
     runs = system("step", USES_HELPER)
-    run = drive_worst(runs, changed(runs))
-    assert run.trace.speed.max() == pytest.approx(5, abs=0.7)
+    assert drive_worst(runs, changed(runs)).trace.speed.max() == pytest.approx(5, abs=0.7)
     assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, (
         "the import is for controllers alone"
     )

@@ -115,8 +115,7 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     for _ in range(100):
         state = step("carla", CARLA.hold_gear(p, state, one > 0), throttle=1.0)
         assert state.target_gear[0] == 1
-    held = CARLA.hold_gear(p, state, one < 0)
-    assert step("carla", held, throttle=1.0).target_gear[0] == 2
+    assert step("carla", CARLA.hold_gear(p, state, one < 0), throttle=1.0).target_gear[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -141,8 +140,7 @@ def test_sumo_is_told_what_a_vehicle_can_do(model: str, told: dict[str, float]) 
 def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
     """At least 0.7 s between changes; torque from 0.325 of the largest, by 337.5 N m/s."""
     states = drive("lgsvl", original("lgsvl"), full_throttle, 12).states
-    gears = np.array([float(state.gear[0]) for state in states])
-    changes = np.flatnonzero(np.diff(gears)) * STEP
+    changes = np.flatnonzero(np.diff(np.array([float(state.gear[0]) for state in states]))) * STEP
     assert len(changes) > 2
     assert np.diff(changes).min() >= 0.7 - STEP / 2
     torque = [float(state.traction_torque[0]) for state in states[:4]]

@@ -111,8 +111,7 @@ def coasting_loss(start: float, duration: float) -> Callable[..., FloatArray]:
     def measured(model: str, population: FloatArray) -> FloatArray:
         run = drive(model, population, coasting_after(start), start + duration + 0.5)
         before = run.speed[run.at(start + 0.5)]
-        after = run.speed[-1]
-        return (before - after) / before
+        return (before - run.speed[-1]) / before
 
     return measured
 

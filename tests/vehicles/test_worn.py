@@ -156,8 +156,7 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
         unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
         values = f"{published:.{digits}f} {unit}|{here:.{digits}f}|{here - published:+.{digits}f}"
         error = f"{100 * (here / published - 1):+.0f} %"
-        line = f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|"
-        assert line in PAGE
+        assert (f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|") in PAGE
     assert np.median(errors) <= 0.06
     assert max(errors) <= 0.25
     assert (
@@ -275,8 +274,7 @@ def test_the_shipped_constants_are_what_the_script_prints() -> None:
     constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(encoding="utf-8")
     assert constants.partition("\n\n")[2].strip() in printed
     study = tomllib.loads(Path("studies/wear.toml").read_text(encoding="utf-8"))
-    of_study = tomllib.loads(printed.partition("[handbook]")[2].partition("\n\n")[2])
-    assert of_study == {
+    assert tomllib.loads(printed.partition("[handbook]")[2].partition("\n\n")[2]) == {
         "vehicle": {"parameters": study["vehicle"]["parameters"]},
         "spread": study["spread"],
     }
@@ -371,8 +369,7 @@ def test_a_change_of_just_the_threshold_is_noise() -> None:
 
 def seen_at(gap: Any, time: float = 0.0) -> Observation:
     """A pedestrian of 0.5 m in the middle of the lane, seen by one vehicle or several."""
-    n = np.size(gap)
-    zeros = np.zeros(n)
+    zeros = np.zeros(np.size(gap))
     columns = {
         "speed": zeros + 10.0,
         "closing_speed": zeros + 10.0,
@@ -423,8 +420,7 @@ def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() 
                 prepared, state, seen_at(np.full(4, 1000.0 - k) / 20, k * 0.05)
             )
             gaps.append(seen.gap * 20)
-        steps = np.diff(np.array(gaps), axis=0)
-        patterns.append(steps == 0)
+        patterns.append(np.diff(np.array(gaps), axis=0) == 0)
     lost = patterns[0]
     assert np.array_equal(lost, patterns[1])
     assert not np.array_equal(lost, patterns[2])
@@ -439,8 +435,7 @@ def test_a_study_without_them_drives_as_with_none() -> None:
     with_them = assemble(load_study("sensing", matrix=None))
     without = assemble(load_study("wear", matrix=None))
     settings = drawn(without, 6, 2)
-    more = np.concatenate([settings, np.zeros((6, 2))], axis=1)
-    ours = drive_and_score(with_them, more)
+    ours = drive_and_score(with_them, np.concatenate([settings, np.zeros((6, 2))], axis=1))
     theirs = drive_and_score(without, settings)
     assert ours.f_safe.tolist() == theirs.f_safe.tolist()
     angled = with_them.characteristics.original.copy()

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Count, Criterion, Margin, question
+from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.compare.differences import (
     BOTH,
@@ -115,7 +115,7 @@ def compare(
     other: Study | Case,
     *,
     samples: Count = 2000,
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    limits: LimitTexts = (),
     margin: Margin = None,
     unsafe: Criterion = None,
     at_tests: bool = False,
@@ -161,7 +161,8 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = _titles(evaluators)
+    titles = _titles(study.name, second.study.name)
+    table = _table(common, settings)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
@@ -176,11 +177,10 @@ def compare(
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **decided,
-        **_numbers(criteria[0], counts, tested, alone["change"]),
-        "outside": outside,
-        "not_simulated": len(pairs.frame) - len(valid.frame) - pairs.number_infeasible,
+        **_numbers(criteria[0], counts, tested, alone["change"], pairs, outside),
         **of_originals,
     }
+    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         why,
@@ -193,11 +193,16 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables=_tables(numbers, tested, titles, limits=alone, settings=_table(common, settings)),
+        tables={"summary": summary, "limits": alone, "pairs": tested.pairs, "settings": table},
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
     )
+
+
+def _titles(*names: str) -> tuple[str, ...]:
+    """What sentences call A and B: the names of their studies if they differ."""
+    return names if names[0] != names[1] else ("A", "B")
 
 
 def _numbers(
@@ -205,6 +210,8 @@ def _numbers(
     counts: Mapping[str, int],
     tested: _PairedTest,
     changes_of_limits: pd.Series[str],
+    pairs: Pairs,
+    outside: int,
 ) -> JsonObject:
     """What was compared."""
     return {
@@ -216,13 +223,9 @@ def _numbers(
         "a12": tested.a12,
         "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
         "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
+        "outside": outside,
+        "not_simulated": int((~pairs.are_valid).sum()) - pairs.number_infeasible,
     }
-
-
-def _titles(evaluators: Sequence[Evaluator]) -> tuple[str, ...]:
-    """What sentences call A and B: the names of their studies if they differ."""
-    names = tuple(side.study.name for side in evaluators)
-    return names if names[0] != names[1] else ("A", "B")
 
 
 def _criteria(
@@ -301,19 +304,6 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
     order = settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
     return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
-
-
-def _tables(
-    numbers: JsonObject,
-    tested: _PairedTest,
-    titles: Sequence[str],
-    *,
-    limits: pd.DataFrame,
-    settings: pd.DataFrame,
-) -> dict[str, pd.DataFrame]:
-    """The tables of an answer, the summary first."""
-    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
-    return {"summary": summary, "limits": limits, "pairs": tested.pairs, "settings": settings}
 
 
 class _PairedTest(NamedTuple):

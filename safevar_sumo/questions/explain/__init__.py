@@ -69,7 +69,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
-NO_COLLISION_NUMBERS: JsonObject = dict.fromkeys(COLLISION_NUMBERS)
 LIMIT, QUICK_LIMIT = 40_000, 4_000
 """Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
 if all would take more, a random sample is analysed.
@@ -180,7 +179,7 @@ def explain(
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
-        **(_collision_numbers(verdicts, collisions) if has_drivers else NO_COLLISION_NUMBERS),
+        **_collision_numbers(verdicts, collisions if has_drivers else None),
         **(smallest.numbers if smallest is not None else {}),
     }
     verdict = verdict_on_failures(evaluator, population, tables["causes"])
@@ -243,19 +242,16 @@ def _counts(
     }
 
 
-def _collision_numbers(verdicts: pd.DataFrame, collisions: int) -> JsonObject:
+def _collision_numbers(verdicts: pd.DataFrame, collisions: int | None) -> JsonObject:
     """The numbers of all collisions, of those assessed that some driver avoids, and that even full
-    braking does not.
+    braking does not; undefined where no driver was asked.
     """
+    if collisions is None:
+        return dict.fromkeys(COLLISION_NUMBERS)
     is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
-    return dict(
-        zip(
-            COLLISION_NUMBERS,
-            (collisions, int(is_avoided.sum()), int(unavoidable.sum())),
-            strict=True,
-        )
-    )
+    numbers = collisions, int(is_avoided.sum()), int(unavoidable.sum())
+    return dict(zip(COLLISION_NUMBERS, numbers, strict=True))
 
 
 def draw_needed(answer: Answer) -> Figure:

@@ -59,14 +59,14 @@ def robust_shares(
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
         return np.full((len(settings), len(factors)), np.nan)
-    seed = evaluator.study.search.seed
+    seed = evaluator.seed
     neighbours = draw_neighbours(evaluator.characteristics, settings, seed, count)
     shares = []
     if evaluator.system.has_simulator:  # which keeps its own time step
         factors = (1.0,)
 
     # The share of neighbours that are unsafe, with each length of the time step.
-    with evaluator.stage(NEIGHBOURS, len(neighbours) * len(factors)):
+    with evaluator.phases.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)

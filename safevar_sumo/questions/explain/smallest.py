@@ -18,9 +18,9 @@ from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of, settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import Enumeration, enumerate_causes, staircase
-from safevar_sumo.questions.explain.robustness import robust_shares, robustness_in_words
-from safevar_sumo.questions.explain.tables import causes_holding
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.explain.robustness import robustness_in_words
+from safevar_sumo.questions.explain.tables import sureness
+from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate
 from safevar_sumo.questions.words import EXACT, join_phrases, number_of, percentage
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.vehicles import CharacteristicSet
@@ -210,7 +210,7 @@ class Smallest(NamedTuple):
         return sentence[:1].upper() + sentence[1:]
 
 
-def smallest_tables(smallest: Smallest | None) -> dict[str, pd.DataFrame]:
+def smallest_tables(smallest: Smallest | None) -> Frames:
     """The tables of causes and of the staircase; empty where the original itself is unsafe."""
     rows = [
         (
@@ -292,21 +292,10 @@ def _table(
         ).unsafe_shares
 
     # How sure each is.
-    robust = np.full(len(causes), np.nan)
-    if causes and not is_rated(evaluator.study):
-        robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
-    holding = causes_holding(evaluator, fits, causes, unsafe)
+    robust, holds, tried = sureness(evaluator, causes, unsafe, fits)
     rows = [
-        (
-            cause.changes,
-            len(cause.changes),
-            begins[index],
-            sum(int(is_cause[index]) for is_cause in holding) if holding else None,
-            len(holding) or None,
-            robust[index],
-            cause.outcome,
-        )
-        for index, cause in enumerate(causes)
+        (cause.changes, len(cause.changes), begin, held, tried, share, cause.outcome)
+        for cause, begin, held, share in zip(causes, begins, holds, robust, strict=True)
     ]
     rows.sort(key=lambda row: (-np.nan_to_num(row[5], nan=-1), -(row[3] or 0), row[1]))
     frame = pd.DataFrame(rows, columns=[*SMALLEST_COLUMNS])

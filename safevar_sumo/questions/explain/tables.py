@@ -37,9 +37,9 @@ from safevar_sumo.questions.preventability import (
     drivers_frame,
     has_reference_drivers,
 )
-from safevar_sumo.questions.tables import Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate, with_interval
 from safevar_sumo.questions.words import EXACT, number_of
-from safevar_sumo.records import BoolArray
+from safevar_sumo.records import FloatArray, NamedValues
 
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
@@ -184,15 +184,9 @@ def causes_table(
     study = evaluator.study
     unsafe = population.unsafe
 
-    # How robust each cause is.
+    # How robust each cause is, and with how many parameter sets it is one.
     causes = [cause for group in causes_of for cause in group]
-    robust = np.full(len(causes), np.nan)
-    if causes and not is_rated(study):
-        settings = settings_of(evaluator.characteristics, causes)
-        robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
-
-    # With how many parameter sets it is one.
-    holding = causes_holding(evaluator, fits, causes, unsafe)
+    robust, holds, tried = sureness(evaluator, causes, unsafe, fits)
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -221,8 +215,8 @@ def causes_table(
             "elsewhere": bool(elsewhere[index]),
             "share": shares[index],
             "robust_share": robust[index],
-            "holds": sum(int(is_cause[index]) for is_cause in holding) if holding else None,
-            "fits": len(holding) or None,
+            "holds": holds[index],
+            "fits": tried,
         }
         for index in order.tolist()
     ]
@@ -236,7 +230,7 @@ def causes_table(
 
 def printed_limits(
     model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
-) -> list[dict[str, dict[str, float]]]:
+) -> list[dict[str, NamedValues]]:
     """The columns encounter, boundary and single_boundary of causes as they are printed: rounded to
     the unsafe side, with as many digits as the vehicle needs to be unsafe.
     """
@@ -246,7 +240,7 @@ def printed_limits(
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
     whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
-    members = model.evaluator.characteristics
+    members = model.characteristics
     settings = np.array([members.setting(one, beyond=True) for one in whole])
     is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
     printed = [
@@ -272,24 +266,31 @@ def printed_limits(
     ]
 
 
-def causes_holding(
-    evaluator: Evaluator, sets: int, causes: Sequence[Cause], unsafe: Unsafe
-) -> list[BoolArray]:
-    """Whether each cause is one, with each of the first `sets` parameter sets."""
+def sureness(
+    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe, sets: int
+) -> tuple[FloatArray, list[int | None], int | None]:
+    """How sure causes are: the share of vehicles with nearly their values that are unsafe, in how
+    many of the first `sets` parameter sets each is one, and how many sets there are.
+    """
+    robust = np.full(len(causes), np.nan)
+    if causes and not is_rated(evaluator.study):
+        settings = settings_of(evaluator.characteristics, causes)
+        robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
     if not (sets and causes and evaluator.study.spread):
-        return []
+        return robust, [None] * len(causes), None
     studies = studies_of_sets(evaluator.study)[:sets]
-    with evaluator.stage(
+    with evaluator.phases.stage(
         OTHER_SETS, len(studies) * sum(1 + len(cause.changes) for cause in causes)
     ):
-        return [
+        are_one = [
             are_causes(evaluator.for_study(study, verified=0), causes, unsafe) for study in studies
         ]
+    return robust, np.sum(are_one, axis=0).tolist(), len(studies)
 
 
 def statistics_tables(
     needed: pd.DataFrame, failures: int, verdicts: pd.DataFrame, collisions: int
-) -> dict[str, pd.DataFrame]:
+) -> Frames:
     """The tables of characteristics and of drivers."""
     return {
         "characteristics": tabulate(

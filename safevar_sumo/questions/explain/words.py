@@ -24,7 +24,7 @@ from safevar_sumo.questions.words import (
     number_of,
     share_in_words,
 )
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.study import Study
 
 BEYOND = 256
@@ -82,7 +82,7 @@ def verdict_on_failures(
 
 
 def _beyond_in_words(
-    evaluator: Evaluator, unsafe: Unsafe, cause: dict[str, float], encounter: dict[str, float]
+    evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
 ) -> str:
     """The share of vehicles beyond all values of a cause, all else as in the original, that are
     unsafe, in a sentence; empty if there are none, or too few may be simulated.
@@ -94,7 +94,7 @@ def _beyond_in_words(
     is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
     if number < LEAST_NEIGHBOURS or not is_open.any():
         return ""
-    shares = np.random.default_rng(evaluator.study.search.seed).random((number, len(members)))
+    shares = np.random.default_rng(evaluator.seed).random((number, len(members)))
     vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
     runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
     share = share_in_words(float(np.mean(unsafe.of(runs))))

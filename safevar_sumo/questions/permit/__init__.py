@@ -6,21 +6,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import CARS_FILE, Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import (
+    CARS_FILE,
+    Criterion,
+    Fits,
+    LimitTexts,
+    Margin,
+    Range,
+    ValueTexts,
+    question,
+)
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
-from safevar_sumo.questions.models import check_margin, distance_to_keep, models_of
+from safevar_sumo.questions.falsify import budget_of
+from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of
@@ -32,9 +40,6 @@ from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study, limits_of, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""
@@ -54,8 +59,8 @@ def permit(
     evaluator: Evaluator,
     *,
     cars: Annotated[Any, CARS_FILE] = None,
-    set: Annotated[tuple[str, ...], "NAME=VALUE"] = (),
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    set: ValueTexts = (),
+    limits: LimitTexts = (),
     others: Literal["new"] | None = None,
     ignore: Annotated[tuple[str, ...], "COLUMN"] = (),
     need: Annotated[str | None, '"50 km/h"'] = None,
@@ -63,8 +68,7 @@ def permit(
     step: Annotated[float, Range(0, 1000, is_open=True)] = 1.0,
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int | None, Range(0, 1000)] = None,
-    attack: Annotated[int, Range(1000, 100_000_000)] = LEAST_SIMULATIONS,
+    fits: Fits = None,
     quick: bool = False,
     out: Annotated[str | None, "FILE.csv"] = None,
 ) -> Answer:
@@ -103,9 +107,6 @@ def permit(
         What is unsafe: a collision, a safety degree below X, or a metric beyond a limit.
     fits
         Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
-    attack
-        Number of simulations for each car and parameter set that search for an unsafe encounter up
-        to the speed found.
     quick
         A rough answer: the study's own parameter set alone, and a short search. The grid alone is
         driven, no car may drive without a limit, and no repair is named.
@@ -120,11 +121,16 @@ def permit(
     members = evaluator.characteristics.vehicle
     _check_forms(cars, set, limits, out)
     fleet = read_cars(study, cars, set, limits, others, ignore)
-    criterion = _criterion(evaluator, unsafe, margin)
+    criterion = keeping_distance(
+        evaluator,
+        evaluator.parse_criterion(COLLISION if unsafe is None else unsafe),
+        margin,
+        is_stated=unsafe is not None,
+    )
     models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
-    budget = max(attack, USUAL_BUDGET) if limits else attack
-    search = PermitSearch(models, span, values, 0 if quick else budget)
+    budget = 0 if quick else budget_of(quick=not limits)
+    search = PermitSearch(models, span, values, budget)
     asked = [Cars.one(setting) for setting in fleet.settings]
     if limits:
         asked = [_within(members, limits, study, fleet.settings[0])]
@@ -274,13 +280,3 @@ def _within(
         lower[column] = item.lower if limit.at_least is None else limit.at_least
         upper[column] = item.upper if limit.at_most is None else limit.at_most
     return Cars.within(lower, upper, study.search.seed)
-
-
-def _criterion(evaluator: Evaluator, unsafe: str | None, margin: float | None) -> Unsafe:
-    """What is unsafe: the stated criterion, or else a collision or less than the margin."""
-    criterion = evaluator.parse_criterion(COLLISION if unsafe is None else unsafe)
-    check_margin(criterion, margin)
-    criterion = replace(criterion, contact=evaluator.system.contact)
-    if not criterion.is_collision or (margin is None and unsafe is not None):
-        return criterion
-    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))

@@ -30,7 +30,7 @@ from safevar_sumo.questions.permit.rows import (
 from safevar_sumo.questions.permit.search import Permit, PermitSearch
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
 from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.results import identity_digest
@@ -118,9 +118,9 @@ class PermitAnswer:
 
     def _rows(
         self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
-    ) -> list[tuple[Any, ...]]:
+    ) -> Rows:
         """A row of `CARS` for each car, in the order of the list."""
-        vehicle = self.models.own.evaluator.characteristics.vehicle
+        vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
         words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)

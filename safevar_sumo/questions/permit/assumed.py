@@ -64,7 +64,7 @@ def worst_end_in_words(
         return ""
     # The car with each assumed value at either end, side by side. Any failure shows that it may
     # drive no faster, so the grid up to its own speed is enough, with the set that limits it.
-    vehicle = models.own.evaluator.characteristics.vehicle
+    vehicle = models.own.characteristics.vehicle
     (setting,) = fleet.settings
     cars = [
         Cars.one(with_value_of(setting, column, ends))

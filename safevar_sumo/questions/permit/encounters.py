@@ -84,18 +84,18 @@ class EncounterRange(NamedTuple):
 
     @property
     def number_of_characteristics(self) -> int:
-        return len(self.model.evaluator.characteristics.vehicle)
+        return len(self.model.characteristics.vehicle)
 
     @property
     def has_phases(self) -> bool:
         """Whether a setting ends with the phase of its encounter."""
-        return self.model.evaluator.characteristics.names[-1] == PHASE
+        return self.model.characteristics.names[-1] == PHASE
 
     def box(self, lower: FloatArray, upper: FloatArray, up_to: float) -> Box | None:
         """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
         None where there is nothing to search: no such encounter, or one vehicle in one.
         """
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         count = len(lower)
         ends = (
             np.concatenate([lower, members.lower[count:]]),
@@ -117,7 +117,7 @@ class EncounterRange(NamedTuple):
         """Encounters at a value of the parameter, as they are printed, shape (P, searched
         parameters): Sobol points and ends of all others.
         """
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         count = self.number_of_characteristics
         others = [
             at
@@ -134,7 +134,7 @@ class EncounterRange(NamedTuple):
 
     def as_printed(self, settings: FloatArray) -> FloatArray:
         """Settings with the encounters' values rounded as they are printed."""
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         rounded = settings.copy()
         for column in range(self.number_of_characteristics, len(members)):
             item = members.members[column]

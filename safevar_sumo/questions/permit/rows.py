@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from safevar_sumo.questions.counterexamples import failures_at
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.search import Permit
 from safevar_sumo.questions.permit.speeds import LimitingFailure
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
 from safevar_sumo.scenarios import searchable_in
 from safevar_sumo.study import PHASE, unit_text
@@ -73,7 +73,7 @@ def failures_in_words(
     for numbers in of_range.values():
         known = [failure for number in numbers if (failure := failures[number]) is not None]
         model = known[0].encounters.model
-        members = model.evaluator.characteristics
+        members = model.characteristics
         point = model.evaluator.system.points[0]
         rows = np.array([failure.setting for failure in known])
         described = failures_at(model, rows)
@@ -143,9 +143,7 @@ def because(
     return f"As fast as the new car, which is safe {span.up_to(new_car)}: {words.sentence}."
 
 
-def set_rows(
-    names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
-) -> list[tuple[Any, ...]]:
+def set_rows(names: Sequence[str], permits: Sequence[Permit], *, with_car: bool) -> Rows:
     """The rows of `SETS`."""
     reached = [
         (name, each) for name, permit in zip(names, permits, strict=True) for each in permit.reached

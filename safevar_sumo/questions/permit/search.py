@@ -127,7 +127,7 @@ class PermitSearch:
             search = SpeedSearch(
                 self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name
             )
-            with model.evaluator.stage(name):
+            with model.evaluator.phases.stage(name):
                 search.drive_grid()
                 if self._budget:
                     search.falsify(self._budget)
@@ -157,6 +157,7 @@ class PermitSearch:
         bounds = list[dict[int, float]]()
         failures = list[list[LimitingFailure]]()
         best = list[tuple[int, Permit] | None]([None] * len(settings))
+        known = [permit.order for permit in permits]  # with the best repair so far
         for row, permit in enumerate(permits):
             worn = np.flatnonzero(measured[row] & (settings[row] != original))
             is_limited = permit.up_to is None or permit.up_to < top
@@ -167,8 +168,7 @@ class PermitSearch:
             # The most promising repair of each car, unless a better one is known.
             chosen = dict[int, int]()
             for row, of_car in enumerate(bounds):
-                known = self._best_of(permits[row], best[row]).order
-                for column in [column for column, most in of_car.items() if most <= known]:
+                for column in [column for column, most in of_car.items() if most <= known[row]]:
                     del of_car[column]
                 if of_car:
                     chosen[row] = max(of_car, key=of_car.__getitem__)
@@ -177,19 +177,16 @@ class PermitSearch:
                 Cars.one(with_value_of(settings[row], column, original))
                 for row, column in chosen.items()
             ]
-            above = [self._best_of(permits[row], best[row]).order for row in chosen]
+            above = [known[row] for row in chosen]
             driven = self.reach(cars, above, REPAIR_STAGE) if cars else []
-            for (row, column), permit, known in zip(chosen.items(), driven, above, strict=True):
-                if permit.order > known:
+            for (row, column), permit in zip(chosen.items(), driven, strict=True):
+                if permit.order > known[row]:
                     best[row] = column, permit
+                    known[row] = permit.order
                 failures[row] = [
                     each.failure for each in permit.reached if each.failure is not None
                 ]
         return best
-
-    def _best_of(self, permit: Permit, repaired: tuple[int, Permit] | None) -> Permit:
-        """A car with its best repair so far, or as it is."""
-        return permit if repaired is None else repaired[1]
 
     def _lower(
         self,

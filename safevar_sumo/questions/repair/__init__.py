@@ -10,11 +10,11 @@ driving system is the change of no parameter.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 import pandas as pd
@@ -27,11 +27,12 @@ from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.box import Proof
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair.price import price_of
@@ -39,12 +40,9 @@ from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parame
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import CONFIDENCE, sobol_points
 from safevar_sumo.questions.words import bound_in_words, encounter_in_words, join_phrases
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, unit_text, write_study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 ROUNDS_STAGE, USUAL_ROUNDS = "smallest change that survives", 8
 """The phase of progress, and its usual number of rounds: each takes about the simulations of a
@@ -132,11 +130,11 @@ def repair(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    promise: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    promise: LimitTexts = (),
     margin: Margin = None,
     unsafe: Criterion = None,
     change: Annotated[tuple[str, ...], "PARAMETER"] = (),
-    fits: Annotated[int | None, Range(0, 1000)] = None,
+    fits: Fits = None,
     out: Annotated[str | None, "FILE.toml"] = None,
     at_tests: bool = False,
     quick: bool = False,
@@ -193,7 +191,8 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * (LEAST_SIMULATIONS if quick else USUAL_BUDGET)})
+    budget = budget_of(quick=quick)
+    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * budget})
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -202,7 +201,7 @@ def repair(
             parameters=parameters,
             unsafe=model.unsafe,
             fit=model.fit,
-            budget=LEAST_SIMULATIONS if quick else USUAL_BUDGET,
+            budget=budget,
         )
         for model in models.members
     ]
@@ -226,7 +225,7 @@ def repair(
     survivors = Survivors([], len(problems), ())
     worst = vehicles[0]
     if is_repairable.any():
-        with evaluator.stage(ROUNDS_STAGE):
+        with evaluator.phases.stage(ROUNDS_STAGE):
             survivors = find_survivors(problems, between, vehicles[is_repairable])
         worst = vehicles[is_repairable][0]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
@@ -255,7 +254,7 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     return rows[problem.holds(rows)]
 
 
-def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[str, float]]:
+def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[NamedValues]:
     """What no driving system can survive: the minimal causes of failures of full braking, shrunk to
     the limit; for each characteristic of a cause the value from which on even full braking at once
     fails.
@@ -266,7 +265,7 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[dict[s
     unsafe = problem.unsafe
     evenly_spaced = np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)
     causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
-    parts: dict[tuple[object, ...], dict[str, float]] = {}
+    parts: dict[tuple[object, ...], NamedValues] = {}
     for limits, cause in zip(find_cause_limits(driver, causes, unsafe), causes, strict=True):
         # Of equal causes in many encounters only the first counts.
         kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
@@ -279,7 +278,7 @@ def _answer_of(
     models: Models,
     survivors: Survivors,
     worst_today: Evaluations,
-    not_repairable: list[dict[str, float]],
+    not_repairable: list[NamedValues],
 ) -> Answer:
     """The answer from the changes that survive, each with its proof: today's parameters alone if
     they do.
@@ -335,7 +334,7 @@ def _verdict(
     *,
     worst: float,
     repairs: list[JsonObject],
-    not_repairable: list[dict[str, float]],
+    not_repairable: list[NamedValues],
 ) -> str:
     """Whether a repair is necessary, the smallest that was found and its price, and what no driving
     system survives.
@@ -459,7 +458,7 @@ def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, 
     )
 
 
-def _limits_in_words(problem: RepairProblem, part: Mapping[str, float]) -> str:
+def _limits_in_words(problem: RepairProblem, part: NamedValues) -> str:
     """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its
     encounter.
     """

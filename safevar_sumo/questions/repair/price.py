@@ -4,7 +4,6 @@ needlessly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -14,7 +13,8 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.questions.braking import brake_onset
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import MatrixTable, Study
 from safevar_sumo.sumo.encounters import encounter
@@ -27,7 +27,7 @@ speed.
 """
 
 
-def price_of(study: Study, values: Mapping[str, float], encounters: FloatArray) -> JsonObject:
+def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
     """The price of other values of parameters against today's, by the names of the answer's
     columns; None where the new vehicle brakes nowhere. `encounters` are new vehicles in K
     encounters, shape (K, n).
@@ -58,7 +58,7 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
     """Where and when the new vehicle begins to brake at each of N points in each of K encounters,
     shape (2, N K), NaN if it does not [m, s]; its largest deceleration [m/s^2].
     """
-    onsets = list[tuple[float, float]]()
+    onsets = list[Interval]()
     deceleration = 0.0
     for result, row in product(simulate_all_points(system, encounters), range(len(encounters))):
         trace = result.runs.trace

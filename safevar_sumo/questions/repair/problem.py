@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads import ADS
@@ -26,7 +25,14 @@ from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.words import join_phrases
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, differences
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    IntArray,
+    NamedValues,
+    differences,
+)
 from safevar_sumo.study import PHASE, FreeParameter, ModelTable, Study, limits_of
 from safevar_sumo.study.characteristics import check_limits
 from safevar_sumo.sumo.system import assemble
@@ -282,7 +288,7 @@ class RepairProblem:
         ]
         return np.stack(columns, axis=1)
 
-    def changed_values(self, change: FloatArray) -> dict[str, float]:
+    def changed_values(self, change: FloatArray) -> NamedValues:
         """The values of the parameters that a change, one set of shape (P,), changes, by name."""
         (values,) = self.values(change[np.newaxis]).tolist()
         names = [parameter.name for parameter in self.parameters]
@@ -326,7 +332,7 @@ class RepairProblem:
 
     def robustness_of_each(
         self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
-    ) -> tuple[FloatArray, npt.NDArray[np.intp] | None]:
+    ) -> tuple[FloatArray, IntArray | None]:
         """What each of M sets of parameters leaves to the limit with each of L settings, shape (M,
         L), and the worst points of these M L rows; None without a matrix.
         """

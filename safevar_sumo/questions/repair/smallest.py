@@ -13,10 +13,9 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.questions.repair.problem import RepairProblem
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, IntArray
 
 MOST_CHANGED = 2
 """Largest number of parameters that change together."""
@@ -168,7 +167,7 @@ class Search:
                 rows = rows[self._survivors(changes[rows], [failure])]
         return None
 
-    def _survivors(self, changes: FloatArray, failures: Sequence[Failure]) -> npt.NDArray[np.intp]:
+    def _survivors(self, changes: FloatArray, failures: Sequence[Failure]) -> IntArray:
         """The rows of the changes that survive the settings of failures at their points; few at a
         time.
         """

@@ -39,6 +39,7 @@ from safevar_sumo.questions.research_questions.fronts import (
 )
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import (
+    AS_PUBLISHED,
     CAUSES,
     CHOSEN,
     DIVERSITY,
@@ -80,9 +81,10 @@ def tables(
     """Answer the research questions of the paper from results, one for each case, as tables and
     figures.
 
-    RQ1 over runs leads; `--details` and JSON have every table, and `--table` prints any. Two tables
-    are computed only by `--table NAME`: `budget` compares the algorithms after equal numbers of
-    simulations, and `diversity` simulates the distinct minimal causes of their failures.
+    RQ1 over runs leads; JSON has every table, `--details` all but those that pool the solutions of
+    runs, `rq1` and `rq2`, and `--table` prints any. Two tables are computed only by `--table NAME`:
+    `budget` compares the algorithms after equal numbers of simulations, and `diversity` simulates
+    the distinct minimal causes of their failures.
 
     Parameters
     ----------
@@ -129,9 +131,10 @@ def tables(
     options = {"algorithm": algorithm, "alpha": alpha, "causes": causes, "table": asked}
     for name, value in options.items():
         words += [f"--{name}", quote(str(value))] if value not in ("", ALPHA, 0) else []
-    main_tables = OVER_RUNS if any(case.has_runs for case in cases) else POOLED
-    lead = next((name for name in main_tables if name in answer.tables), "")
-    return replace(answer, command=" ".join(words), lead=lead)
+    has_runs = any(case.has_runs for case in cases)
+    lead = next((name for name in (OVER_RUNS if has_runs else POOLED) if name in answer.tables), "")
+    folded = AS_PUBLISHED if has_runs else ()
+    return replace(answer, command=" ".join(words), lead=lead, folded=folded)
 
 
 def figures(*results: Results | str | Path) -> dict[str, Figure]:
@@ -266,7 +269,7 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     """What a case's frame leaves out."""
     # What each table cannot say.
     remarks = list[str]()
-    if table in ("rq1", "rq2"):
+    if table in AS_PUBLISHED:
         remarks += _on_pooled_tests(table, case, frame, alpha)
     if table in POOLED:
         remarks.append(_equal_solutions(case))

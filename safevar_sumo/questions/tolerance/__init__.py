@@ -5,15 +5,16 @@ The filter of small changes is not applied, as the question is about the vehicle
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion, Margin, Range, question
+from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, USUAL_BUDGET
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
@@ -30,9 +31,6 @@ from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.wider import WIDER
 from safevar_sumo.study import Study
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 
 @question
@@ -52,12 +50,11 @@ def tolerance(
     subject: Study | Case,
     evaluator: Evaluator,
     *,
-    limits: Annotated[tuple[str, ...], '"NAME >= X"'] = (),
+    limits: LimitTexts = (),
     characteristics: Annotated[tuple[str, ...], "A,B"] = (),
     margin: Margin = None,
     unsafe: Criterion = None,
-    fits: Annotated[int | None, Range(0, 1000)] = None,
-    attack: Annotated[int, Range(0, 100_000_000)] = USUAL_BUDGET,
+    fits: Fits = None,
     up_to: Annotated[str | None, "NAME=V"] = None,
     at_tests: bool = False,
     quick: bool = False,
@@ -86,10 +83,6 @@ def tolerance(
     fits
         Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
-    attack
-        Number of simulations that search for a counterexample to the joint limits, over all
-        parameter sets, at least 1,000; 0 leaves this search out, and then no limit is called kept.
-        With fewer than by default the answer is rough.
     up_to
         Limits that hold up to a value of a searched parameter or of an axis of the matrix, such as
         speed=40: encounters with a larger value do not count.
@@ -104,10 +97,11 @@ def tolerance(
     if up_to is not None:
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
-    budget = min(attack, LEAST_SIMULATIONS) if quick else attack
+    budget = budget_of(quick=quick)
+    fits = 0 if quick else fits
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
-    phases = phases_of(evaluator, len(columns), budget, 0 if quick else fits)
+    phases = phases_of(evaluator, len(columns), budget, fits)
     planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
     evaluator.plan(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
     specified = specified_limits(study, limits, columns)
@@ -127,7 +121,7 @@ def tolerance(
         original=original,
         criterion=unsafe,
         margin=margin,
-        fits=0 if quick else fits,
+        fits=fits,
         budget=budget,
         is_quick=quick,
         at_tests=at_tests,

@@ -26,9 +26,9 @@ VALUES = 17
 each model.
 """
 FALSIFICATIONS, FALSIFICATION_SHARE, GENERATIONS = 20, 0.1, 5
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of
-`--attack` of each, though never less than `LEAST_SIMULATIONS`, and its number of generations, the
-first at the limit itself.
+"""Largest number of attacks on a limit, in a study that searches its scenario; the share of the
+simulations that search for a counterexample of each, though never less than `LEAST_SIMULATIONS`,
+and its number of generations, the first at the limit itself.
 """
 ALONE_STAGE = "limits alone with each parameter set"
 Beyond = tuple[FloatArray, Model] | None
@@ -82,7 +82,7 @@ class AloneLimit(NamedTuple):
         return self._replace(safe=(low, high), beyond=(below, above))
 
     def _change(self, setting: FloatArray, model: Model) -> float:
-        column = model.evaluator.characteristics.names.index(self.characteristic.name)
+        column = model.characteristics.names.index(self.characteristic.name)
         return abs(float(setting[column]) - self.characteristic.original)
 
 
@@ -138,20 +138,22 @@ class AloneSearch:
         self.models.append(model)
         if not self.ends:
             return
-        has_moved = _move_before(self.ends, model, self._encounters, VALUES)
-        has_moved |= any([_move_between(self.ends, test) for test in tests])
-        # The ends as they are printed, until all are safe in all models: where one moves, it is new
-        # to the others.
-        while has_moved:
-            at_ends = [_move_before(self.ends, each, self._encounters, 2) for each in self.models]
-            has_moved = any(at_ends)
-            has_moved |= any([_move_between(self.ends, test) for test in tests])
+        # Then the ends as they are printed, until all are safe in all models: where one moves, it
+        # is new to the others.
+        models, number = [model], VALUES
+        while any(
+            [
+                *[_move_before(self.ends, each, self._encounters, number) for each in models],
+                *[_move_between(self.ends, test) for test in tests],
+            ]
+        ):
+            models, number = self.models, 2
 
     def attack(self, model: Model, budget: int) -> None:
         """Move ends in before what a falsification in a model finds in other encounters, in a study
         that searches its scenario.
         """
-        if self.ends and budget and len(model.evaluator.characteristics.scenario):
+        if self.ends and len(model.characteristics.scenario):
             share = max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
             _falsify_alone(self.ends, model, share)
 
@@ -178,7 +180,7 @@ def _find_beyond(ends: Sequence[_Ends], own: Model) -> None:
     """Find what is just beyond the ends of scans: their first unsafe values, each in its worst
     encounter.
     """
-    members = own.evaluator.characteristics
+    members = own.characteristics
     places = [(each, side, each.first_unsafe(side)) for each in ends for side in (0, 1)]
     found = [(each, side, value) for each, side, value in places if value is not None]
     settings = np.array([members.setting({each.item.name: value}) for each, _, value in found])
@@ -205,7 +207,7 @@ def _move_between(ends: Sequence[_Ends], test: MovingTest) -> bool:
     moved.
     """
     vehicles = [_settings_within(each, test.original[np.newaxis], 2) for each in ends]
-    rng = Stream.TESTS_BETWEEN.generator(test.model.evaluator.study.search.seed)
+    rng = Stream.TESTS_BETWEEN.generator(test.model.evaluator.seed)
     settings = [test.spread(rows, rng) for rows in vehicles]
     robustness = test.robustness(np.concatenate(settings), ALONE_STAGE)
     is_unsafe = np.split(robustness < 0, np.cumsum([*map(len, settings)])[:-1])
@@ -270,8 +272,8 @@ def _by_side(ends: _Ends, failures: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def _falsify_alone(ends: Sequence[_Ends], model: Model, budget: int) -> None:
     """Falsify the limits in encounters that no scan met, until nothing is found."""
-    members = model.evaluator.characteristics
-    seed = model.evaluator.study.search.seed
+    members = model.characteristics
+    seed = model.evaluator.seed
     judges = judges_of([model], "falsification of limits alone")
     waiting = [*ends]
     nothing = np.zeros((0, len(members)))

@@ -64,16 +64,6 @@ class Asked(NamedTuple):
     smaller: Sequence[Evaluator] = ()
 
     @property
-    def drives_between(self) -> bool:
-        """Whether limits are falsified between the tests of a matrix."""
-        return self.budget > 0 and not self.at_tests
-
-    @property
-    def may_keep(self) -> bool:
-        """Whether limits may be called kept: a search for counterexamples met all that counts."""
-        return self.budget > 0 and not self.is_quick
-
-    @property
     def unsafe_solutions(self) -> FloatArray:
         """The distinct unsafe solutions of results that change no other characteristics than those
         that vary, and parameters of the scenario; shape (K, n).
@@ -93,7 +83,7 @@ class Asked(NamedTuple):
         is_inside = (settings >= members.lower) & (settings <= members.upper)
         settings = settings[is_inside.all(axis=1)]
         evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
-        return np.asarray(settings[evaluations.valid & self.unsafe.of(evaluations)])
+        return settings[evaluations.valid & self.unsafe.of(evaluations)]
 
 
 def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:

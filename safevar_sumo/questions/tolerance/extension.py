@@ -57,28 +57,26 @@ class Extension:
         """
         moved = None
         for stride in STRIDES:
-            wider = self.validation(box, step, stride)
+            wider = self.moved(box, step, stride)
             if wider is None or self._is_blocked(box, wider, step):
                 break
             moved = wider
         return moved
 
-    def validation(self, box: Box, step: Step, stride: int = 1) -> Box | None:
+    def moved(self, box: Box, step: Step, stride: int = 1) -> Box | None:
         """The box with one limit moved out by some moves, rounded; None at the end of the
         domain.
         """
         side, column = step
         item = self.search.characteristics.members[column]
-        end = (box.lower, box.upper)[side][column]
+        end = box.end(side, column)
         last = (item.lower, item.upper)[side]
         if end == last:
             return None
         move = max(LEAST_MOVE * (item.upper - item.lower), 10.0**-item.digits)
         place = item.rounded(end + (-1, 1)[side] * stride * move, upwards=side == 0)
         place = max(place, last) if side == 0 else min(place, last)
-        ends = [box.lower.copy(), box.upper.copy()]
-        ends[side][column] = place
-        return Box(box.region, *ends)
+        return box.with_end(side, column, place)
 
     def _is_blocked(self, box: Box, wider: Box, step: Step) -> bool:
         search = self.search
@@ -86,22 +84,16 @@ class Extension:
         sides = search.sides_of(wider)
         if sides[side, column] > search.longest[side, column] or len(search.unsafe_inside(sides)):
             return True
-        end = (wider.lower, wider.upper)[side][column]
-        ends = [wider.lower.copy(), wider.upper.copy()]
-        for values in ends:
-            values[column] = end
-        slab = Box(wider.region, *ends).corners(search.seed, 1)
+        slab = wider.with_end(1 - side, column, wider.end(side, column)).corners(search.seed, 1)
         slab = np.random.default_rng(search.seed).permutation(slab)[:SLAB_CORNERS]
         settings = np.concatenate([slab, search.settings_at_end(sides, step)])
         if search.have_unsafe(settings[np.newaxis])[0]:
             return True
-        beyond = [wider.lower.copy(), wider.upper.copy()]
-        beyond[1 - side][column] = (box.lower, box.upper)[side][column]
         judges = judges_of(search.first_models, SEARCH_STAGE)
         rng = Stream.EXTENSION.generator(search.seed, side, column)
-        room = Box(wider.region, *beyond)
+        room = wider.with_end(1 - side, column, box.end(side, column))
         found = falsify(room, judges, [slab[:KNOWN_CORNERS]], SLAB_SIMULATIONS, rng).failures
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, *found.values()])
+        search.know(*found.values())
         return bool(found)
 
     def cut(self, box: Box, clearance: float, avoided: Sequence[FloatArray] = ()) -> Box:
@@ -153,7 +145,7 @@ class Extension:
         """For each limit that could move out further, a known failure that it then meets."""
         beyond = dict[tuple[int, int], FloatArray]()
         for side, column in np.argwhere(self.search.domain > 0).tolist():
-            wider = self.validation(box, (side, column))
+            wider = self.moved(box, (side, column))
             if wider is not None:
                 for setting in self.search.unsafe_inside(self.search.sides_of(wider))[:1]:
                     beyond[side, column] = setting

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.bars import bars_of, draw_bars
@@ -53,7 +54,7 @@ class _Search:
     tried: int = 0
 
     def __post_init__(self) -> None:
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         varies = ~members.of_vehicle
         varies[self.columns] = True
         self.low = np.where(varies, members.lower, members.original)
@@ -73,7 +74,7 @@ class _Search:
 
     def limit_alone(self) -> None:
         """Move each side to the last value that is safe if its characteristic alone changes."""
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         ends = [
             members.setting({members.names[column]: value})
             for column in self.columns
@@ -85,7 +86,7 @@ class _Search:
 
     def needed(self, failure: FloatArray) -> FloatArray:
         """A failure, shape (n,), without the changes that it does not need, one after another."""
-        original = self.model.evaluator.characteristics.with_original_vehicle(failure[np.newaxis])
+        original = self.model.characteristics.with_original_vehicle(failure[np.newaxis])
         least = failure.copy()
         for column in self.columns:
             tried = least.copy()
@@ -107,7 +108,7 @@ class _Search:
         """Move the sides that failures reach, shape (K, n), each to the last safe place on the line
         from the original vehicle in the same encounter.
         """
-        members = self.model.evaluator.characteristics
+        members = self.model.characteristics
         starts = members.with_original_vehicle(failures)
         if not len(failures):
             return
@@ -125,9 +126,9 @@ class _Search:
                     self.high[column] = max(min(self.high[column], end), start[column])
         self.corners = self.tried = 0
 
-    def test_corners(self, rng: np.random.Generator) -> None:
+    def test_corners(self, rng: Generator) -> None:
         """Test corners, all if they are few, until none of them is unsafe."""
-        of_vehicle = self.model.evaluator.characteristics.of_vehicle
+        of_vehicle = self.model.characteristics.of_vehicle
         most = int(CORNER_SHARE * self.left)
         while most and self.left > most + self.cost:
             is_open = np.flatnonzero((self.low < self.high) & of_vehicle)
@@ -142,7 +143,7 @@ class _Search:
                 return
             self.cut(unsafe)
 
-    def falsify(self, rng: np.random.Generator) -> bool:
+    def falsify(self, rng: Generator) -> bool:
         """Search for counterexamples with what is left; whether the last of them was cut off, and
         vehicles in the box were tried after it.
         """
@@ -161,7 +162,7 @@ def answer_roughly(asked: Asked) -> Answer:
     evaluator = asked.evaluator
     members = evaluator.characteristics
     search = _Search(Model(0, evaluator, asked.unsafe), asked.columns)
-    seed = evaluator.study.search.seed
+    seed = evaluator.seed
     search.limit_alone()
     alone = search.low.copy(), search.high.copy()
     search.test_corners(Stream.FIRST_CORNERS.generator(seed))
@@ -197,7 +198,7 @@ def answer_roughly(asked: Asked) -> Answer:
 
 def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: bool) -> str:
     """What was found, and which characteristics can make the vehicle unsafe on their own."""
-    members = search.model.evaluator.characteristics
+    members = search.model.characteristics
     words = "No vehicle that was tried within the joint limits is unsafe."
     if not is_tested:
         words = "The simulations did not suffice to try vehicles within the joint limits."

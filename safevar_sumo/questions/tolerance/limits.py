@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,12 +16,11 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import USUAL_BUDGET, enough
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, tabulate
+from safevar_sumo.questions.tables import Column, Columns, Frames, Rows, tabulate
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.rows import (
@@ -47,9 +46,9 @@ from safevar_sumo.questions.tolerance.wider import (
     usual_settings,
     wider_rows,
 )
-from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences, why_not_kept
+from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles.region import REJECTIONS
 
@@ -131,9 +130,7 @@ class FoundLimits(NamedTuple):
         return all(one.safe is not None for one in self.scans)
 
 
-def phases_of(
-    evaluator: Evaluator, columns: int, budget: int, fits: int | None
-) -> dict[str, float]:
+def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None) -> NamedValues:
     """The phases of progress, each with the number of settings that it usually simulates."""
     study = evaluator.study
     points = len(evaluator.system.points)
@@ -141,10 +138,10 @@ def phases_of(
     if is_rated(study):
         return phases
     sets = len(studies_of_sets(study)[1:fits]) if study.spread and fits != 0 else 0
-    own = USUAL_BOXES * enough(max(budget, 1)) / points
+    own = USUAL_BOXES * budget / points
     of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
     phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
-    if study.wider and budget:
+    if study.wider:
         phases[WIDER_STAGE] = SLOWNESS * usual_settings(evaluator, budget, 1 + sets)
     return phases
 
@@ -210,7 +207,7 @@ def _find_together(
         item.name: Limit(at_least=item.lower, at_most=item.upper) for item in members.scenario
     }
     tests = {
-        model.fit: moving_tests(model, asked.unsafe) if asked.drives_between else []
+        model.fit: [] if asked.at_tests else moving_tests(model, asked.unsafe)
         for model in models.members
     }
     joint = JointSearch(models, tests, columns, {**asked.limits, **everywhere}, asked.budget, outer)
@@ -243,10 +240,10 @@ def answer_limits(asked: Asked) -> Answer:
     found = find_nested_limits(asked)
     models = found.models
     together = found.together
-    scope = scope_of(study, between=asked.drives_between)
-    rows = limit_rows(found.alone, together, asked.limits, models.members, scope)
-    if not asked.may_keep:
-        rows = rows.without_kept()
+    scope = scope_of(study, between=not asked.at_tests)
+    rows = limit_rows(
+        found.alone, together, asked.limits, models.members, scope, is_rough=asked.is_quick
+    )
     nearest = []
     if rows.broken and together is not None:
         nearest = nearest_limits(models, asked.limits)
@@ -257,11 +254,13 @@ def answer_limits(asked: Asked) -> Answer:
         refusal = f"the original vehicle itself {breach}: no limit can be kept"
         demand = f"{refusal}. {asked.unsafe.smaller_demand(asked.original)}".strip()
     failures = (refusal,) if refusal else tuple(f"limit of {text}" for text in rows.broken)
-    is_kept = None if not failures and not asked.may_keep else not failures
+    is_kept = None if not failures and asked.is_quick else not failures
+    if is_kept is None and asked.limits:
+        failures = ("with --quick, no limit is called kept: ask without it",)
     sentences = verdict_sentences(
         models, found.alone, together, asked, rows.broken, nearest, wider, demand
     )
-    tested = tested_sentences(models, together, asked.budget)
+    tested = tested_sentences(models, together)
     return Answer(
         question="tolerance",
         study=study,
@@ -271,13 +270,13 @@ def answer_limits(asked: Asked) -> Answer:
             "unsafe": str(asked.unsafe),
             "margin": asked.unsafe.keep,
             "kept": is_kept,
-            "rough": asked.budget < USUAL_BUDGET,
+            "rough": asked.is_quick,
             "scope": scope,
             "up_to": None if asked.up_to is None else float(asked.up_to.partition("=")[2]),
             **_numbers(found),
         },
         tables=_tables(found, rows.rows, nearest, wider),
-        failures=(why_not_kept(asked),) if is_kept is None and asked.limits else failures,
+        failures=failures,
         draw=draw_bars,
     )
 
@@ -289,12 +288,7 @@ def _numbers(found: FoundLimits) -> JsonObject:
     return {**found.together.numbers, "fits_tried": len(found.models.members)}
 
 
-def _tables(
-    found: FoundLimits,
-    rows: Sequence[tuple[Any, ...]],
-    nearest: Sequence[tuple[Any, ...]],
-    wider: Sequence[tuple[Any, ...]],
-) -> dict[str, pd.DataFrame]:
+def _tables(found: FoundLimits, rows: Rows, nearest: Rows, wider: Rows) -> Frames:
     """The tables of an answer, the limits first; those without rows are left out."""
     scans = found.scans
     # Joint limits lead, without those of the whole domain; else those of each alone.
@@ -338,9 +332,7 @@ def _check_drawable(evaluator: Evaluator) -> None:
     members = evaluator.characteristics
     region = evaluator.region
     if not len(
-        Box(region, members.lower, members.upper).draw(
-            1, np.random.default_rng(evaluator.study.search.seed)
-        )
+        Box(region, members.lower, members.upper).draw(1, np.random.default_rng(evaluator.seed))
     ):
         problem = (
             f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
@@ -379,7 +371,7 @@ def _intervals(scans: Sequence[OneAtATimeScan]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)[[*INTERVALS]]
 
 
-def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]:
+def _fit_rows(models: Models, together: LimitsTogether) -> Rows:
     """A row of `FITS` for each parameter set."""
     states = {fit: "kept" for fit in models.fits} | dict.fromkeys(together.broken, "not kept")
     states |= {model.fit: "left out" for model in models.left_out}
@@ -391,7 +383,7 @@ def _fit_rows(models: Models, together: LimitsTogether) -> list[tuple[Any, ...]]
     return [(fit, state, corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
 
 
-def _lost_points(scans: Sequence[OneAtATimeScan]) -> list[tuple[Any, ...]]:
+def _lost_points(scans: Sequence[OneAtATimeScan]) -> Rows:
     """A row of `POINTS` for each characteristic."""
     return [
         (

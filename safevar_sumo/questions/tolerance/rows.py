@@ -5,7 +5,7 @@ safe side.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import join_phrases
@@ -88,19 +88,8 @@ class LimitRows(NamedTuple):
     Nothing is said of limits around an unsafe original.
     """
 
-    rows: list[tuple[Any, ...]]
+    rows: Rows
     broken: list[str]
-
-    def without_kept(self) -> LimitRows:
-        """The rows of limits that nothing searched for a counterexample: none of them is called
-        kept.
-        """
-        place = [*LIMITS].index("kept")
-        rows = [
-            (*row[:place], None if row[place] else row[place], *row[place + 1 :])
-            for row in self.rows
-        ]
-        return self._replace(rows=rows)
 
 
 def limit_rows(
@@ -109,10 +98,13 @@ def limit_rows(
     limits: Mapping[str, Limit],
     models: Sequence[Model],
     scope: str,
+    *,
+    is_rough: bool,
 ) -> LimitRows:
     """The rows of the table of limits, whose sentences carry their scope.
 
-    `together` is None in a rated study, and around an unsafe original.
+    `together` is None in a rated study, and around an unsafe original. None is called kept where
+    the answer is rough.
     """
     beyond_alone = _failures_alone(alone)
     beyond = {} if together is None else _failures_beyond(together, models)
@@ -124,7 +116,8 @@ def limit_rows(
         limit = limits.get(item.name)
         specified = NOWHERE if limit is None else (limit.at_least, limit.at_most)
         box = None if together is None else together.box
-        column = models[0].evaluator.characteristics.names.index(name)
+        members = models[0].characteristics
+        column = members.names.index(name)
         ends = None if box is None else (float(box.lower[column]), float(box.upper[column]))
         failure = (beyond_alone if box is None else beyond).get(name)
         is_kept = None if limit is None else _is_kept(each, specified, together)
@@ -132,18 +125,13 @@ def limit_rows(
             broken.append(
                 _broken_in_words(each, specified, together, beyond_alone.get(name), models)
             )
-        members = models[0].evaluator.characteristics
         rows.append(
             (
                 *(name, item.unit, item.original),
                 *(*(each.safe or NOWHERE), *(ends or NOWHERE), *specified),
-                is_kept,
+                None if is_kept and is_rough else is_kept,
                 None if failure is None else failure.words,
-                (
-                    None
-                    if failure is None
-                    else dict(zip(members.names, failure.setting.tolist(), strict=True))
-                ),
+                None if failure is None else members.named(failure.setting),
                 None if failure is None else failure.command,
                 (
                     None
@@ -155,7 +143,7 @@ def limit_rows(
     return LimitRows(rows, broken)
 
 
-def uncertainty_rows(alone: Sequence[AloneLimit]) -> list[tuple[Any, ...]]:
+def uncertainty_rows(alone: Sequence[AloneLimit]) -> Rows:
     """A row of `UNCERTAINTY` for each characteristic whose limit alone is closer than in the
     scan.
     """
@@ -180,7 +168,7 @@ def _is_kept(alone: AloneLimit, specified: Ends, together: LimitsTogether | None
     )
 
 
-def _outside(alone: AloneLimit, specified: Ends) -> tuple[float, float]:
+def _outside(alone: AloneLimit, specified: Ends) -> Interval:
     """How far the user's limit is outside what is safe alone [unit], 0 if it is inside, and the end
     that is.
     """
@@ -203,7 +191,7 @@ def _broken_in_words(
     item = alone.characteristic
     by, end = _outside(alone, specified)
     if by:
-        members = models[0].evaluator.characteristics
+        members = models[0].characteristics
         # At the specified value itself the original encounter may be safe; then what fails beyond
         # the limit is said.
         for model in models:
@@ -238,7 +226,7 @@ def _failures_alone(alone: Iterable[AloneLimit]) -> dict[str, Failure]:
 def _failures_beyond(together: LimitsTogether, models: Sequence[Model]) -> dict[str, Failure]:
     """How the car fails just beyond each limit of the box, by its name."""
     failures: dict[str, Failure] = {}
-    names = models[0].evaluator.characteristics.names
+    names = models[0].characteristics.names
     waiting = {names[column]: setting for (_, column), setting in together.beyond.items()}
     for model in together.searched:
         if not waiting:

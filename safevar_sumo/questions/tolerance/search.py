@@ -139,7 +139,7 @@ class BoxGeometry:
         needs none.
         """
         change = settings - self.original
-        return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
+        return np.stack([-change, change], axis=1) - ROUNDING * self.width
 
     def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
         """A box with some sides moved outwards by a share of the domain, up to their longest."""
@@ -155,9 +155,7 @@ class BoxGeometry:
         shares = np.divide(
             boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0
         )
-        return np.asarray(
-            np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)
-        )  # finite for a width of 0, too
+        return np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)  # finite for a width of 0, too
 
 
 class BoxSearch(BoxGeometry):
@@ -192,7 +190,7 @@ class BoxSearch(BoxGeometry):
         self.corners = list[FloatArray]()
         self.gap = 0.0
         self.search_count = 0
-        self.seed = model.evaluator.study.search.seed
+        self.seed = model.evaluator.seed
         self.batch = max(BATCH // len(model.points or model.evaluator.system.points), LEAST_BATCH)
 
     def join(self, model: Model) -> None:
@@ -205,6 +203,10 @@ class BoxSearch(BoxGeometry):
                 del self.models[number]
                 break
         self.models.insert(0, model)
+
+    def know(self, *settings: FloatArray) -> None:
+        """Know unsafe settings, each of shape (K, n): no later box holds one of them."""
+        self.unsafe_settings = np.concatenate([self.unsafe_settings, *settings])
 
     @property
     def first_models(self) -> list[Model]:
@@ -219,7 +221,7 @@ class BoxSearch(BoxGeometry):
         (K, n).
         """
         is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
-        return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
+        return self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1]
 
     def needs(self, settings: FloatArray) -> FloatArray:
         """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2,
@@ -233,7 +235,7 @@ class BoxSearch(BoxGeometry):
         not.
         """
         needs = self.extents(self.unsafe_settings) if needs is None else needs
-        return np.asarray(self.unsafe_settings[(needs <= sides).all(axis=(1, 2))])
+        return self.unsafe_settings[(needs <= sides).all(axis=(1, 2))]
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one
@@ -259,7 +261,7 @@ class BoxSearch(BoxGeometry):
             if is_unsafe.any():
                 self.models.remove(model)
                 self.models.insert(0, model)
-            self.unsafe_settings = np.concatenate([self.unsafe_settings, rows[is_unsafe]])
+            self.know(rows[is_unsafe])
             has_unsafe[waiting] = is_unsafe.reshape(len(waiting), -1).any(axis=1)
         return has_unsafe
 
@@ -283,8 +285,7 @@ class BoxSearch(BoxGeometry):
         if len(known):
             return known
         points = self.points(sides, SEARCH_POINTS)
-        found = points[self.are_unsafe(points)]
-        return found
+        return points[self.are_unsafe(points)]
 
     def learn(self, settings: FloatArray, model: Model | None = None) -> FloatArray:
         """Add corners that are unsafe, from some settings that are unsafe in a model, or in any;
@@ -314,7 +315,7 @@ class BoxSearch(BoxGeometry):
         starts = ends.copy()
         starts[np.arange(len(rows)), columns] = self.original[columns]
         found = find_boundaries(starts, ends, partial(model.are_unsafe, stage=SEARCH_STAGE))
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, found.unsafe])
+        self.know(found.unsafe)
         nearest = causes.copy()
         nearest[rows, columns] = found.unsafe[np.arange(len(rows)), columns]
         return nearest
@@ -337,7 +338,7 @@ class BoxSearch(BoxGeometry):
             is_kept = ~(needs >= cause).all(axis=(1, 2))
             needs = needs[is_kept]
             self.unsafe_settings = self.unsafe_settings[is_kept]
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, np.unique(causes, axis=0)])
+        self.know(np.unique(causes, axis=0))
 
     def _causes(self, settings: FloatArray, model: Model | None) -> FloatArray:
         """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in
@@ -383,7 +384,7 @@ class BoxSearch(BoxGeometry):
         boxes = rows.reshape(-1, *self.domain.shape)
         needs = self.needs(self.unsafe_settings)
         holds_failure = [(needs <= box).all(axis=(1, 2)).any() for box in boxes]
-        return np.asarray(~self.are_safe(boxes) | holds_failure)
+        return ~self.are_safe(boxes) | holds_failure
 
     def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
         """A box within `start` that is safe at the known corners, and keeps off known unsafe
@@ -416,7 +417,7 @@ class BoxSearch(BoxGeometry):
         is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
         steps = rng.normal(0.0, deviation, shape) * is_moved
         boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
-        return np.asarray(boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN])
+        return boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN]
 
     def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
         """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
@@ -462,8 +463,7 @@ class BoxSearch(BoxGeometry):
         settings = np.concatenate(
             [self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)]
         )
-        box = self.box(sides)
-        settings[:, column] = (box.lower, box.upper)[side][column]
+        settings[:, column] = self.box(sides).end(side, column)
         return settings
 
     def best(self, start: FloatArray) -> FloatArray | None:

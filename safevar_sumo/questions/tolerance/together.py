@@ -11,9 +11,9 @@ import numpy as np
 
 from safevar_sumo.questions.between import MovingTest
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, enough
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.sampling import Interval, Stream
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import BoxSearch
@@ -101,7 +101,7 @@ class LimitsTogether(NamedTuple):
     beyond: Mapping[tuple[int, int], FloatArray] = {}
 
     @property
-    def least(self) -> tuple[float, float]:
+    def least(self) -> Interval:
         """The least that the falsification found [m]: over all parameter sets, and with the study's
         own; undefined without one.
         """
@@ -142,7 +142,7 @@ def broken_specification(
     model at the points where it is: those of the study, or between those of its `tests`.
     """
     stage = "specified limits with each parameter set"
-    seed = models[0].evaluator.study.search.seed
+    seed = models[0].evaluator.seed
     corners = specified.corners(seed, 0)[:MAX_CORNERS]
     settings = np.concatenate([corners, specified.spread_and_corners(SPECIFICATION_POINTS, seed)])
     settings = np.unique(settings, axis=0)
@@ -171,7 +171,7 @@ def _keeps_its_margin(specified: Box, model: Model) -> bool:
     that keeps a margin, and nothing but less than it would be unsafe: then no encounter that counts
     can break them.
     """
-    members = model.evaluator.characteristics
+    members = model.characteristics
     is_original = (specified.lower == members.original) & (specified.upper == members.original)
     if not len(members.scenario) or not is_original[members.of_vehicle].all():
         return False
@@ -225,7 +225,7 @@ class JointSearch:
         self._tests = tests
         self._columns = columns
         self._limits = limits
-        self._budget = enough(budget)
+        self._budget = budget
         self._search = BoxSearch(self.own, columns, limits, _nothing(self.own))
         specified = self._search.printed(self._search.fixed)
         self.found = LimitsTogether(
@@ -262,11 +262,7 @@ class JointSearch:
         if self._outer is not None:
             # Without joint limits there are none here: no free side has any room.
             search.stay_within(self._outer.box or self._outer.specified)
-            known = [
-                search.unsafe_settings,
-                *(row[np.newaxis] for row in self._outer.beyond.values()),
-            ]
-            search.unsafe_settings = np.concatenate(known)
+            search.know(*(row[np.newaxis] for row in self._outer.beyond.values()))
         boxes = _Boxes(search, _start_of(search, self._columns, scans))
         validator = self._validator(self.own, self._budget)
         self._validators = [validator]
@@ -311,7 +307,7 @@ class JointSearch:
         if model.fit in self.found.broken or outer is None:
             return
         search = self._search
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, unsafe_settings])
+        search.know(unsafe_settings)
         validator = self._validator(model, budget_of_set(self._budget), with_phases=True)
         extension = Extension(search)
         met = list[Model]()
@@ -389,18 +385,18 @@ def budget_of_set(budget: int) -> int:
     """Number of simulations of a falsification with another parameter set, or in a test that
     moves.
     """
-    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS) if budget else 0
+    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS)
 
 
 def _nothing(model: Model) -> FloatArray:
-    return np.zeros((0, len(model.evaluator.characteristics)))
+    return np.zeros((0, len(model.characteristics)))
 
 
 def _learn(search: BoxSearch, validation: Validation) -> Iterator[tuple[Failures, FloatArray]]:
     """Take failures, and the models in which they are, into a search; the causes of each."""
     for failures in validation.failures:
         search.join(failures.model)
-        search.unsafe_settings = np.concatenate([search.unsafe_settings, failures.settings])
+        search.know(failures.settings)
         yield failures, search.learn(failures.settings, failures.model)
 
 

@@ -96,7 +96,7 @@ class Validator:
         self.tests = tests
         self.budget, self.budget_between = budgets
         self._with_phases = with_phases
-        self.seed = model.evaluator.study.search.seed
+        self.seed = model.evaluator.seed
         self._judge = NarrowedJudge(model, VALIDATION_STAGE)
         self._worst = list[tuple[MovingTest | None, FloatArray]]()
         """The worst settings of the last box, at the tests and between them."""
@@ -113,7 +113,7 @@ class Validator:
         first = corners[:FIRST_CORNERS]
         is_searched = len(box.region.characteristics.scenario) > 0
         validation, robustness = self._test(Validation(box), first)
-        if validation.failures or not self.budget:
+        if validation.failures:
             return validation
         # Phases first: they cut off most of what fails between the tests.
         self._worst = [(None, first)]
@@ -135,7 +135,7 @@ class Validator:
         corners = self._corners(box, attempt)
         rngs = [
             Stream.VALIDATION.generator(self.seed, attempt, number, self.model.fit)
-            for number in range(confirmations if self.budget else 0)
+            for number in range(confirmations)
         ]
         validation, robustness = self._test(validation, corners[:MAX_CORNERS])
         worst = corners[np.argsort(robustness, kind="stable")]

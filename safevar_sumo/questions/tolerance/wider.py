@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
@@ -17,7 +16,7 @@ from safevar_sumo.questions.models import Model, Models, judges_of, limit_criter
 from safevar_sumo.questions.reach import falsify_limits, reach
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns
+from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.tolerance.up_to import study_up_to
@@ -82,13 +81,13 @@ def usual_settings(evaluator: Evaluator, budget: int, sets: int) -> float:
     return number * len(there) / len(evaluator.system.points)
 
 
-def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any, ...]]:
+def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
     """The row of `WIDER` for a study that names a wider one: an attack on the limits together in
     the wider scope, or without such limits on the specified ones.
     """
     evaluator = asked.evaluator
     budget = asked.budget
-    if not evaluator.study.wider or together is None or not asked.budget:
+    if not evaluator.study.wider or together is None:
         return []
     study = wider_study(evaluator.study)
     if asked.up_to is not None:
@@ -105,7 +104,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
     judges = judges_of(models.members, WIDER_STAGE)
     stream = seed, Stream.WIDER_SCOPE
     lowest = None
-    with evaluator.stage(WIDER_STAGE, usual_settings(evaluator, budget, len(judges))):
+    with evaluator.phases.stage(WIDER_STAGE, usual_settings(evaluator, budget, len(judges))):
         found = falsify_limits(box, judges, budget, stream)
         if found.failures and study.scenario.search:
             searched = study.scenario.search
@@ -118,16 +117,13 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> list[tuple[Any,
             ]
             lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
-    members = other.characteristics
-    fails_at = (
-        None if failure is None else dict(zip(members.names, failure.setting.tolist(), strict=True))
-    )
+    fails_at = None if failure is None else other.characteristics.named(failure.setting)
     return [(study.name, scope_of(study), not found.failures, verdict, fails_at)]
 
 
 def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
     """A box of the vehicle's characteristics in all encounters of the wider study."""
-    members = models.own.evaluator.characteristics
+    members = models.own.characteristics
     own = evaluator.characteristics
     lower = members.lower.copy()
     upper = members.upper.copy()

@@ -5,27 +5,19 @@ which scope.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MET_BY_CORNERS
 from safevar_sumo.questions.counterexamples import describe
-from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model, Models, fit_names
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.tables import Rows
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
 from safevar_sumo.questions.words import bound_in_words, join_phrases, number_of, share_in_words
 from safevar_sumo.study import unit_text
-
-
-def why_not_kept(asked: Asked) -> str:
-    """Why specified limits that nothing broke are not called kept."""
-    if asked.is_quick:
-        return "with --quick, no limit is called kept: ask without it"
-    return "with --attack 0, no simulation searched for a counterexample"
 
 
 def verdict_sentences(
@@ -34,8 +26,8 @@ def verdict_sentences(
     together: LimitsTogether | None,
     asked: Asked,
     broken: Sequence[str],
-    nearest: Sequence[tuple[Any, ...]],
-    wider: Sequence[tuple[Any, ...]],
+    nearest: Rows,
+    wider: Rows,
     refusal: str,
 ) -> Iterator[str]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
@@ -48,11 +40,6 @@ def verdict_sentences(
         return
 
     # The decision, and how sure it is.
-    if asked.budget < USUAL_BUDGET and not asked.is_quick:
-        yield (
-            f"Rough answer, with {asked.budget:,} instead of {USUAL_BUDGET:,} simulations that"
-            " search for a counterexample."
-        )
     if broken:
         yield f"Do not release: {'; '.join(broken)}."
     if together is not None:
@@ -77,20 +64,20 @@ def verdict_sentences(
         yield f"Left out, as all their values are above {asked.up_to}: {tests}."
     if asked.at_tests:
         yield "Nothing was simulated between the values of the tests (--at-tests)."
-    yield f"Scope: {scope_of(study, between=asked.drives_between)}."
+    yield f"Scope: {scope_of(study, between=not asked.at_tests)}."
 
 
-def tested_sentences(models: Models, together: LimitsTogether | None, budget: int) -> Iterator[str]:
+def tested_sentences(models: Models, together: LimitsTogether | None) -> Iterator[str]:
     """How joint limits were tested; nothing without such limits."""
     study = models.own.evaluator.study
-    if together is not None and budget and study.scenario.search:
+    if together is not None and study.scenario.search:
         share = share_in_words(models.own.evaluator.share_left_out)
         yield (
             f"Of the encounters over the domain {share} do not count, because the original vehicle"
             f" itself keeps less than {study.scenario.margin:g} m in them."
         )
     if together is not None and together.box is not None:
-        yield validation_in_words(together, budget)
+        yield validation_in_words(together)
         if together.proof is not None:
             bound = bound_in_words(together.proof.at_most).capitalize()
             yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
@@ -108,7 +95,7 @@ def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
         yield f"The specified limits hold in {kept} parameter sets of the vehicle, not in {fits}."
 
 
-def _nearest_in_words(nearest: Sequence[tuple[Any, ...]]) -> Iterator[str]:
+def _nearest_in_words(nearest: Rows) -> Iterator[str]:
     """Which values would hold in place of the specified limits."""
     would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
     if would_do:
@@ -145,12 +132,10 @@ def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Ite
     decision = "All joint limits hold at the same time"
     if asked.limits:
         decision = "The joint limits below hold" if together.broken else "All limits hold"
-    if not asked.budget:
-        decision = "The joint limits below were tested at their corners alone, and hold there"
     yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
     for model in models.left_out:
         # Its words name the test and the parameter set.
-        described = describe(model, {"": model.evaluator.characteristics.original})
+        described = describe(model, {"": model.characteristics.original})
         words = described[""].words if described else f"parameter set {model.fit} is unsafe"
         yield f"With the original vehicle itself {words}: there no limit is claimed."
     if not asked.is_quick:
@@ -185,23 +170,21 @@ def tested_in_words(unsafe: Unsafe, fits: int) -> str:
     return f"{every} keeps at least {unsafe.keep:.3g} m of clearance{others}"
 
 
-def validation_in_words(together: LimitsTogether, budget: int) -> str:
+def validation_in_words(together: LimitsTogether) -> str:
     """What joint limits were tested with: corner cases, simulations that search for a
     counterexample, and random vehicles.
     """
     searched = len(together.members[0].evaluator.characteristics.scenario) > 0
     met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
-    falsification = _falsification_in_words(together, budget)
+    falsification = _falsification_in_words(together)
     return f"All corner cases{met}; {falsification}; {_sampled_in_words(together)}."
 
 
-def _falsification_in_words(together: LimitsTogether, budget: int) -> str:
+def _falsification_in_words(together: LimitsTogether) -> str:
     """The falsification: `20,000 simulations that search for a counterexample (smallest clearance
     0.36 m)`.
     """
     passed = [*together.validations.values()]
-    if not passed or not budget:
-        return "no search for a counterexample"
     number = sum(each.attacked for each in passed)
     at_all_points = sum(each.at_all_points for each in passed)
     simulated = f"{number:,} simulations that search for a counterexample"
@@ -244,7 +227,7 @@ def _without_room(models: Models, together: LimitsTogether) -> list[str]:
     return [
         item.name
         for item, low, high, last in zip(
-            models.own.evaluator.characteristics, box.lower, box.upper, together.room, strict=True
+            models.own.characteristics, box.lower, box.upper, together.room, strict=True
         )
         if low == high and last and not item.is_scenario
     ]
