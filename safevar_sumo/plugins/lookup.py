@@ -6,7 +6,7 @@ working directory or installed.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
 import os
 import sys
@@ -115,6 +115,7 @@ class Lookup:
         # The module is loaded, and has the name.
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
+        module_name = module.__name__
         this_process.named_files.add(file_of_module(module_name))
         try:
             target = getattr(module, attribute)
@@ -203,7 +204,7 @@ class Lookup:
                 np.errstate(),
                 end_if_longer(self._time_limit, f"the import of {name}"),
             ):
-                return importlib.import_module(name)
+                return _import_beside(name, folders) or importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
             expected = (
@@ -214,6 +215,23 @@ class Lookup:
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             this_process.modules |= sys.modules.keys() - modules_before
+
+
+def _import_beside(name: str, folders: Sequence[str]) -> ModuleType | None:
+    """A module beside the study with the name of one of Python or of a library that is loaded, such
+    as random.py, which stays: under a name of its own. None for any other name.
+    """
+    file = file_beside(f"{name}.py", folders)
+    if not file or name not in sys.modules or is_user_file(file_of_module(name)):
+        return None
+    own_name = f"{name}_beside_the_study"
+    if file_of_module(own_name) != file:
+        spec = importlib.util.spec_from_file_location(own_name, file)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[own_name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[own_name])
+    return sys.modules[own_name]
 
 
 def _has_some(candidate: Any, base: type) -> bool:

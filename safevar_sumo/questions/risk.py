@@ -41,14 +41,7 @@ from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
-from safevar_sumo.records import (
-    BoolArray,
-    Evaluations,
-    FloatArray,
-    IntArray,
-    JsonObject,
-    NamedValues,
-)
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, JsonObject
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import Uniform
 
@@ -137,8 +130,8 @@ def risk(
     model = VariationModel(study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
-    planned: NamedValues = {SAMPLING: samples, SENSITIVITY: has_design * BASE_POINTS * block}
-    evaluator.plan(planned, least=LEAST_SETTINGS)
+    of_design = has_design * BASE_POINTS * block
+    evaluator.plan({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     vehicles = model.draw(samples, default_rng(study.search.seed))

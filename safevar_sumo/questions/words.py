@@ -11,7 +11,7 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 OUTCOME_VERBS = {
     Outcome.STOPPED: "stops",
@@ -69,6 +69,19 @@ def change_texts(
             text = f"{value:{EXACT}}" if are_printed else item.text(value)
             texts.append(f"{item.name} {original:g} -> {text}{item.suffix}{share}")
     return texts
+
+
+def undecidable_in_words(items: Iterable[Characteristic]) -> str:
+    """That limits of characteristics are too near to the original, in a sentence."""
+    names = join_phrases(
+        f"{item.short_name} (measured to within {item.precision.value:g}{item.suffix})"
+        for item in items
+        if item.precision is not None
+    )
+    return (
+        f"Not decidable in a workshop, as the limit is nearer to the original vehicle than it is"
+        f" measured: {names}."
+    )
 
 
 def encounter_in_words(

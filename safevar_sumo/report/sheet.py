@@ -22,7 +22,7 @@ from safevar_sumo.questions.answer import Answer, Columns, tabulate
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.tables import html_table
-from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.questions.words import join_phrases, undecidable_in_words
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
 from safevar_sumo.scenarios import SPEED_DIMENSION
@@ -202,8 +202,14 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     if not numbers["box"]:
         return "No limits were found that hold at the same time."
     items = study.case.characteristics.vehicle
-    is_measured = any(item.is_for_workshop for item in items)
-    return "" if is_measured else "The study names no item that a workshop can measure."
+    rows = {row["characteristic"]: row for row in _records(limits.table())}
+    measured = [item for item in items if item.is_for_workshop]
+    vague = [
+        item for item in measured if not item.is_decidable(*_together(item, rows.get(item.name)))
+    ]
+    if vague:
+        return undecidable_in_words(vague)
+    return "" if measured else "The study names no item that a workshop can measure."
 
 
 def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from safevar_sumo.study.characteristics import (
     Constraint as Constraint,
     Domain as Domain,
     Limit as Limit,
+    Precision as Precision,
     limits_of as limits_of,
     unit_text as unit_text,
 )

@@ -54,17 +54,27 @@ class Domain(Table, frozen=True, kw_only=True):
             raise mistake(f"original = {self.original}", f"a value in [{self.lower}, {self.upper}]")
 
 
+class Precision(Table, frozen=True, kw_only=True):
+    """How far measurements of one vehicle may differ, the `value` in the characteristic's unit, and
+    the `source` of this value, or that it is an assumption.
+    """
+
+    value: PositiveNumber
+    source: Annotated[str, Meta(min_length=1, max_length=400)]
+
+
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
     """One row of the characteristics table.
 
     `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
-    measures it, or, if `workshop` is false, who else does; `remedy` says what to do with a vehicle
-    beyond its limit.
+    measures it, or, if `workshop` is false, who else does, and `precision` how exactly; `remedy`
+    says what to do with a vehicle beyond its limit.
     """
 
     counterpart: ShortText = ""
     workshop: Annotated[bool, WITHOUT_EFFECT] = True
     measurement: ShortText = ""
+    precision: Annotated[Precision | None, WITHOUT_EFFECT] = None
     remedy: ShortText = ""
 
 

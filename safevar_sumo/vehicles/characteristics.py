@@ -17,7 +17,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
-from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study, plain_values, unit_text
+from safevar_sumo.study import PHASE, PHASE_DECIMALS, Precision, Study, plain_values, unit_text
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -36,10 +36,10 @@ class Characteristic:
     (`is_scenario`); all quantities are in `unit`.
 
     `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines
-    it, `measurement` says how a workshop measures it or, unless `workshop`, who else does, and
-    `remedy` what to do beyond a limit; all of them may be empty. `short_name` is its name in
-    sentences: by default the meaning up to the first comma or bracket, such as `engine drag`, or
-    the name if the study gives no meaning.
+    it, `measurement` says how a workshop measures it or, unless `workshop`, who else does,
+    `precision` how exactly, and `remedy` what to do beyond a limit; all of them may be empty.
+    `short_name` is its name in sentences: by default the meaning up to the first comma or bracket,
+    such as `engine drag`, or the name if the study gives no meaning.
     """
 
     name: str
@@ -52,6 +52,7 @@ class Characteristic:
     counterpart: str = ""
     workshop: bool = True
     measurement: str = ""
+    precision: Precision | None = None
     remedy: str = ""
     is_scenario: bool = False
 
@@ -70,6 +71,16 @@ class Characteristic:
     def is_for_workshop(self) -> bool:
         """Whether a workshop can measure it, and the study says how."""
         return self.workshop and bool(self.measurement)
+
+    def is_decidable(self, low: float, high: float) -> bool:
+        """Whether limits, other than ends of the domain, are farther from the original than the
+        precision of the measurement.
+        """
+        if self.precision is None or low == high:
+            return True
+        nearest_low = max(self.original - self.precision.value, self.lower)
+        nearest_high = min(self.original + self.precision.value, self.upper)
+        return low <= nearest_low and high >= nearest_high
 
     @property
     def threshold(self) -> float:

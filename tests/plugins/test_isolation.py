@@ -196,3 +196,16 @@ def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
     for settings in (BOTH[:1], BOTH):
         with pytest.raises(InputError, match=r"speed (is nan|= -3\.0)"):
             drive_and_score(replace(NATIVE, ads=BRAKES, vehicle=vehicle), settings)
+
+
+def test_a_module_beside_the_study_may_have_the_name_of_one_that_is_loaded(in_tmp: Path) -> None:
+    Path("random.py").write_text(
+        "import random\n"
+        "from safevar_sumo.ads.aeb import Aeb\n"
+        "class Mine(Aeb, frozen=True, kw_only=True):\n"
+        "    braking_share: float = random.choice([0.3])\n"
+    )
+    Path("mine.toml").write_text(
+        'extends = "wear"\nname = "mine"\n[ads]\nmodel = "random:Mine"\nparameters = {}\n'
+    )
+    assert json_of("simulate", "mine.toml")["numbers"]["f_safe"] == pytest.approx(1.16, abs=0.01)

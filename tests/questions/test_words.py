@@ -13,6 +13,8 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import words
 from safevar_sumo.questions.case import load_cases
+from safevar_sumo.questions.words import undecidable_in_words
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, searched
 
 STUDY = """
@@ -119,3 +121,16 @@ def test_half_of_the_originals_is_said_by_every_question(
         assert answer["numbers"]["unsafe"].startswith("below="), typed
         assert "half of the original's" in answer["verdict"], typed
         assert "--unsafe collision counts collisions alone." in answer["verdict"], typed
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "is_decidable"),
+    [(0.9, 1.0, True), (0.96, 1.0, False), (0.5, 1.0, True), (1.0, 1.0, True)],
+)
+def test_a_limit_nearer_to_the_original_than_its_measurement_is_not_decidable(
+    low: float, high: float, *, is_decidable: bool
+) -> None:
+    brakes = next(item for item in CharacteristicSet.of(load_study("wear")) if item.precision)
+    assert (brakes.original, brakes.lower, brakes.upper) == (1, 0.5, 1)
+    assert brakes.is_decidable(low, high) is is_decidable
+    assert "relative brake torque (measured to within 0.05)" in undecidable_in_words([brakes])

@@ -308,3 +308,13 @@ def test_a_workshop_can_measure_most_of_a_worn_car_and_not_an_engines_drag(
     name: str, leads: bool
 ) -> None:
     assert reported(replace(answer_of(), study=read_study(name))).has_workshop_parts is leads
+
+
+def test_limits_that_a_workshop_cannot_decide_have_no_sheet_to_sign() -> None:
+    vague = [
+        (name, 0.97, *rest[1:]) if name == "brakeTorque" else (name, *rest)
+        for name, *rest in LIMITS
+    ]
+    sheet = sheet_with(answer_of(rows=vague[:-1]))
+    assert "Do not use this sheet. Not decidable in a workshop" in sheet
+    assert "signature" not in sheet

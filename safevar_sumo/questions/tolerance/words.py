@@ -16,7 +16,13 @@ from safevar_sumo.questions.tables import Rows
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.words import bound_in_words, join_phrases, number_of, share_in_words
+from safevar_sumo.questions.words import (
+    bound_in_words,
+    join_phrases,
+    number_of,
+    share_in_words,
+    undecidable_in_words,
+)
 from safevar_sumo.study import unit_text
 
 
@@ -46,6 +52,14 @@ def verdict_sentences(
         yield from _fits_in_words(models, together)
         yield from _nearest_in_words(nearest)
         yield from _box_in_words(models, together, asked)
+        box = together.box
+        vague = [
+            item
+            for column, item in enumerate(models.own.evaluator.characteristics.vehicle)
+            if box and not item.is_decidable(float(box.lower[column]), float(box.upper[column]))
+        ]
+        if vague:
+            yield undecidable_in_words(vague)
 
     # What is unsafe elsewhere.
     for name, _, _, verdict, _ in wider:
