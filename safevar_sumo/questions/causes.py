@@ -22,6 +22,7 @@ from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
 from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.research_questions.statistics import median_interval
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.terminal import print_text
@@ -244,8 +245,9 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     -------
     pandas.DataFrame
         Columns algorithm, run, failures (different unsafe solutions), examined, causes; alone,
-        those that no other algorithm found in the run of the same number; and cost, the settings
-        that all this took to simulate.
+        those that no other algorithm found in the run of the same number; of budgets `of_run`, the
+        median over runs of the causes of a run's examined failures, with its interval; and cost,
+        the settings that all this took to simulate.
     """
     # The first failures of each run.
     keys = ["algorithm", "run"]
@@ -272,8 +274,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         settings.index,
         name="kind",
     )
-    found = examined.merge(settings.join(kinds.explode()))[[*keys, "kind"]]
-    found = found.dropna().drop_duplicates()
+    each = examined.merge(settings.join(kinds.explode())).dropna(subset="kind")
+    found = each[[*keys, "kind"]].drop_duplicates()
 
     # How many of each run.
     counted = {
@@ -286,7 +288,19 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         {name: rows.groupby(keys).size() for name, rows in counted.items()},
         pd.MultiIndex.from_tuples(case.finished_runs, names=keys),
     )
-    return frame.fillna(0).astype(int).reset_index().assign(cost=evaluator.simulated)
+    frame = frame.fillna(0).astype(int).reset_index().assign(cost=evaluator.simulated)
+    if "simulations" not in keys:
+        return frame
+
+    # How many in a run of each algorithm.
+    of_runs = each.groupby([*keys, "run"])["kind"].nunique()
+    runs = case.solutions.groupby("algorithm")["run"].unique()
+    counts = [
+        [of_runs.get((algorithm, budget, run), 0) for run in runs[algorithm]]
+        for algorithm, budget in frame[keys].itertuples(index=False)
+    ]
+    low, high = np.transpose([median_interval(row) for row in counts])
+    return frame.assign(of_run=[*map(np.median, counts)], of_run_low=low, of_run_high=high)
 
 
 PARTS = (32, 8, 8, 8)

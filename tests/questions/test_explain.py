@@ -249,6 +249,23 @@ def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once
     assert counts[3] == [["nsga2", 100, 1, 1, 1, 0], ["rs", 100, 3, 3, 2, 1]], "both find a up"
 
 
+def test_causes_within_budgets_have_an_interval_over_runs() -> None:
+    """Run k of eight has failures of k kinds, at most three."""
+    evaluator = made_up_evaluator(
+        3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2) | (settings[:, 2] > 9)
+    )
+    kinds = np.array([(9.5, 5.0, 5.0), (5.0, 1.0, 5.0), (5.0, 5.0, 9.5)])
+    own = [kinds[: min(k, 3)] + 0.01 * k * (kinds[: min(k, 3)] == 5) for k in range(1, 9)]
+    runs = [(("rs", k), evaluator.evaluate(rows, "runs")) for k, rows in enumerate(own)]
+    frame = solutions_frame(evaluator.characteristics.names, runs)
+    case = build_case(
+        evaluator.study, {"safety_degree": 2.0}, frame, frame, [key for key, _ in runs]
+    )
+    (row,) = causes_of_runs(within_budgets(case), evaluator, 99).to_dict("records")[:1]
+    assert (row["causes"], row["of_run"]) == (3, 3)
+    assert (row["of_run_low"], row["of_run_high"]) == (1, 3), "order statistics of 1, 2 and six 3"
+
+
 def limits(evaluator: Evaluator, *setting: float) -> Limits:
     """The limits of the only cause of a setting."""
     (causes,) = find_minimal_causes(evaluator, np.array([setting]), COLLISION)
