@@ -117,7 +117,7 @@ def test_every_shipped_study_has_answers_or_reasons(name: str) -> None:
             "permit autoware_july --quick --limits 'brakeTorque >= 0.5' --others new",
             "may not drive",
         ),
-        ("tolerance smoke --simulations 60", ""),
+        ("tolerance smoke --simulations 200", ""),
         pytest.param("explain smoke --simulations 60", "", marks=SLOW),
         pytest.param("risk smoke --simulations 90", "", marks=SLOW),
         pytest.param("rating stop", "earns", marks=SLOW),

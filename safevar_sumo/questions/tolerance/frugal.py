@@ -1,5 +1,5 @@
-"""Joint limits with few simulations: each characteristic alone, the corners of a box, and a search
-for counterexamples in it with what is left. The answer is rough.
+"""Joint limits with few simulations: each characteristic alone, then a box that is cut where random
+vehicles in it are unsafe, and tried with what is left. The answer is rough.
 """
 
 from __future__ import annotations
@@ -14,44 +14,45 @@ from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import AT_ONE_PHASE
-from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.sampling import CONFIDENCE, Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.limits import OF_BOX
 from safevar_sumo.questions.tolerance.rows import LIMITS, LIMITS_TITLE, NOWHERE
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import bound_in_words, join_phrases, number_of
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 
 STAGE = "limits with few simulations"
 PARTS = (4, 4)
 """Number of parts into which each round divides a line to a failure."""
-CORNER_SHARE = 0.25
-"""Share of the simulations that one round of corners takes at most."""
-BATCH = 16
+BATCH = 8
 """Number of vehicles that are tried at once in search of a counterexample."""
+KEPT = 1 / 3
+"""Share of the settings that has to be tried in the final box."""
+FIRST_GAP, WIDENING = 1 / 50, 1.2
+"""How far limits keep off failures first, as a share of the domain, and the factor by which each
+further failure makes this larger.
+"""
+GREATEST_SHARE = 0.05
+"""Greatest bound of the share of unsafe vehicles with which limits are stated."""
 
 
 @dataclass
 class _Search:
-    """A box that shrinks where vehicles in it are unsafe.
+    """A box that is cut where vehicles in it are unsafe.
 
     Attributes
     ----------
     low, high
         The ends of its sides, shape (n,).
-    corners, tried
-        Numbers of corners, and of other vehicles, that were safe in the box as it is now.
     """
 
     model: Model
     columns: list[int]
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
-    corners: int = 0
-    tried: int = 0
 
     def __post_init__(self) -> None:
         members = self.model.characteristics
@@ -59,6 +60,11 @@ class _Search:
         varies[self.columns] = True
         self.low = np.where(varies, members.lower, members.original)
         self.high = np.where(varies, members.upper, members.original)
+        self._outer = self.low, self.high
+        self._gap = FIRST_GAP
+        self._failures = np.empty((0, len(members)))
+        self._safe = np.empty((0, len(members)))
+        self._budget = self.left
 
     @property
     def box(self) -> Box:
@@ -68,6 +74,16 @@ class _Search:
     def left(self) -> int:
         """Settings that may still be simulated."""
         return self.model.evaluator.left or 0
+
+    @property
+    def tried(self) -> int:
+        """Number of random vehicles that were safe in the box as it is now."""
+        return int(self._are_inside(self._safe).sum())
+
+    @property
+    def at_most(self) -> float:
+        """The share of unsafe vehicles in the box is at most this (`CONFIDENCE`, one-sided)."""
+        return float(1 - (1 - CONFIDENCE) ** (1 / self.tried)) if self.tried else 1.0
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         return self.model.are_unsafe(settings, STAGE)
@@ -82,9 +98,40 @@ class _Search:
             if value != members.original[column]
         ]
         settings = np.array(ends).reshape(-1, len(members))
-        self.shrink(settings[self.are_unsafe(settings)])
+        unsafe = settings[self.are_unsafe(settings)]
+        if len(unsafe):
+            starts = members.with_original_vehicle(unsafe)
+            found = find_boundaries(starts, unsafe, self.are_unsafe, PARTS)
+            for safe, failure in zip(found.safe, unsafe, strict=True):
+                (column,) = np.flatnonzero(
+                    (failure != members.original) & members.of_vehicle
+                ).tolist()
+                is_high = bool(failure[column] > members.original[column])
+                self._move(column, safe[column], is_high=is_high)
+        self._outer = self.low.copy(), self.high.copy()
 
-    def needed(self, failure: FloatArray) -> FloatArray:
+    def find(self, rng: Generator) -> bool:
+        """Cut the box until a third of all settings was tried in it; whether this was reached."""
+        while self.left >= BATCH + len(self.columns):
+            settings = self.box.with_ends(BATCH, rng)
+            is_unsafe = self.are_unsafe(settings)
+            if is_unsafe.any():
+                self._cut(settings[is_unsafe][0])
+            else:
+                self._safe = np.concatenate([self._safe, settings])
+        return self.tried >= KEPT * self._budget and self.at_most <= GREATEST_SHARE
+
+    def _cut(self, failure: FloatArray) -> None:
+        """Cut off a failure, shape (n,), and keep farther off all that are known: too little was
+        simulated around them.
+        """
+        self._failures = np.vstack([self._failures, self._needed(failure)])
+        self._gap *= WIDENING
+        self.low, self.high = (end.copy() for end in self._outer)
+        while (inside := self._failures[self._are_inside(self._failures)]).size:
+            self._cut_off(inside)
+
+    def _needed(self, failure: FloatArray) -> FloatArray:
         """A failure, shape (n,), without the changes that it does not need, one after another."""
         original = self.model.characteristics.with_original_vehicle(failure[np.newaxis])
         least = failure.copy()
@@ -95,66 +142,37 @@ class _Search:
                 least = tried
         return least
 
-    def cut(self, failures: FloatArray) -> None:
-        """Move the sides that the first of some failures needs, shape (K, n)."""
-        self.shrink(self.needed(failures[0])[np.newaxis])
-
-    @property
-    def cost(self) -> int:
-        """Settings that a cut takes at most."""
-        return len(self.columns) + settings_of_line(PARTS)
-
-    def shrink(self, failures: FloatArray) -> None:
-        """Move the sides that failures reach, shape (K, n), each to the last safe place on the line
-        from the original vehicle in the same encounter.
+    def _cut_off(self, failures: FloatArray) -> None:
+        """Move the side that loses the least share of its length by it, for that of K failures,
+        shape (K, n), for which this loss is the greatest.
         """
         members = self.model.characteristics
-        starts = members.with_original_vehicle(failures)
-        if not len(failures):
-            return
-        found = find_boundaries(starts, failures, self.are_unsafe, PARTS)
-        changes = (failures != starts) & members.of_vehicle
-        for safe, start, is_changed in zip(found.safe, starts, changes, strict=True):
-            for column in np.flatnonzero(is_changed):
-                lower, upper = sorted((safe[column], start[column]))
-                item = members.members[column]
-                if safe[column] < start[column]:
-                    end = item.rounded(lower, upwards=True)
-                    self.low[column] = min(max(self.low[column], end), start[column])
-                else:
-                    end = item.rounded(upper, upwards=False)
-                    self.high[column] = max(min(self.high[column], end), start[column])
-        self.corners = self.tried = 0
+        gap = self._gap * (members.upper - members.lower)
+        is_above = failures > members.original
+        ends = np.where(
+            is_above,
+            np.maximum(failures - gap, members.original),
+            np.minimum(failures + gap, members.original),
+        )
+        lengths = np.maximum(self.high - self.low, 1e-300)
+        kept = np.where(is_above, ends - self.low, self.high - ends) / lengths
+        is_choice = (failures != members.original) & members.of_vehicle
+        kept = np.where(is_choice, kept, -np.inf)
+        row = int(np.argmin(kept.max(axis=1)))
+        column = int(np.argmax(kept[row]))
+        self._move(column, ends[row, column], is_high=bool(is_above[row, column]))
 
-    def test_corners(self, rng: Generator) -> None:
-        """Test corners, all if they are few, until none of them is unsafe."""
-        of_vehicle = self.model.characteristics.of_vehicle
-        most = int(CORNER_SHARE * self.left)
-        while most and self.left > most + self.cost:
-            is_open = np.flatnonzero((self.low < self.high) & of_vehicle)
-            size = len(is_open)
-            numbers = np.arange(2**size) if 2**size <= most else rng.integers(2**size, size=most)
-            points = rng.random((len(numbers), len(self.low)))
-            points[:, is_open] = numbers[:, np.newaxis] >> np.arange(size) & 1
-            settings = self.box.at(points)
-            unsafe = settings[self.are_unsafe(settings)]
-            if not len(unsafe):
-                self.corners = len(settings)
-                return
-            self.cut(unsafe)
+    def _move(self, column: int, end: float, *, is_high: bool) -> None:
+        """Move a side to an end, rounded towards the original."""
+        item = self.model.characteristics.members[column]
+        rounded = item.rounded(end, upwards=not is_high)
+        if is_high:
+            self.high[column] = max(rounded, item.original)
+        else:
+            self.low[column] = min(rounded, item.original)
 
-    def falsify(self, rng: Generator) -> bool:
-        """Search for counterexamples with what is left; whether the last of them was cut off, and
-        vehicles in the box were tried after it.
-        """
-        while self.left >= BATCH + self.cost:
-            settings = self.box.with_ends(BATCH, rng)
-            unsafe = settings[self.are_unsafe(settings)]
-            if len(unsafe):
-                self.cut(unsafe)
-            else:
-                self.tried += len(settings)
-        return self.tried > 0
+    def _are_inside(self, settings: FloatArray) -> BoolArray:
+        return np.asarray(((settings >= self.low) & (settings <= self.high)).all(axis=1))
 
 
 def answer_roughly(asked: Asked) -> Answer:
@@ -165,8 +183,7 @@ def answer_roughly(asked: Asked) -> Answer:
     seed = evaluator.seed
     search.limit_alone()
     alone = search.low.copy(), search.high.copy()
-    search.test_corners(Stream.FIRST_CORNERS.generator(seed))
-    is_tested = search.falsify(Stream.JOINT_LIMITS.generator(seed))
+    is_tested = search.find(Stream.JOINT_LIMITS.generator(seed))
 
     # A row for each characteristic; limits alone only where there is one encounter, joint limits
     # only where vehicles were tried within them.
@@ -182,13 +199,14 @@ def answer_roughly(asked: Asked) -> Answer:
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
     limits.attrs["bars"] = bars_of(limits, domains)
+    bound = bound_in_words(search.at_most).capitalize()
     return Answer(
         question="tolerance",
         study=evaluator.study,
         verdict=_verdict(search, alone, is_tested),
         tested=(
-            f"{number_of(search.corners, 'corner')} and {search.tried:,} vehicles in search of a"
-            f" counterexample. {AT_ONE_PHASE}"
+            f"{number_of(search.tried, 'random vehicle')} within the limits, with half of their"
+            f" values at ends. {bound} of such vehicles are unsafe. {AT_ONE_PHASE}"
         ),
         numbers={**_numbers(asked), "scope": scope_of(evaluator.study, between=False)},
         tables={"limits": limits},
@@ -199,9 +217,9 @@ def answer_roughly(asked: Asked) -> Answer:
 def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: bool) -> str:
     """What was found, and which characteristics can make the vehicle unsafe on their own."""
     members = search.model.characteristics
-    words = "No vehicle that was tried within the joint limits is unsafe."
+    words = f"None of {search.tried:,} vehicles that were tried within the joint limits is unsafe."
     if not is_tested:
-        words = "The simulations did not suffice to try vehicles within the joint limits."
+        words = "The simulations did not suffice to try enough vehicles within joint limits."
     is_closer = (alone[0] > members.lower) | (alone[1] < members.upper)
     names = [item.name for item, fails in zip(members, is_closer, strict=True) if fails]
     names = [name for name in names if name in members.vehicle.names]
