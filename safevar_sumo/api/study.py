@@ -389,8 +389,7 @@ def summarise(results: Results) -> Answer:
         counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
         collisions = int(are_collisions(feasible).sum())
-        best = feasible["f_safe"].min()
-        ends = (collisions, *counts, best, len(solutions))
+        ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
 
     # The study's metrics are columns, too.

@@ -271,8 +271,7 @@ def journal_progress(
         asked = sum(reader.asked() for reader in readers)
         left = sum(reader.left for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
-        phase = f"{study.name}: {finished} of {len(keys)} runs"
-        progress(phase, asked, asked + left)
+        progress(f"{study.name}: {finished} of {len(keys)} runs", asked, asked + left)
 
     return show
 
@@ -341,5 +340,4 @@ def _random_settings(study: Study, *shape: int) -> FloatArray:
             characteristics.lower, characteristics.upper, (count, len(characteristics))
         )
 
-    drawn = region.draw_feasible(draw, math.prod(shape))
-    return np.resize(drawn, (*shape, len(characteristics)))
+    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))

@@ -96,8 +96,7 @@ def system_of(study: Study) -> System:
 
 @lru_cache(maxsize=KNOWN_SYSTEMS)
 def _assemble_packed(packed_study: bytes) -> System:
-    study = msgspec.msgpack.decode(packed_study, type=Study)
-    return assemble(study)
+    return assemble(msgspec.msgpack.decode(packed_study, type=Study))
 
 
 def carry_out(

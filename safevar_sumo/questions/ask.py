@@ -280,11 +280,9 @@ class Question:
             if is_long and progress is True and sys.stderr.isatty():
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
-                    rough = {**values, "quick": True}
-                    first = self.answer(subjects, rough, **how, progress=part)
+                    first = self.answer(subjects, {**values, "quick": True}, **how, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
-            called = _name(source)
-            answer = self.answer(subjects, values, **how, progress=progress, called=called)
+            answer = self.answer(subjects, values, **how, progress=progress, called=_name(source))
         return replace(answer, command=command)
 
     def answer(

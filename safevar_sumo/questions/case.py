@@ -290,7 +290,6 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 if "scoring" in manifest
                 else PUBLISHED_SCORING
             )
-            stated = {name: manifest[name] for name in OF_ALGORITHMS if name in manifest}
             cases.append(
                 build_case(
                     study,
@@ -301,7 +300,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                     scoring=scoring,
                     has_runs="imported" not in manifest,
                     failures=tuple(failures),
-                    **stated,
+                    **{name: manifest[name] for name in OF_ALGORITHMS if name in manifest},
                 )
             )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:

@@ -225,8 +225,7 @@ class Evaluator:
         )
         evaluations = self.evaluate(pairs, stage)
         worst = np.argmin(unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1)
-        first_rows = np.arange(len(settings)) * len(encounters)
-        return evaluations.take(first_rows + worst)
+        return evaluations.take((np.arange(len(settings)) * len(encounters)) + worst)
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
@@ -346,8 +345,7 @@ class Evaluator:
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        first = self.at_most(FIRST_SETTINGS, 8)
-        evaluations = self.evaluate(settings[:first], stage)
+        evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
         if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)

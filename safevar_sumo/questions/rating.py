@@ -298,8 +298,7 @@ def _cells(
 
 
 def _changes(study: Study, setting: FloatArray) -> NamedValues:
-    characteristics = CharacteristicSet.of(study)
-    pairs = zip(characteristics, setting.tolist(), strict=True)
+    pairs = zip(CharacteristicSet.of(study), setting.tolist(), strict=True)
     return {item.name: value for item, value in pairs if value != item.original}
 
 

@@ -134,8 +134,7 @@ def risk(
     evaluator.plan({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = model.draw(samples, default_rng(study.search.seed))
-    drawn = evaluator.evaluate(vehicles, SAMPLING)
+    drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)
 
     # How many are unsafe.
     simulated = drawn.take(np.flatnonzero(drawn.valid))
@@ -437,8 +436,7 @@ def _table(
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
             head = f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
             meaning = f"share of the variance of {of_what}: {meaning}"
-            is_detail = output == "unsafe"
-            column = Column("-", meaning, ".2f", head=head, is_detail=is_detail)
+            column = Column("-", meaning, ".2f", head=head, is_detail=output == "unsafe")
             columns |= with_interval(name, column)
 
     # The characteristic that decides most comes first.

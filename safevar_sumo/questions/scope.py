@@ -24,8 +24,7 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
     if study.matrix.point:
         of_point = dict(points[0].parameters)
         test = next(test for test in study.matrix.tests if test.name == of_point["test"])
-        over = {name: [of_point[name]] for name in test.over}
-        return [(replace_in(test, over=over), [*points])]
+        return [(replace_in(test, over={name: [of_point[name]] for name in test.over}), [*points])]
     rest = iter(points)
     tests = []
     for test in study.matrix.tests:

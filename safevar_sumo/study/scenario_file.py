@@ -73,8 +73,7 @@ def files_of_scenario(
                 **test.parameters,
                 **dict(zip(test.over, combination, strict=True)),
             }
-            texts = frozenset(item for item in point.items() if isinstance(item[1], str))
-            points[texts] = point
+            points[frozenset(item for item in point.items() if isinstance(item[1], str))] = point
 
     # The file itself, its catalogs and its road.
     files: dict[str, str] = {}

@@ -158,7 +158,6 @@ def step(traci, vehicle_id):
 
 def test_a_traci_controller_reads_them_by_its_own_calls(in_tmp: Path) -> None:
     (in_tmp / "reads.py").write_text(CONTROLLER)
-    table = {"kind": "traci", "model": "reads:step"}
-    system: System = assemble(load_study("native", ads=table))
+    system: System = assemble(load_study("native", ads={"kind": "traci", "model": "reads:step"}))
     with pytest.raises(UserCodeError, match=r"4\.700 m and \d\.\d+ m"):
         drive_and_score(system, original_of(system))

@@ -76,6 +76,15 @@ def some_settings(study: Study, number: int) -> FloatArray:
     return sobol_settings(CharacteristicSet.of(study), number)
 
 
+@pytest.fixture
+def eight(folder: Path, simulated: list[int]) -> tuple[Study, FloatArray]:
+    """A study, and eight settings of it that were simulated."""
+    study = load_study("smoke")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+    return study, settings
+
+
 def assert_equal(one: Evaluations, other: Evaluations) -> None:
     """To the bit, in every array."""
     np.testing.assert_array_equal(one.settings, other.settings)
@@ -250,25 +259,23 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     assert sum(simulated) == 64
 
 
-def test_an_altered_entry_is_simulated_again(folder: Path, simulated: list[int]) -> None:
+def test_an_altered_entry_is_simulated_again(
+    eight: tuple[Study, FloatArray], folder: Path, simulated: list[int]
+) -> None:
     """One byte of each entry is changed, and one entry takes another one's place."""
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
     with diskcache.Cache(str(folder)) as entries:
         for key in [*entries]:
             content = bytearray(entries[key])
             content[-20] ^= 1
             entries[key] = bytes(content)
-    evaluated(study, settings)
+    evaluated(*eight)
     assert sum(simulated) == 16
 
 
-def test_nothing_is_unpickled(folder: Path, simulated: list[int], tmp_path: Path) -> None:
+def test_nothing_is_unpickled(
+    eight: tuple[Study, FloatArray], folder: Path, simulated: list[int], tmp_path: Path
+) -> None:
     """An entry that somebody has planted would make a file."""
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
 
     class Planted:
         def __reduce__(self) -> tuple[object, ...]:
@@ -278,7 +285,7 @@ def test_nothing_is_unpickled(folder: Path, simulated: list[int], tmp_path: Path
         database.execute(
             "UPDATE Cache SET mode = 4, filename = NULL, value = ?", [pickle.dumps(Planted())]
         )
-    evaluated(study, settings)
+    evaluated(*eight)
     assert sum(simulated) == 16
     assert not (tmp_path / "planted").exists()
 
@@ -344,12 +351,11 @@ def test_an_answer_is_the_same_from_the_cache(
     assert not simulated
 
 
-def test_evidence_does_not_check_itself(folder: Path, simulated: list[int]) -> None:
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
+def test_evidence_does_not_check_itself(
+    eight: tuple[Study, FloatArray], simulated: list[int]
+) -> None:
     with simulate_anew():
-        evaluated(study, settings)
+        evaluated(*eight)
     assert sum(simulated) == 16
 
 

@@ -159,14 +159,19 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
         carried_out(study, tmp_path)
 
 
+def at_times(monkeypatch: pytest.MonkeyPatch, pool: FormulaPool, *seconds: float) -> None:
+    """The pool evaluates, and the clock shows these seconds."""
+    times = iter(seconds)
+    monkeypatch.setattr("time.perf_counter", lambda: next(times))
+    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+
+
 @pytest.mark.parametrize(("workers", "runs"), [(1, None), (4, None), (2, 2)])
 def test_the_speed_of_a_study_is_that_of_all_workers_that_have_a_run(
     workers: int, runs: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pool = FormulaPool(4 if runs else workers)
-    seconds = iter([10.0, 14.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    at_times(monkeypatch, pool, 10.0, 14.0)
     task = Task(study=load_study("smoke"), batch_size=200)
     assert measure_speed(task, pool, runs) == workers * 200 / 4
     assert sorted(pool.sizes) == [200] * 2 * workers, "those before are not measured"
@@ -177,9 +182,7 @@ def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
 ) -> None:
     """0.5 s for one vehicle: ten are enough."""
     pool = FormulaPool(1)
-    seconds = iter([0.0, 0.5, 1.0, 6.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    at_times(monkeypatch, pool, 0.0, 0.5, 1.0, 6.0)
     study = load_study("smoke", ads={"model": "highway_idm", "parameters": {}})
     assert measure_speed(Task(study=study, batch_size=200), pool) == 10 / 5
     assert pool.sizes == [1, 1, 10]

@@ -127,10 +127,9 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
     for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
         domain = ("km/h", 40, *((20, 60) if model == "deer:Deer" else (10, 80)))
         search = {"speed": {}, "visibility": {"lower": 0.5}}
-        test = {"name": "it", "model": model}
         for tables in (
             {"scenario": {"model": model, "search": search}, "matrix": None},
-            {"scenario": {"search": search}, "matrix": {"tests": [test]}},
+            {"scenario": {"search": search}, "matrix": {"tests": [{"name": "it", "model": model}]}},
         ):
             found = load_study("wear", **tables).scenario.search
             speed = found["speed"]
@@ -256,8 +255,7 @@ def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
 
 def with_own_models(study: Study, folder: Path) -> Study:
     """A study with copies of its scenario, vehicle and driving system."""
-    tables = {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}
-    for key, shipped in tables.items():
+    for key, shipped in {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}.items():
         table = getattr(study, key)
         own = msgspec.structs.replace(table, model=copied(shipped[table.model], folder))
         study = msgspec.structs.replace(study, **{key: own})

@@ -5,6 +5,7 @@ unsafe region is known.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -25,7 +26,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Limit, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, searched
 from tests.made_up import made_up_evaluations
 
 
@@ -148,6 +149,27 @@ def two_islands(settings: FloatArray) -> BoolArray:
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
     return (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
+
+
+@pytest.fixture
+def ahead(request: pytest.FixtureRequest, in_tmp: Path) -> Study:
+    """The study that the test's module has as `AHEAD`."""
+    (in_tmp / "ahead.toml").write_text(request.module.AHEAD)
+    return load_study("ahead.toml")
+
+
+@pytest.fixture(scope="module")
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the module's `STUDY` and its results are."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.toml").write_text(request.module.STUDY)
+    searched(load_study(str(folder / "tiny.toml")), folder / "results")
+    return folder
+
+
+def model_of(study: Study, **unsafe: float) -> Model:
+    """Its own model, which is simulated here."""
+    return Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe(**unsafe))
 
 
 def box_of(

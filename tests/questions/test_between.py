@@ -24,6 +24,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
+from tests.questions.conftest import model_of
 
 AHEAD = """
 extends = "wear"
@@ -43,12 +44,6 @@ AT_TESTS_ALONE = {
 """Limits of `wear` that hold at its tests; between them, at 59 km/h, a car keeps 0.25 m."""
 
 
-@pytest.fixture
-def ahead(in_tmp: Path) -> Study:
-    (in_tmp / "ahead.toml").write_text(AHEAD)
-    return load_study("ahead.toml")
-
-
 def box_within(model: Model, ends: dict[str, float]) -> Box:
     members = model.evaluator.characteristics
     end = members.setting(ends)
@@ -57,7 +52,7 @@ def box_within(model: Model, ends: dict[str, float]) -> Box:
 
 
 def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study) -> None:
-    own = Model(0, Evaluator(ahead, InlinePool(), verified=0), Unsafe(keep=0.3))
+    own = model_of(ahead, keep=0.3)
     box = box_within(own, AT_TESTS_ALONE)
     corners = box.corners(0, 0)
     assert own.robustness(corners, "").min() >= 0
@@ -78,7 +73,7 @@ def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study
 
 
 def test_an_encounter_between_counts_only_where_the_original_is_safe(ahead: Study) -> None:
-    own = Model(0, Evaluator(ahead, InlinePool(), verified=0), Unsafe(keep=0.3))
+    own = model_of(ahead, keep=0.3)
     worn = own.evaluator.characteristics.setting({"sensorLatency": 0.4})[np.newaxis]
     for new_car, counts in ((own.unsafe, True), (Unsafe(keep=99.0), False)):
         (test,) = moving_tests(own, new_car)

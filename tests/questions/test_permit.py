@@ -14,11 +14,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import EncounterRange, ranges_of, span_of
 from safevar_sumo.questions.permit.search import PermitSearch
@@ -28,7 +26,8 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of, refused, run
+from tests.in_process import json_of, refused, run
+from tests.questions.conftest import model_of
 
 SHORT = """
 extends = "wear_joint"
@@ -257,7 +256,7 @@ over = { speed = [40, 60] }
 
 def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     span = span_of(study, None)
-    own = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    own = model_of(study)
     values = np.arange(span.low, span.high + 1)
     return PermitSearch(Models((own,), ()), span, values, budget)
 
@@ -268,7 +267,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     span = span_of(study, None)
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
     assert (span.ending, span.left_out) == (("CPFA",), ("CPLA",))
-    model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    model = model_of(study)
     ends = [(each.test, each.low, each.high) for each in ranges_of(model, span)]
     assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)

@@ -328,8 +328,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     metric = RATING_POINTS.name if are_rated else SAFETY_DEGREE
     a, b = (run.column(metric) for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
-    sample = frame[frame["source"] == SAMPLE]
-    pairs = sample.groupby(LINE)[[*SIDES]].mean()
+    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
     unit = "straight lines through the domain"
     if "run" in frame:

@@ -164,9 +164,8 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
     distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
     chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
     handles = handles_of(table)
-    settings = table[characteristics].to_numpy(dtype=float)[chosen]
     return _Candidates(
-        settings,
+        table[characteristics].to_numpy(dtype=float)[chosen],
         [str(handles[row]) for row in chosen],
         table["outcome"].to_numpy(dtype=str)[chosen],
     )

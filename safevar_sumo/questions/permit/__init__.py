@@ -213,9 +213,8 @@ def read_cars(
         cars = {
             f"All cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
         }
-    written = [*CARS, DIGEST]
     return read_fleet(
-        study, members, cars, values, others=others, ignore=ignore, answer_columns=written
+        study, members, cars, values, others=others, ignore=ignore, answer_columns=[*CARS, DIGEST]
     )
 
 

@@ -164,8 +164,7 @@ class EncounterRange(NamedTuple):
         rows = self.as_printed(settings)
         evaluations = self.model.evaluate(rows, stage)
         if evaluations.failed.any():
-            row = int(np.argmax(evaluations.failed))
-            reason = evaluations.reason(row)
+            reason = evaluations.reason(int(np.argmax(evaluations.failed)))
             raise SimulationError(f"a car cannot be simulated in test {self.test!r}: {reason}")
         robustness = self.model.robustness_by(evaluations)
         return np.where(self.model.evaluator.region.feasible(rows), robustness, np.inf)

@@ -133,8 +133,7 @@ class PermitSearch:
                     search.falsify(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
-                failure = search.failures[number]
-                found[car].append(Reached(model.fit, search.up_to(number), failure))
+                found[car].append(Reached(model.fit, search.up_to(number), search.failures[number]))
         return [Permit(reached) for reached in found]
 
     def repair_first(

@@ -240,8 +240,7 @@ def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray
     shape (L, n).
     """
     promise = problem.promise
-    seed = problem.study.search.seed
-    points = sobol_points(SOBOL_VEHICLES, len(promise.lower), seed)
+    points = sobol_points(SOBOL_VEHICLES, len(promise.lower), problem.study.search.seed)
     settings = [
         promise.region.characteristics.original[np.newaxis],
         promise.at(np.round(points)),

@@ -80,8 +80,7 @@ class Asked(NamedTuple):
         if self.up_to is None or not len(settings):
             return settings
         # They are unsafe in the whole study; those in encounters above the value do not count.
-        is_inside = (settings >= members.lower) & (settings <= members.upper)
-        settings = settings[is_inside.all(axis=1)]
+        settings = settings[((settings >= members.lower) & (settings <= members.upper)).all(axis=1)]
         evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
         return settings[evaluations.valid & self.unsafe.of(evaluations)]
 

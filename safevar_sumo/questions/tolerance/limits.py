@@ -235,8 +235,7 @@ def _find_together(
 
 def answer_limits(asked: Asked) -> Answer:
     """The answer with limits alone and joint limits."""
-    evaluator = asked.evaluator
-    study = evaluator.study
+    study = asked.evaluator.study
     found = find_nested_limits(asked)
     models = found.models
     together = found.together
