@@ -16,7 +16,15 @@ from msgspec import Meta
 
 from safevar_sumo.errors import missing_extra
 from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation, Quantity
+from safevar_sumo.records import (
+    BoolArray,
+    Command,
+    FloatArray,
+    FloatOrArray,
+    Nominal,
+    Observation,
+    Quantity,
+)
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
@@ -224,7 +232,7 @@ class DelayLine(NamedTuple):
     """
 
     steps: int
-    fraction: float | FloatArray
+    fraction: FloatOrArray
     past: tuple[FloatArray, ...] = ()
 
     @classmethod
@@ -234,7 +242,7 @@ class DelayLine(NamedTuple):
         return cls(int(steps), float(fraction))
 
     @staticmethod
-    def parts(delay: float | FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    def parts(delay: FloatOrArray, step: float) -> tuple[FloatArray, FloatArray]:
         """Whole steps and the fraction of a step of a delay [s], or of several."""
         steps, fraction = np.divmod(np.round(np.asarray(delay) / step, STEP_DECIMALS), 1)
         return steps, fraction

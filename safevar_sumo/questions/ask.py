@@ -34,7 +34,7 @@ from safevar_sumo.terminal import Parts, Progress, open_progress, print_text
 if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.questions.answer import Answer
-    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.case import Subject
     from safevar_sumo.questions.evaluator import Evaluator
 
 QUESTIONS = {
@@ -252,7 +252,7 @@ class Question:
             raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: known[name].check(value) for name, value in values.items()}
 
-        def subject_of(source: StudyLike | Results) -> Study | Case:
+        def subject_of(source: StudyLike | Results) -> Subject:
             subject = study_or_case(
                 source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only
             )
@@ -351,7 +351,7 @@ class Question:
         following = self._following(subjects[0], evaluator, called) or answer.next
         return replace(answer, verdict=verdict, numbers=numbers, next=following)
 
-    def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
+    def _following(self, subject: Subject, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
         and where nobody else is on the road nothing is unsafe by itself.
         """

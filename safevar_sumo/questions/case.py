@@ -248,6 +248,10 @@ class Case:
         return remarks
 
 
+Subject = Study | Case
+"""What a question may be asked about."""
+
+
 def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:
     """The solutions that count for a metric; for TET and TIT only those without collision
     (docs/method.md, section 4).

@@ -22,7 +22,7 @@ from safevar_sumo.campaign.questions import (
 )
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
@@ -326,7 +326,7 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
     def choose_criterion(
-        self, text: Unsafe | str | None, source: Study | Case, original: Evaluations | None = None
+        self, text: Unsafe | str | None, source: Subject, original: Evaluations | None = None
     ) -> Unsafe:
         """The criterion that an option states, or else the default for the solutions of results, or
         for settings over the whole domain of a study.

@@ -15,7 +15,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -159,7 +159,7 @@ class Models(NamedTuple):
 
 def limit_criterion(
     evaluator: Evaluator,
-    subject: Study | Case,
+    subject: Subject,
     unsafe: Unsafe | str | None,
     margin: float | None,
     original: Evaluations,

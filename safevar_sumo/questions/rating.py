@@ -20,6 +20,7 @@ from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import ValueTexts, question
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from safevar_sumo.questions.case import Case
 
 CELLS_STAGE = "cells and robustness layers"
 """The phase of progress."""
@@ -96,7 +96,7 @@ CELLS: Columns = TEST | {
     cells=CELLS,
 )
 def rating(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     set: ValueTexts = (),
@@ -140,7 +140,7 @@ def rating(
 
 
 def _variant(
-    subject: Study | Case, evaluator: Evaluator, changes: tuple[str, ...], solution: str | None
+    subject: Subject, evaluator: Evaluator, changes: tuple[str, ...], solution: str | None
 ) -> dict[str, FloatArray]:
     """The variant's setting by its name; empty if the options describe none.
 

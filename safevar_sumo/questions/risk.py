@@ -34,7 +34,7 @@ from safevar_sumo.questions.answer import (
     with_interval,
 )
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.price import LEAST_SETTINGS
@@ -106,7 +106,7 @@ confidence interval; R2 is what a regression explains.
     sensitivity=COLUMNS,
 )
 def risk(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     samples: Count = 10_000,

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare.differences import (
     BOTH,
     COLLISION,
@@ -67,7 +67,7 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
+from safevar_sumo.study import SAFETY_DEGREE, limits_of
 
 RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
 MAX_REASONS = 3
@@ -110,9 +110,9 @@ PAIR_COLUMNS: Columns = {
     settings=["source", *SETTING_COLUMNS, ...],
 )
 def compare(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
-    other: Study | Case,
+    other: Subject,
     *,
     samples: Count = 2000,
     limits: LimitTexts = (),
@@ -229,7 +229,7 @@ def _numbers(
 
 
 def _criteria(
-    subjects: Sequence[Study | Case],
+    subjects: Sequence[Subject],
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
     unsafe: str | None,
@@ -256,9 +256,7 @@ def _criteria(
 
 
 def _default_criterion(
-    subjects: Sequence[Study | Case],
-    evaluators: Sequence[Evaluator],
-    originals: Sequence[Evaluations],
+    subjects: Sequence[Subject], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
 ) -> Unsafe:
     """A collision if any vehicle of either system collides, else a safety degree; points only if
     both are rated.

@@ -14,7 +14,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -212,7 +212,7 @@ def in_order_of(a: Study, b: Study) -> Study:
 
 
 def pairs_of(
-    subjects: Sequence[Study | Case], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
+    subjects: Sequence[Subject], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
 ) -> tuple[Pairs, int]:
     """The solutions of both sides and the drawn settings, evaluated in both systems; and the number
     of solutions that are not in both domains.

@@ -25,7 +25,7 @@ from safevar_sumo.questions.ask import (
     ValueTexts,
     question,
 )
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
@@ -55,7 +55,7 @@ NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
     sets=SETS,
 )
 def permit(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     cars: Annotated[Any, CARS_FILE] = None,

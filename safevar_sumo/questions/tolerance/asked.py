@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Limit, Study, limits_of
@@ -47,7 +47,7 @@ class Asked(NamedTuple):
         those of each.
     """
 
-    subject: Study | Case
+    subject: Subject
     evaluator: Evaluator
     columns: list[int]
     limits: dict[str, Limit]
