@@ -34,7 +34,7 @@ from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
-from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch
+from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch, Repaired
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
@@ -165,7 +165,7 @@ def _drive(
     asked: Sequence[Cars],
     *,
     is_rough: bool,
-) -> tuple[Permit, list[Permit], list[tuple[int, Permit] | None]]:
+) -> tuple[Permit, list[Permit], list[Repaired]]:
     """How far the new car and each of the others are safe, and the best repair of each.
 
     Raises

@@ -27,7 +27,7 @@ from safevar_sumo.questions.permit.rows import (
     set_rows,
     verdict_of,
 )
-from safevar_sumo.questions.permit.search import Permit, PermitSearch
+from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
@@ -64,9 +64,7 @@ class PermitAnswer:
     is_box: bool
     assumed: Sequence[str]
 
-    def of(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
-    ) -> Answer:
+    def of(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Answer:
         """The answer about the cars of a list, in its order, each with its best repair."""
         span = self.span
         rows = self._rows(fleet, permits, repaired)
@@ -116,9 +114,7 @@ class PermitAnswer:
             listing=self._listing(cars, fleet),
         )
 
-    def _rows(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
-    ) -> Rows:
+    def _rows(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Rows:
         """A row of `CARS` for each car, in the order of the list."""
         vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
