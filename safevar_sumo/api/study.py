@@ -11,7 +11,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
 
-import msgspec
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
@@ -257,7 +257,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
-    return msgspec.structs.replace(study, search=msgspec.structs.replace(search, **changes))
+    return replace_in(study, search=replace_in(search, **changes))
 
 
 def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:

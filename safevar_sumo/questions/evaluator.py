@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
 from safevar_sumo.campaign.pool import Pool, open_pool
@@ -371,10 +371,8 @@ class Evaluator:
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
         # The interval may be no multiple of this step.
-        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
-        return self.for_study(
-            msgspec.structs.replace(self.study, step_length=step, metrics=metrics)
-        )
+        metrics = replace_in(self.study.metrics, sampling_interval=None)
+        return self.for_study(replace_in(self.study, step_length=step, metrics=metrics))
 
     def end(self) -> None:
         """Have user code simulate again what it began with: an error if it does not repeat it."""

@@ -17,6 +17,7 @@ from pathlib import Path
 import diskcache
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -87,14 +88,14 @@ def eight(folder: Path, simulated: list[int]) -> tuple[Study, FloatArray]:
 
 def assert_equal(one: Evaluations, other: Evaluations) -> None:
     """To the bit, in every array."""
-    np.testing.assert_array_equal(one.settings, other.settings)
+    assert_array_equal(one.settings, other.settings)
     assert [*one.results] == [*other.results]
     for name, values in one.results.items():
-        np.testing.assert_array_equal(values, other.results[name])
+        assert_array_equal(values, other.results[name])
         assert values.dtype == other.results[name].dtype
-    np.testing.assert_array_equal(one.points, other.points)
+    assert_array_equal(one.points, other.points)
     for mine, theirs in zip(one.cells or (), other.cells or (), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+        assert_array_equal(mine, theirs)
 
 
 @pytest.mark.parametrize("name", ["smoke", "alks", "sun"])

@@ -13,8 +13,9 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
+from numpy.random import default_rng
+from pandas.testing import assert_frame_equal
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
@@ -49,7 +50,7 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
         load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3")
         for name in ("together", "alone")
     )
-    pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+    assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(second, tmp_path / "fresh")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
     results = load_runs(tmp_path / "out")
-    pd.testing.assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
+    assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
     assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
@@ -137,7 +138,7 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(
     journal.finish([0], 1)
     journal.close()
     run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1, PUBLISHED_SCORING)  # type: ignore[arg-type]
-    result = run.finish(np.random.default_rng(0))
+    result = run.finish(default_rng(0))
     for found in (result.solutions, result.sample):
         assert np.array_equal(found.settings, both.settings[:1])
 
@@ -150,8 +151,7 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
     path = journal_file(tmp_path, "rs-00")
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
     monkeypatch.setattr(
-        "safevar_sumo.campaign.share.random_generator_of",
-        lambda study, key: np.random.default_rng(7),
+        "safevar_sumo.campaign.share.random_generator_of", lambda study, key: default_rng(7)
     )
     with pytest.raises(
         SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"

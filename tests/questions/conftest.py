@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import questions
@@ -68,11 +68,8 @@ def made_up_study(n: int) -> Study:
         name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
         for name in "abcdefghijkl"[:n]
     }
-    return msgspec.structs.replace(
-        smoke,
-        name="made-up",
-        spread={},
-        vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows),
+    return replace(
+        smoke, name="made-up", spread={}, vehicle=replace(smoke.vehicle, characteristics=rows)
     )
 
 

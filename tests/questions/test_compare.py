@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy
 import tomli_w
+from numpy.testing import assert_allclose
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -65,7 +66,7 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     lines = [one.f_safe.reshape(4, 8).mean(axis=0) for one in runs]
     assert answer.numbers["p"] == pytest.approx(scipy.stats.wilcoxon(*lines).pvalue)
     assert "8 straight lines" in answer.tested
-    np.testing.assert_allclose(answer.tables["pairs"][["a", "b"]], np.transpose(lines))
+    assert_allclose(answer.tables["pairs"][["a", "b"]], np.transpose(lines))
     assert re.search(r"line 7 +│ +-?\d", text := answer.render("text", details=True))
     assert "The same settings" not in text
     assert only_a > 0
@@ -92,7 +93,7 @@ def test_settings_lie_on_lines_from_the_original_and_within_the_limits(
         assert shares[1] / shares[0] == pytest.approx(0.5) or shares[1] / shares[
             0
         ] == pytest.approx(1.5)
-        np.testing.assert_allclose(
+        assert_allclose(
             of_line / shares[:, np.newaxis], [of_line[0] / shares[0]] * len(of_line), atol=1e-9
         )
     if limits:
@@ -217,7 +218,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     answer = sv.compare("smoke", "heavy.toml", samples=50, pool=POOL)
     frame = answer.tables["settings"]
     assert frame["b_mass"].min() >= 2450
-    np.testing.assert_allclose(frame["b_mass"] - frame["mass"], 96)
+    assert_allclose(frame["b_mass"] - frame["mass"], 96)
     assert answer.tables["limits"].set_index("characteristic").loc["mass", ["a", "b"]].tolist() == [
         2404,
         2500,

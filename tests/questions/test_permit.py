@@ -7,11 +7,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
@@ -74,8 +75,8 @@ def are_unsafe(
     own = studies_of_sets(study)[fit]
     assert own.matrix is not None
     for test in own.matrix.tests:
-        alone = msgspec.structs.replace(own.matrix, tests=[test])
-        single = msgspec.structs.replace(own, matrix=alone)
+        alone = replace(own.matrix, tests=[test])
+        single = replace(own, matrix=alone)
         system = assemble(single)
         if phase:
             system = assemble(in_phases(single, system))
@@ -92,7 +93,7 @@ def are_unsafe(
 def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
     study = load_study("wear_joint")
     members = assemble(study).characteristics.vehicle
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     settings = np.vstack(
         [members.original, members.lower + rng.random((3, 7)) * (members.upper - members.lower)]
     )
@@ -192,7 +193,7 @@ def test_all_cars_within_limits(short: Study) -> None:
     assert row["up_to"] <= 37, "a worn car of another test"
     assert "brakeTorque 1 -> 0.7" in row["because"]
     members = assemble(short).characteristics.vehicle
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     cars = np.tile(members.original, (40, 1))
     for name, values in (("treadDepth", [3, 8]), ("payload", [75, 525]), ("brakeTorque", [0.7, 1])):
         cars[:, members.names.index(name)] = rng.choice(values, 40)

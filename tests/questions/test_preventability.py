@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 import scipy
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -56,9 +56,7 @@ ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.value
 def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
     scenario = ScenarioTable(model="crossing", parameters=parameters)
-    return Evaluator(
-        msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool()
-    )
+    return Evaluator(replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
 
 
 def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
@@ -132,7 +130,7 @@ def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> No
 def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_verdict() -> None:
     tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
-    here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
+    here = Evaluator(replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(
         *assess_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
     )

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from msgspec.structs import replace as replace_in
+from numpy.random import default_rng
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
@@ -311,7 +312,7 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
             parameters=[],
             unsafe=Unsafe(keep=0.3),
         )
-        settings = problem.promise.draw(20, np.random.default_rng(1))
+        settings = problem.promise.draw(20, default_rng(1))
         driver = problem.best_driver
         is_safe = (
             full_braking.robustness_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
@@ -381,7 +382,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     )
     ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
-    values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
+    values = default_rng(1).uniform(low, high, (3, len(names)))
     settings = np.tile(system.characteristics.original, (3, 1))
     together = drive_and_score(replace(system, ads=VariedAds(system.ads, names, values)), settings)
     for row, one in enumerate(values):

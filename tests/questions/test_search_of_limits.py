@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -37,9 +38,9 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
         )
 
     def alone(number: int) -> Falsification:
-        return falsify(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
+        return falsify(boxes[number], [judge, judge], [], 2000, default_rng(number))
 
-    rngs = [np.random.default_rng(number) for number in (0, 1)]
+    rngs = [default_rng(number) for number in (0, 1)]
     for one, other in zip(
         falsify_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True
     ):
@@ -72,7 +73,7 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
     model = Model(0, evaluator, Unsafe(keep=0.1))
     new_car = Box(evaluator.region, lower, upper)
     worn = Box(evaluator.region, np.where(members.of_vehicle, members.lower, lower), upper)
-    robustness = model.robustness(new_car.draw(16, np.random.default_rng(5)), "new car")
+    robustness = model.robustness(new_car.draw(16, default_rng(5)), "new car")
     assert robustness.min() >= study.scenario.margin - 0.1
     assert broken_specification(new_car, [model], {0: ()}) == {}
     assert evaluator.simulated == 16

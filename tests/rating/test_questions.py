@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -40,13 +40,13 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         speeds = {"CCRs": (10, 50, 80), "CPNA": (50,)}.get(matrix.test_name, ())
         rows = tuple(row for row in matrix.rows if row.vut_speed in speeds)
         if rows:
-            matrices.append(msgspec.structs.replace(matrix, rows=rows))
+            matrices.append(replace_in(matrix, rows=rows))
     layers = tuple(
         layer
         for layer in WHOLE.layers
         if layer.test_name in ("CCRs", "CPNA") and layer.name not in ("Trajectory/Heading",)
     )
-    protocol = msgspec.structs.replace(WHOLE, matrices=tuple(matrices), layers=layers)
+    protocol = replace_in(WHOLE, matrices=tuple(matrices), layers=layers)
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.questions.evaluator import Evaluator
@@ -143,8 +144,8 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         both = np.stack([setting[of_vehicle], other.characteristics.original])
         alone = drive_and_score(other, both)
         assert alone.outcome[0] == evaluations.outcome[row]
-        np.testing.assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(
+        assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
+        assert_allclose(
             evaluations.metrics["original_safety_degree"][row],
             alone.f_safe[1],
             rtol=0,
@@ -167,7 +168,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     )
     in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
-    np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
+    assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
     assert settings_per_batch(system, Engine.RECORDED) > len(settings)
 
 
@@ -184,7 +185,7 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
         drive_and_score(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
-    np.testing.assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
+    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
 
 
 def planted(**changes: Any) -> Study:
@@ -235,7 +236,7 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
     assert ratio[collided].min() > 0.99
     assert ratio[~collided].max() < 1.01
     degrees = everything["original_safety_degree"]
-    np.testing.assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
+    assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
 
 
 @pytest.mark.slow

@@ -8,9 +8,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
@@ -192,10 +192,10 @@ def in_order_of(a: Study, b: Study) -> Study:
     units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
-        return msgspec.structs.replace(
+        return replace(
             b,
-            vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
-            scenario=msgspec.structs.replace(
+            vehicle=replace(b.vehicle, characteristics=characteristics),
+            scenario=replace(
                 b.scenario, search={name: b.domains[name] for name in a.scenario.search}
             ),
         )
