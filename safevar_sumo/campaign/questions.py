@@ -279,8 +279,7 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
     with open_pool(1) as pool:  # first, as a simulator may end its process
         (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(system, settings)
-    for row, difference in differences(here.results, there.results):
+    for row, difference in differences(drive_and_score(system, settings).results, there.results):
         from safevar_sumo.check import Finding  # slow to import, and rarely needed
 
         words = f"{difference} in a new process"

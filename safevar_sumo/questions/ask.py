@@ -195,10 +195,9 @@ class Question:
             )
             < 2
         ):
-            takes = f"takes ({', '.join(map(str, parameters))})"
             raise InputError(
                 f"question {self.name!r}",
-                takes,
+                f"takes ({', '.join(map(str, parameters))})",
                 "(subject, evaluator), then other subjects, * and options",
             )
         self.takes_results_only = str(parameters[0].annotation) == "Case"

@@ -54,10 +54,9 @@ class MovingTest:
         self.test = test
         self.axes = tuple(domains)
         self._base = model
-        alone = without_axes(test, domains)
         moving = replace_in(
             study,
-            matrix=replace_in(study.matrix, tests=[alone]),
+            matrix=replace_in(study.matrix, tests=[without_axes(test, domains)]),
             scenario=replace_in(study.scenario, search=domains),
         )
         evaluator = model.evaluator.for_study(moving, verified=0)

@@ -211,8 +211,7 @@ def show_simulation(
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
     # Several values of a characteristic are a sweep.
-    is_sweep = any(len(options) > 1 for options in values.values())
-    if is_sweep:
+    if any(len(options) > 1 for options in values.values()):
         if trace or animate or gui or spread:
             expected = (
                 "one value for each characteristic with --trace, --animate, --gui or --spread"
@@ -321,8 +320,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = _remark_table(remarks)
-    members = system.characteristics.vehicle
-    if texts := change_texts(members, system.characteristics.named(setting)):
+    if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
     verdict += _meets(system, setting)
     solution = {} if target.handle is None else {"solution": str(target.handle)}

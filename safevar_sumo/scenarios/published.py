@@ -167,8 +167,7 @@ class PedestrianCrossing(
         """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
         nobody.
         """
-        target_speed = WALKING_SPEED * KMH_PER_MS
-        near = Crossing(test="CPNA", target_speed=target_speed, time_to_impact=7.0)
+        near = Crossing(test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0)
         for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
             yield from replace(walk, speed=speed).benign()
 

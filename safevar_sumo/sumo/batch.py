@@ -178,8 +178,7 @@ def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
         starts = n_encounters * np.arange(len(points))
         group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
-    last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
-    n_samples = round(last_sample) + 1
+    n_samples = round(max(float(np.max(last_sample_of(point, step))) for point in points)) + 1
     return Traffic(points, group, n_encounters=n_encounters, n_samples=n_samples, step=step)
 
 

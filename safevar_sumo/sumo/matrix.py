@@ -299,8 +299,7 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     if not system.matrix:
         return system.points[0]
     at_points = [result.evaluations for result in simulate_all_points(system, setting[np.newaxis])]
-    number = int(worst_points(system, at_points)[0])
-    return system.points[number]
+    return system.points[int(worst_points(system, at_points)[0])]
 
 
 def at_point(study: Study, name: str) -> Study:
@@ -382,8 +381,7 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
         measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
         # An impact may be allowed: then the measure says how bad a collision is.
-        by_measure = ~has_collided | (name == IMPACT_EXCESS.name)
-        values = np.where(by_measure, measures, safety_degrees)
+        values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf

@@ -33,6 +33,8 @@ from tests.in_process import InlinePool, searched
 from tests.made_up import drawn
 from tests.manual import ROOT
 
+SLOW = pytest.mark.slow
+
 BASES = {
     "pedestrian_crossing": "sun",
     "lead_vehicle_stopped": "native",
@@ -45,10 +47,7 @@ FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 
 
 def each(names: Iterable[str], *others: str) -> list[Any]:
-    return [
-        pytest.param(name, *others, marks=() if name in FAST else pytest.mark.slow)
-        for name in names
-    ]
+    return [pytest.param(name, *others, marks=() if name in FAST else SLOW) for name in names]
 
 
 def copied(model: Any, folder: Path) -> str:
@@ -183,7 +182,7 @@ def short(study: str, algorithm: str) -> Study:
     return load_study(study, search=search)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
@@ -232,7 +231,7 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,7 +255,7 @@ def with_own_models(study: Study, folder: Path) -> Study:
     return study
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ["smoke", "sun_joint", "alks_joint"])
 def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
@@ -265,7 +264,7 @@ def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
 
 
-@pytest.mark.slow
+@SLOW
 def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,8 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
 
+SLOW = pytest.mark.slow
+
 LONGER = {
     "ads": {"model": "aeb", "parameters": {"braking_share": 0.65, "response_time": 0.3}},
     "name": "earlier",
@@ -48,7 +50,7 @@ def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
     return tuple(answer.numbers[name] for name in ("only_a_unsafe", "only_b_unsafe", "both"))  # type: ignore[return-value]
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_another_version_avoids_is_what_simulations_say() -> None:
     wear, earlier = sv.load_study("wear", **ONE_TEST), sv.load_study("wear", **ONE_TEST, **LONGER)
     answer = sv.compare(wear, earlier, samples=32, unsafe="collision", pool=POOL)
@@ -73,7 +75,7 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     assert both < 16, "most vehicles with random changes of all characteristics collide in both"
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("limits", [(), ("treadDepth >= 3", "brakeTorque >= 0.8")])
 def test_settings_lie_on_lines_from_the_original_and_within_the_limits(
     limits: tuple[str, ...],
@@ -148,7 +150,7 @@ VERSIONS = {
 }
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("version", VERSIONS)
 def test_none_of_four_worse_versions_is_released(
     version: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
@@ -173,7 +175,7 @@ def test_none_of_four_worse_versions_is_released(
         assert float(speed) == pytest.approx(-answer.numbers["b_degree"], abs=0.005)
 
 
-@pytest.mark.slow
+@SLOW
 def test_without_benign_scenes_nothing_is_called_better() -> None:
     wear, early = (
         load_study("wear", **ONE_TEST),
@@ -187,7 +189,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
     assert answer.numbers["metres_earlier"] > 0
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("few_simulations")
 def test_margin_and_rounding_are_those_of_tolerance() -> None:
     smoke, later = load_study("smoke"), load_study("smoke", name="later")
@@ -209,7 +211,7 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
     assert answer["verdict"].startswith("RELEASE: B does not differ from A in anything")
 
 
-@pytest.mark.slow
+@SLOW
 def test_original_values_that_differ(in_tmp: Path) -> None:
     Path("heavy.toml").write_text(
         'extends = "smoke"\nname = "heavy"\n[vehicle.characteristics]\nmass = { original = 2500.0,'
@@ -228,7 +230,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     assert answer.figure().axes
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
@@ -249,7 +251,7 @@ def weathers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     ]
 
 
-@pytest.mark.slow
+@SLOW
 def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     wet, dry = (sv.load(path) for path in reversed(weathers))
     answer = sv.compare(wet, dry, samples=20, pool=POOL)
@@ -274,7 +276,7 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     assert pairs["a"].tolist() == pytest.approx(a)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Path) -> None:
     dry, wet = map(str, weathers)
     page = (

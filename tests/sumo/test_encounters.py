@@ -30,6 +30,8 @@ from tests.in_process import InlinePool, searched, verify_everywhere
 from tests.made_up import case_of, drawn
 from tests.sumo.planted import BRAKING, GAP
 
+SLOW = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def _models(in_tmp: Path) -> None:
@@ -218,7 +220,7 @@ def planted(**changes: Any) -> Study:
     return load_study(tables)
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) -> None:
     """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap -
     margin; a share b of its brakes collides if s / b > gap. So the least wear that ever collides
@@ -239,7 +241,7 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
     assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
     """In half of the encounters here the original collides; all algorithms simulate them and report
     none.
@@ -256,7 +258,7 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     assert (results.solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=SLOW)])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     name: str, tmp_path: Path
 ) -> None:
@@ -275,7 +277,7 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     assert (solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("coarse", "few_simulations")
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
     """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap
@@ -290,7 +292,7 @@ def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> 
     assert answer.numbers["failures"] == 0
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> (
     None
 ):

@@ -271,8 +271,7 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
             axis=0,
         )
         step /= 2
-        beside = np.where(lines % 2, step, -step)
-        shares[lines] += np.choose(failures, [step, beside, -step])
+        shares[lines] += np.choose(failures, [step, np.where(lines % 2, step, -step), -step])
     return Pairs.joined(rounds)
 
 

@@ -103,8 +103,7 @@ def _matrix_up_to(study: Study, name: str, high: float) -> Study:
         units = [searchable_in(points[0].scenario) for _, points in by_test]
         unit = next((unit_text(each[name].unit) for each in units if name in each), "")
         problem = f"{name}={high:g} is not among the values that study {study.name!r} drives"
-        legal = f"a value from {min(driven):g} to {max(driven):g}{unit}"
-        raise InputError(OPTION, problem, legal)
+        raise InputError(OPTION, problem, f"a value from {min(driven):g} to {max(driven):g}{unit}")
     tests = list[MatrixTest]()
     for test, points in by_test:
         values = _values(test, name)
