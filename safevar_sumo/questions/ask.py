@@ -311,7 +311,8 @@ class Question:
             option = next((one.name for one in self.options if one.metavar == CRITERION), "")
             criterion = values.get(option)
             cites = ""
-            # A study's own criterion stands where nothing else is asked for.
+            # A study's own criterion stands where nothing else is asked for; a margin is that of a
+            # collision.
             if option and all(values.get(name) is None for name in (option, "margin")):
                 criterion = study.unsafe.criterion or None
                 values = {**values, option: criterion}

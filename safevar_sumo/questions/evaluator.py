@@ -345,6 +345,7 @@ class Evaluator:
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
+        # The most of a few simulations is the question's, not the criterion's.
         evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
         if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)

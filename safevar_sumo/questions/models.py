@@ -108,7 +108,7 @@ class Model(NamedTuple):
         return robustness
 
     def robustness_by(self, evaluations: Evaluations) -> FloatArray:
-        """What evaluated settings leave; see `left`."""
+        """What evaluated settings leave; see `robustness`."""
         return np.where(evaluations.valid, self.unsafe.robustness(evaluations), np.inf)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:

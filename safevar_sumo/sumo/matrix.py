@@ -134,7 +134,7 @@ def drive_and_score(
     scenario, row i also holds the safety degree of the original vehicle in the encounter of setting
     i, unless `with_originals` is false.
     """
-    # Large batches are cut.
+    # Large batches are cut; beside each setting drives the original in its encounter.
     takes_pairs = with_originals and len(system.characteristics.scenario) > 0
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:

@@ -156,6 +156,7 @@ def compare(
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
+    # Of few simulations a third, a sixth in each study; the others are for the limits.
     pairs, outside = pairs_of((subject, other), common, criteria, evaluator.at_most(samples, 6))
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)

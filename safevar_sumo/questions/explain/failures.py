@@ -145,6 +145,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     if is_rated(study):
         number = RATED_SAMPLED_SETTINGS
+    # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
