@@ -15,6 +15,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
+from safevar_sumo.campaign.batches import ask_why_no_verdict
 from safevar_sumo.campaign.campaign import (
     choose_engine,
     evaluate_original,
@@ -23,7 +24,6 @@ from safevar_sumo.campaign.campaign import (
 )
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.ads import PerVehicleAds
+from safevar_sumo.campaign.batches import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
@@ -24,7 +25,6 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import (
     MAX_REPEATED,
     REPEATED,

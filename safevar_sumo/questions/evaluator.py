@@ -12,14 +12,14 @@ from functools import cached_property
 import numpy as np
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
-from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import (
+from safevar_sumo.campaign.batches import (
     ask_why_no_verdict,
     compile_vehicle,
     evaluate_all,
     repeat_first_batches,
 )
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Subject
@@ -117,8 +117,8 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, settings: NamedValues, least: int = 1) -> None:
-        """Plan the phases of a question, each with the number of settings that it is expected to
+    def begin(self, settings: NamedValues, least: int = 1) -> None:
+        """Begin a question of these phases, each with the number of settings that it is expected to
         simulate; below the `least` number there is no answer.
         """
         expected = sum(settings.values())

@@ -131,7 +131,7 @@ def risk(
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
     of_design = has_design * BASE_POINTS * block
-    evaluator.plan({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
+    evaluator.begin({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)

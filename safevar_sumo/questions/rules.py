@@ -91,7 +91,7 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.plan({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
+    evaluator.begin({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)

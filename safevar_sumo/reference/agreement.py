@@ -64,7 +64,7 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     """
     # The reference's settings, simulated here.
     study = evaluator.study
-    evaluator.plan({STAGE: 1})
+    evaluator.begin({STAGE: 1})
     data = read_reference(reference, evaluator.characteristics)
     here = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
     if not here.valid.any():

@@ -27,7 +27,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, WORST, Study
-from safevar_sumo.sumo.batch import drive_all, is_recorded, score
+from safevar_sumo.sumo.batch import drive_all, needs_no_sumo, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.system import System, assemble
@@ -213,7 +213,7 @@ def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
     if system.has_simulator:  # each result is journaled at once
         return 1
-    if not is_recorded(system, engine):
+    if not needs_no_sumo(system, engine):
         return MAX_COPIES
     if len(
         system.characteristics.scenario
@@ -237,7 +237,7 @@ def batch_size(system: System, engine: Engine) -> int:
     """
     if system.has_simulator:
         return 1
-    if is_recorded(system, engine):
+    if needs_no_sumo(system, engine):
         return largest_batch(system)
     lanes = max(
         number_of_lanes(open_network(network))
@@ -284,7 +284,7 @@ def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Ite
     # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
-    if is_recorded(system, engine) and (not searched or [*searched] == [PHASE]):
+    if needs_no_sumo(system, engine) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)

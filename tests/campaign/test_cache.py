@@ -21,10 +21,10 @@ from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import cache, questions
+from safevar_sumo.campaign import batches, cache
+from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
 from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Use, unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
@@ -63,7 +63,7 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         numbers.append(len(rows))
         return evaluate_settings(task, rows)
 
-    monkeypatch.setattr(questions, "evaluate_settings", count)
+    monkeypatch.setattr(batches, "evaluate_settings", count)
     return numbers
 
 
@@ -145,7 +145,7 @@ def test_an_interrupted_question_goes_on_where_it_was(
     folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Portions that had ended when it was interrupted are not simulated again."""
-    monkeypatch.setattr(questions, "PORTION", 16)
+    monkeypatch.setattr(batches, "PORTION", 16)
     study = load_study("smoke")
     settings = some_settings(study, 64)
     kept = list[int]()
@@ -205,8 +205,8 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     folder: Path, simulated: list[int], in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What user code reads cannot be known: here a file whose name no study has."""
-    monkeypatch.setattr(questions, "PORTION", 16)
-    monkeypatch.setattr(questions, "SMALL_PORTION", 16)
+    monkeypatch.setattr(batches, "PORTION", 16)
+    monkeypatch.setattr(batches, "SMALL_PORTION", 16)
     (in_tmp / "threshold.py").write_text(
         "from pathlib import Path\nTTC = float(Path('t').read_text())"
     )
@@ -347,7 +347,7 @@ def test_an_answer_is_the_same_from_the_cache(
     first = sv.risk("smoke", samples=100, jobs=1)
     assert sum(simulated) > 100
     simulated.clear()
-    monkeypatch.setattr(questions, "carry_out", None)
+    monkeypatch.setattr(batches, "carry_out", None)
     assert sv.risk("smoke", samples=100, jobs=1).render("json") == first.render("json")
     assert not simulated
 

@@ -19,9 +19,9 @@ from pandas.testing import assert_frame_equal
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
+from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import PUBLISHED_SCORING

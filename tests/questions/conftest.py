@@ -13,9 +13,9 @@ import pytest
 from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import questions
+from safevar_sumo.campaign import batches
+from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.questions import between, evaluator, measure, scope
 from safevar_sumo.questions.evaluator import Evaluator
@@ -33,12 +33,12 @@ from tests.made_up import made_up_evaluations
 @pytest.fixture(autouse=True)
 def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have no vehicle model whose batches could be measured."""
-    choose = questions.choose_batches
+    choose = batches.choose_batches
 
     def choose_batches(study: Study, selection: Selection) -> Batches:
         return Batches(100, True, False) if study.name == "made-up" else choose(study, selection)
 
-    monkeypatch.setattr(questions, "choose_batches", choose_batches)
+    monkeypatch.setattr(batches, "choose_batches", choose_batches)
 
 
 @pytest.fixture(autouse=True)
@@ -49,8 +49,8 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(
             module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
         )
-    system_of = questions.system_of
-    for module in (evaluator, questions):
+    system_of = batches.system_of
+    for module in (evaluator, batches):
         monkeypatch.setattr(
             module,
             "system_of",

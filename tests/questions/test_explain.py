@@ -13,7 +13,7 @@ import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.questions import COMPILING
+from safevar_sumo.campaign.batches import COMPILING
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -419,7 +419,7 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     shown = list[tuple[str, int, int]]()
     study = made_up_study(1)
     evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
-    evaluator.plan({"first": 1, "all calls": 1})
+    evaluator.begin({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
     with evaluator.phases.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")

@@ -146,7 +146,7 @@ def compare(
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
-    evaluator.plan({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
+    evaluator.begin({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):

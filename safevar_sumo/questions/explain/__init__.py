@@ -206,7 +206,7 @@ def _plan(subject: Subject, evaluator: Evaluator, quick: bool) -> int:
     else:
         limit = QUICK_LIMIT if quick else LIMIT
         planned = {TO_EXPLAIN: len(subject.solutions)}
-    evaluator.plan({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
+    evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit
 
 

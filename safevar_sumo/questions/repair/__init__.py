@@ -192,7 +192,7 @@ def repair(
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
     budget = budget_of(quick=quick)
-    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * budget})
+    evaluator.begin({ROUNDS_STAGE: USUAL_ROUNDS * budget})
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(

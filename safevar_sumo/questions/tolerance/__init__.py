@@ -102,7 +102,7 @@ def tolerance(
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
     phases = phases_of(evaluator, len(columns), budget, fits)
     planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
-    evaluator.plan(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
+    evaluator.begin(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.

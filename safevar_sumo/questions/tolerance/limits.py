@@ -219,8 +219,8 @@ def _find_together(
                 phases.begin_round(number, len(models.members) - 1, is_known=True)
             search_alone.add(model, tests[model.fit])
             search_alone.attack(model, asked.budget)
-            # Limits alone are failures of one characteristic that a joint box must not hold; what the
-            # joint search met of this kind moves limits alone.
+            # No joint box holds a failure of one characteristic alone, and what the joint search
+            # met of these moves limits alone.
             for _ in range(MAX_REFUTED):
                 if model.fit == 0:
                     joint.find(scans, np.concatenate([known, search_alone.failures]))
