@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -142,11 +142,6 @@ class Models(NamedTuple):
 
     members: tuple[Model, ...]
     left_out: tuple[Model, ...]
-
-    @classmethod
-    def own_alone(cls, evaluator: Evaluator, unsafe: Unsafe) -> Self:
-        """The study's own parameter set."""
-        return cls((Model(0, evaluator, unsafe),), ())
 
     @property
     def own(self) -> Model:

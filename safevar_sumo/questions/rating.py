@@ -429,7 +429,7 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
     from matplotlib.colors import ListedColormap
 
     # Rows and columns, and the cell at each place.
-    columns = [*(f"{value:g}" for value in matrix.column_values), ""]
+    columns = [*(f"{value:g}" for value in matrix.impact_locations or matrix.target_speeds), ""]
     rows = [
         f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}"
         for number, row in enumerate(matrix.rows)

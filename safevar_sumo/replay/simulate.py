@@ -44,7 +44,7 @@ from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.safer import rises_again, why_safer
 from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
-from safevar_sumo.scenarios import degree_note, pre_crash_sentence
+from safevar_sumo.scenarios import FROM_CENTRES, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, PHASE_DECIMALS, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import (
@@ -455,7 +455,9 @@ def _sweep(study: Study, system: System, settings: FloatArray, names: list[str])
 
     # What a reader should know of the settings.
     collisions = int(evaluations.collided[1:].sum())
-    remarks = [*_remarks(system), degree_note(contact)]
+    centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
+    note = f"Safety degree: least distance in m{centres}, or minus the collision speed in m/s."
+    remarks = [*_remarks(system), note]
     read_first = list[str]()
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         read_first.append(f"Remark: In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")

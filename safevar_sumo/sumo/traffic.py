@@ -82,7 +82,6 @@ class Traffic:
         # None: all vehicles share a column, or each has its own.
         self.group: IntArray | None = group if 1 < n_groups < self.n else None
         bodies = [Moving.of(track, step, self.width) for track in self.tracks]
-        # Who is in the path counts before who moves beside it, and both before who stands there.
         highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.

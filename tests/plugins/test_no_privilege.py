@@ -200,7 +200,7 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     functions = {inspect.getfile(one): one for one in own_functions}
     modules = [copied(function, in_tmp).partition(":")[0] for function in functions.values()]
     lines = [
-        "import msgspec",
+        "from msgspec.structs import replace",
         *(f"from {module} import *" for module in modules),
         "from safevar_sumo.metrics import Measure",
     ]

@@ -162,7 +162,7 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = _titles(study.name, second.study.name)
+    titles = ("A", "B") if study.name == second.study.name else (study.name, second.study.name)
     table = _table(common, settings)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
@@ -199,11 +199,6 @@ def compare(
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
     )
-
-
-def _titles(*names: str) -> tuple[str, ...]:
-    """What sentences call A and B: the names of their studies if they differ."""
-    return names if names[0] != names[1] else ("A", "B")
 
 
 def _numbers(

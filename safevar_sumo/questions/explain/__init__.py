@@ -146,7 +146,8 @@ def explain(
         top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
-    is_caused = _has_causes(population, study)
+    # Of an unsafe original no change is a cause, but in another encounter it may be safe.
+    is_caused = bool(study.scenario.search or not population.unsafe.of(population.original)[0])
 
     # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
     # of a smaller one where few simulations are allowed.
@@ -208,13 +209,6 @@ def _plan(subject: Subject, evaluator: Evaluator, quick: bool) -> int:
         planned = {TO_EXPLAIN: len(subject.solutions)}
     evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit
-
-
-def _has_causes(population: Population, study: Study) -> bool:
-    """Whether changes can be causes: of an unsafe original none is, but in another encounter it may
-    be safe.
-    """
-    return bool(study.scenario.search or not population.unsafe.of(population.original)[0])
 
 
 def _counts(population: Population, subject: Subject, analysed: int, explained: int) -> JsonObject:
