@@ -39,7 +39,7 @@ def test_there_are_no_others() -> None:
 
 @pytest.mark.parametrize("name", [*SHOWN, *OTHERS])
 def test_a_notebook_needs_only_the_public_names(name: str) -> None:
-    cells = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4).cells
+    cells = _read(name).cells
     code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
     assert re.findall(r".*\bsafevar_sumo\b.*", code) == ["import safevar_sumo as sv"]
     assert set(re.findall(r"\bsv\.(\w+)", code)) <= set(sv.__all__)
@@ -47,17 +47,14 @@ def test_a_notebook_needs_only_the_public_names(name: str) -> None:
 
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    notebook = _read(name)
     nbformat.validate(notebook)
     assert _shown(notebook) == SHOWN[name]
 
 
 def test_stored_outputs_are_of_todays_vehicle() -> None:
     """`python -m tests.test_notebooks [NAME]...` stores them anew."""
-    texts = {
-        name: _texts(nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4))
-        for name in (*SHOWN, "answers")
-    }
+    texts = {name: _texts(_read(name)) for name in (*SHOWN, "answers")}
     assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
     results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
     assert results == results[:1] * len(SHOWN)
@@ -93,10 +90,7 @@ def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
     monkeypatch.setenv("SAFEVAR_PUBLISHED", str(tmp_path))
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")
-    for notebook in (
-        nbformat.read(NOTEBOOKS / "paper.ipynb", as_version=4),
-        _executed("paper", place, timeout=240),
-    ):
+    for notebook in (_read("paper"), _executed("paper", place, timeout=240)):
         assert _shown(notebook) == (0, 0)
         tables = [
             text
@@ -106,8 +100,12 @@ def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
         assert len(tables) == 6
 
 
+def _read(name: str) -> nbformat.NotebookNode:
+    return nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+
+
 def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
-    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    notebook = _read(name)
     NotebookClient(
         notebook,
         timeout=timeout,
@@ -166,9 +164,8 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) -> None:
-    file = NOTEBOOKS / "rating.ipynb"
     for notebook in (
-        nbformat.read(file, as_version=4),
+        nbformat.read(NOTEBOOKS / "rating.ipynb", as_version=4),
         _executed("rating", tmp_path, timeout=1800),
     ):
         texts = _texts(notebook)

@@ -19,6 +19,7 @@ from safevar_sumo.ads.base import (
     Trim,
     blocks_the_way,
     cruise_at,
+    is_ahead,
     is_in_the_way,
     time_to_reach,
 )
@@ -190,8 +191,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
 
         # It ends when nobody approaches any more who blocks the way.
-        is_ahead = np.isfinite(seen.gap) & (seen.gap > 0)
-        still_blocks = is_ahead & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
+        still_blocks = is_ahead(seen) & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
         is_standing = speed <= 0
         return np.where(still_blocks | is_standing, np.maximum(stage, memory.stage), stage)
 

@@ -16,7 +16,15 @@ from msgspec import Meta
 
 from safevar_sumo.errors import missing_extra
 from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
-from safevar_sumo.records import BoolArray, Command, FloatArray, Nominal, Observation, Quantity
+from safevar_sumo.records import (
+    BoolArray,
+    Command,
+    FloatArray,
+    FloatOrArray,
+    Nominal,
+    Observation,
+    Quantity,
+)
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
 """A driver's parameter above 0, in SI units."""
@@ -224,7 +232,7 @@ class DelayLine(NamedTuple):
     """
 
     steps: int
-    fraction: float | FloatArray
+    fraction: FloatOrArray
     past: tuple[FloatArray, ...] = ()
 
     @classmethod
@@ -234,7 +242,7 @@ class DelayLine(NamedTuple):
         return cls(int(steps), float(fraction))
 
     @staticmethod
-    def parts(delay: float | FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    def parts(delay: FloatOrArray, step: float) -> tuple[FloatArray, FloatArray]:
         """Whole steps and the fraction of a step of a delay [s], or of several."""
         steps, fraction = np.divmod(np.round(np.asarray(delay) / step, STEP_DECIMALS), 1)
         return steps, fraction
@@ -341,7 +349,7 @@ def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) 
     """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle
     reaches it [m]; below 0 outside, and `-LARGEST_GAP` without an obstacle.
     """
-    is_detected = np.isfinite(seen.gap) & (seen.gap <= reach * seen.visibility) & (seen.gap > 0)
+    is_detected = is_ahead(seen) & (seen.gap <= reach * seen.visibility)
     lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
     lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
     watched = corridor + seen.obstacle_width / 2
@@ -349,9 +357,18 @@ def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) 
     return np.where(is_detected, watched - least, -LARGEST_GAP)
 
 
+def is_ahead(seen: Observation) -> BoolArray:
+    """Whether there is an obstacle, and it has not been passed."""
+    return np.isfinite(seen.gap) & (seen.gap > 0)
+
+
+def moves_inwards(seen: Observation) -> BoolArray:
+    """Whether an obstacle moves towards the middle of the lane."""
+    return np.sign(seen.lateral) * seen.lateral_speed < 0
+
+
 def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
     """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards
     the middle.
     """
-    moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
-    return (np.abs(seen.lateral) <= corridor + seen.obstacle_width / 2) | moves_inwards
+    return (np.abs(seen.lateral) <= corridor + seen.obstacle_width / 2) | moves_inwards(seen)

@@ -56,8 +56,7 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         initial_trim = trim_at(nominal, seen) if trim is None else trim
         gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
         acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        command = self.pedals(acceleration, seen.speed, nominal, initial_trim)
-        return command, (nominal, initial_trim)
+        return self.pedals(acceleration, seen.speed, nominal, initial_trim), (nominal, initial_trim)
 
     @abstractmethod
     def acceleration_at(

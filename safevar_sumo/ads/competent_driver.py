@@ -9,7 +9,9 @@ import numpy as np
 from safevar_sumo.ads.base import (
     NonNegativeParameter,
     PositiveParameter,
+    is_ahead,
     is_in_the_way,
+    moves_inwards,
     time_to_reach,
 )
 from safevar_sumo.ads.reaction import (
@@ -171,10 +173,5 @@ def _cuts_in(seen: Observation) -> BoolArray:
     """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than
     across it.
     """
-    moves_inwards = np.sign(seen.lateral) * seen.lateral_speed < 0
-    return (
-        np.isfinite(seen.gap)
-        & (seen.gap > 0)
-        & moves_inwards
-        & (seen.obstacle_speed >= np.abs(seen.lateral_speed))
-    )
+    along = seen.obstacle_speed >= np.abs(seen.lateral_speed)
+    return is_ahead(seen) & moves_inwards(seen) & along

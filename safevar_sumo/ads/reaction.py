@@ -18,6 +18,7 @@ from safevar_sumo.ads.base import (
     Trim,
     blocks_the_way,
     cruise_at,
+    is_ahead,
 )
 from safevar_sumo.records import (
     GRAVITY,
@@ -197,7 +198,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         # Is there a danger? A known one is there while its cause approaches or brakes.
         is_same = seen.obstacle == memory.leader
         is_known = (memory.aware_time >= 0) & (is_same | memory.is_endangered)
-        blocks = np.isfinite(seen.gap) & (seen.gap > 0) & blocks_the_way(seen, self.corridor)
+        blocks = is_ahead(seen) & blocks_the_way(seen, self.corridor)
         approaches = (seen.closing_speed >= 0) | memory.leader_brakes
         is_endangered = danger.is_present | (is_known & blocks & approaches)
 

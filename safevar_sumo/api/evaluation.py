@@ -120,7 +120,7 @@ def evaluate_with_workers(
     from safevar_sumo.questions.evaluator import open_evaluator
 
     with open_evaluator(study, pool, jobs, progress) as evaluator:
-        evaluator.plan({SETTINGS: 1})
+        evaluator.begin({SETTINGS: 1})
         return evaluator.evaluate(settings, SETTINGS, ignore_constraints=True)
 
 

@@ -11,10 +11,11 @@ from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
 
-import msgspec
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
+from safevar_sumo.campaign.batches import ask_why_no_verdict
 from safevar_sumo.campaign.campaign import (
     choose_engine,
     evaluate_original,
@@ -23,7 +24,6 @@ from safevar_sumo.campaign.campaign import (
 )
 from safevar_sumo.campaign.evaluation import Task
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -257,7 +257,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
-    return msgspec.structs.replace(study, search=msgspec.structs.replace(search, **changes))
+    return replace_in(study, search=replace_in(search, **changes))
 
 
 def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:
@@ -389,8 +389,7 @@ def summarise(results: Results) -> Answer:
         counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
         collisions = int(are_collisions(feasible).sum())
-        best = feasible["f_safe"].min()
-        ends = (collisions, *counts, best, len(solutions))
+        ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
 
     # The study's metrics are columns, too.

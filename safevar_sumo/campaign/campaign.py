@@ -15,6 +15,7 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.ads import PerVehicleAds
+from safevar_sumo.campaign.batches import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
@@ -24,7 +25,6 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.campaign.questions import ask_why_no_verdict, check_code, compile_vehicle
 from safevar_sumo.campaign.runs import (
     MAX_REPEATED,
     REPEATED,
@@ -271,8 +271,7 @@ def journal_progress(
         asked = sum(reader.asked() for reader in readers)
         left = sum(reader.left for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
-        phase = f"{study.name}: {finished} of {len(keys)} runs"
-        progress(phase, asked, asked + left)
+        progress(f"{study.name}: {finished} of {len(keys)} runs", asked, asked + left)
 
     return show
 
@@ -341,5 +340,4 @@ def _random_settings(study: Study, *shape: int) -> FloatArray:
             characteristics.lower, characteristics.upper, (count, len(characteristics))
         )
 
-    drawn = region.draw_feasible(draw, math.prod(shape))
-    return np.resize(drawn, (*shape, len(characteristics)))
+    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))

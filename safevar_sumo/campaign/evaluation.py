@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
@@ -96,8 +97,7 @@ def system_of(study: Study) -> System:
 
 @lru_cache(maxsize=KNOWN_SYSTEMS)
 def _assemble_packed(packed_study: bytes) -> System:
-    study = msgspec.msgpack.decode(packed_study, type=Study)
-    return assemble(study)
+    return assemble(msgspec.msgpack.decode(packed_study, type=Study))
 
 
 def carry_out(
@@ -261,8 +261,8 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
 
 def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
     """A study with other values of parameters of its ADS."""
-    ads = msgspec.structs.replace(study.ads, parameters={**study.ads.parameters, **values})
-    return msgspec.structs.replace(study, ads=ads)
+    ads = replace_in(study.ads, parameters={**study.ads.parameters, **values})
+    return replace_in(study, ads=ads)
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:

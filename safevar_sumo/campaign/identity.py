@@ -31,8 +31,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     `used` are names of further files, which user code was seen to load; those that exist belong to
     the inputs.
     """
-    files = files_of(study, system, used)
-    identity = {"files": files, "results": RESULTS, "platform": PLATFORM}
+    identity = {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
     # Versions of the user's simulators, and of the distributions that they name.
     versions = {}
     for scenario in (point.scenario for point in system.points):

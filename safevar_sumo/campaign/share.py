@@ -78,6 +78,7 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
             f"a worker does not see {share.directory}",
             "a directory on a disk that all workers share",
         )
+    # Before: this worker may have other files. Afterwards: somebody may have edited them meanwhile.
     refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
     with about(task.study.source), ExitStack() as stack:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
@@ -100,6 +101,7 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
             for key in share.keys:  # what they hold is not repeatable, and is not continued
                 journal_file(share.directory, str(key)).unlink(missing_ok=True)
             raise
+        # SUMO repeats the same settings whether a run was searched now or read from its journal.
         return [run.finish(random_generator_of(task.study, run.key)) for run in runs]
 
 

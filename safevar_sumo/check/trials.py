@@ -18,7 +18,7 @@ from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
-from safevar_sumo.sumo import is_recorded
+from safevar_sumo.sumo import needs_no_sumo
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -99,7 +99,7 @@ def try_simulations(
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
-    if ":" in study.scenario.model and is_recorded(system):
+    if ":" in study.scenario.model and needs_no_sumo(system):
         try:
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:

@@ -20,7 +20,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.console import Console
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.ask import Option, options_of
@@ -141,7 +141,7 @@ def _check_names(
     for key in keys:
         named.check_key(key)
     if table is not None:
-        named.check_table(table)
+        check_name("table", f"there is no table {table!r}", table, named.tables)
 
 
 def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float]]) -> None:

@@ -12,13 +12,20 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
 from safevar_sumo.metrics.measures import RATING_POINTS
-from safevar_sumo.records import KMH_PER_MS, BoolArray, Evaluations, FloatArray, Outcome, Quantity
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    Outcome,
+    Quantity,
+    TextArray,
+)
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables
 
@@ -314,7 +321,7 @@ class Unsafe:
         raise InputError("unsafe", repr(criterion), CRITERIA)
 
     @classmethod
-    def default(cls, original: Tables, outcomes: npt.NDArray[np.str_] | pd.Series[str]) -> Unsafe:
+    def default(cls, original: Tables, outcomes: TextArray | pd.Series[str]) -> Unsafe:
         """The criterion if none is stated.
 
         In a rated study, a vehicle is unsafe if it has lost at least one of the original's points.

@@ -256,7 +256,8 @@ class Actor:
         path = now.path
         left, turn, forward = offset, np.ones(len(ahead)), ahead
         distance = now.distance + np.cumsum(forward)
-        # Where a lane is depends on the distance, and the distance on how far it leads aside.
+        # Where a lane is depends on the distance, and the distance on how far it leads aside: each
+        # round begins where the one before has come to, and no test shows what a fourth changes.
         for _ in range(1 if lane is None else 3):
             if lane is not None:
                 left = offset + lane.shift(distance)
@@ -268,7 +269,8 @@ class Actor:
                 turn = np.where(speed > MIN_SPEED, cosine + 1j * sine, 1.0)
                 distance = now.distance + np.cumsum(forward)
             if isinstance(path, Way) and not path.is_straight:
-                # On a way that bends, the inner side is shorter.
+                # On a way that bends, the inner side is shorter; the second round takes the bend
+                # where the first one has come to.
                 for _ in range(2):
                     middle = distance - forward / 2
                     inside = 1 - path.curvature(middle) * left

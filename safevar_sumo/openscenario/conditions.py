@@ -49,6 +49,7 @@ def _condition(player: Player, condition: Element, window: slice) -> Array:
     """Class Condition: with its edge, after its delay; it is unknown before it is asked for the
     first time.
     """
+    # The player's document keeps its elements, so that no two have the same id.
     if id(condition) not in player.seen:
         player.seen[id(condition)] = window.start, np.zeros(len(player.times) + 1, bool)
     first, seen = player.seen[id(condition)]

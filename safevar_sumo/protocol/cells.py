@@ -91,11 +91,6 @@ class CellMatrix(Struct, frozen=True, forbid_unknown_fields=True):
     def name(self) -> str:
         return self.test_name if self.light is None else f"{self.test_name} {self.light}"
 
-    @property
-    def column_values(self) -> tuple[float, ...]:
-        """The impact locations [%] of the columns or, without them, the target's speeds [km/h]."""
-        return self.impact_locations or self.target_speeds
-
     def is_rated_by_warning(self, row: int) -> bool:
         """Whether a row is rated by the time to collision at the warning."""
         return self.rows[row].has_function_choice and self.test_name in WARNING_TESTS

@@ -59,10 +59,6 @@ class Contents(NamedTuple):
         }
         return self._replace(numbers=tables.pop(""), tables=tables)
 
-    def check_table(self, name: str) -> None:
-        """Refuse the name of no table; raises an InputError."""
-        check_name("table", f"there is no table {name!r}", name, self.tables)
-
     def check_key(self, key: str) -> None:
         """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
         # A number, a number in a list, or a column.

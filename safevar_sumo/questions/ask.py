@@ -34,7 +34,7 @@ from safevar_sumo.terminal import Parts, Progress, open_progress, print_text
 if TYPE_CHECKING:
     from safevar_sumo.campaign.pool import Pool
     from safevar_sumo.questions.answer import Answer
-    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.case import Subject
     from safevar_sumo.questions.evaluator import Evaluator
 
 QUESTIONS = {
@@ -195,10 +195,9 @@ class Question:
             )
             < 2
         ):
-            takes = f"takes ({', '.join(map(str, parameters))})"
             raise InputError(
                 f"question {self.name!r}",
-                takes,
+                f"takes ({', '.join(map(str, parameters))})",
                 "(subject, evaluator), then other subjects, * and options",
             )
         self.takes_results_only = str(parameters[0].annotation) == "Case"
@@ -252,7 +251,7 @@ class Question:
             raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: known[name].check(value) for name, value in values.items()}
 
-        def subject_of(source: StudyLike | Results) -> Study | Case:
+        def subject_of(source: StudyLike | Results) -> Subject:
             subject = study_or_case(
                 source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only
             )
@@ -280,11 +279,9 @@ class Question:
             if is_long and progress is True and sys.stderr.isatty():
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
-                    rough = {**values, "quick": True}
-                    first = self.answer(subjects, rough, **how, progress=part)
+                    first = self.answer(subjects, {**values, "quick": True}, **how, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
-            called = _name(source)
-            answer = self.answer(subjects, values, **how, progress=progress, called=called)
+            answer = self.answer(subjects, values, **how, progress=progress, called=_name(source))
         return replace(answer, command=command)
 
     def answer(
@@ -314,7 +311,8 @@ class Question:
             option = next((one.name for one in self.options if one.metavar == CRITERION), "")
             criterion = values.get(option)
             cites = ""
-            # A study's own criterion stands where nothing else is asked for.
+            # A study's own criterion stands where nothing else is asked for; a margin is that of a
+            # collision.
             if option and all(values.get(name) is None for name in (option, "margin")):
                 criterion = study.unsafe.criterion or None
                 values = {**values, option: criterion}
@@ -353,7 +351,7 @@ class Question:
         following = self._following(subjects[0], evaluator, called) or answer.next
         return replace(answer, verdict=verdict, numbers=numbers, next=following)
 
-    def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
+    def _following(self, subject: Subject, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
         and where nobody else is on the road nothing is unsafe by itself.
         """

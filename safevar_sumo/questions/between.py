@@ -6,7 +6,7 @@ has the vehicle's characteristics, then a place on each axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.scope import moving_axes, points_of_tests
+from safevar_sumo.questions.scope import are_numbers, at_values, moving_axes, points_of_tests
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Scenario, searchable_in, weather_of
 from safevar_sumo.study import PHASE, Domain, MatrixTest, Study
@@ -54,12 +54,9 @@ class MovingTest:
         self.test = test
         self.axes = tuple(domains)
         self._base = model
-        alone = replace_in(
-            test, over={name: values for name, values in test.over.items() if name not in domains}
-        )
         moving = replace_in(
             study,
-            matrix=replace_in(study.matrix, tests=[alone]),
+            matrix=replace_in(study.matrix, tests=[without_axes(test, domains)]),
             scenario=replace_in(study.scenario, search=domains),
         )
         evaluator = model.evaluator.for_study(moving, verified=0)
@@ -118,16 +115,7 @@ class MovingTest:
     def encounters(self, settings: FloatArray) -> list[MatrixTest]:
         """The encounters of settings, as tests of a matrix."""
         places = np.unique(settings[:, -len(self.axes) :], axis=0).tolist()
-        return [
-            replace_in(
-                self.test,
-                over={
-                    **self.test.over,
-                    **{name: [value] for name, value in zip(self.axes, place, strict=True)},
-                },
-            )
-            for place in places
-        ]
+        return [at_values(self.test, dict(zip(self.axes, place, strict=True))) for place in places]
 
 
 def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
@@ -164,8 +152,13 @@ def axes_of(test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
             upper=float(max(values) if len(values) > 1 else searchable[name].upper),
         )
         for name, values in test.over.items()
-        if name in searchable and all(type(value) in (int, float) for value in values)
+        if name in searchable and are_numbers(values)
     }
+
+
+def without_axes(test: MatrixTest, axes: Collection[str]) -> MatrixTest:
+    """A test whose matrix does not have these axes."""
+    return replace_in(test, over={name: test.over[name] for name in test.over if name not in axes})
 
 
 def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
@@ -188,8 +181,7 @@ def _points_of(test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]
     """The test at each of its points alone, with what tells it from others."""
     for place in product(*test.over.values()):
         over = dict(zip(test.over, place, strict=True))
-        alone = replace_in(test, over={name: [value] for name, value in over.items()})
-        yield (test.name, *over.items()), alone
+        yield (test.name, *over.items()), at_values(test, over)
 
 
 def with_encounters(study: Study, system: System, names: Iterable[str]) -> tuple[Study, System]:
@@ -237,16 +229,12 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
 
     # At a point, the rest of its test stays as it is there.
     kept = [(test, domains) for test, domains in moving if axes <= {*domains}]
-    tests = [
-        replace_in(test, over={name: test.over[name] for name in test.over if name not in axes})
-        for test, _ in kept
-    ]
+    tests = [without_axes(test, axes) for test, _ in kept]
     if matrix.point:
         of_point = dict(system.points[0].parameters)
         tests = [
             replace_in(
-                test,
-                over={name: [of_point[name]] for name in test.over},
+                at_values(test, {name: of_point[name] for name in test.over}),
                 weathers=[
                     weather
                     for weather in test.weathers

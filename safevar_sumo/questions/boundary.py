@@ -97,8 +97,7 @@ def last_safe_values(
     ):
         nearest = np.argmin(np.abs(unsafe[:, group.column] - group.safe))
         column = safe[:, group.column]
-        value = column[np.argmin(np.abs(column - group.safe))]
-        values.append((float(value), unsafe[nearest]))
+        values.append((float(column[np.argmin(np.abs(column - group.safe))]), unsafe[nearest]))
     return values
 
 

@@ -248,6 +248,10 @@ class Case:
         return remarks
 
 
+Subject = Study | Case
+"""What a question may be asked about."""
+
+
 def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:
     """The solutions that count for a metric; for TET and TIT only those without collision
     (docs/method.md, section 4).
@@ -290,7 +294,6 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 if "scoring" in manifest
                 else PUBLISHED_SCORING
             )
-            stated = {name: manifest[name] for name in OF_ALGORITHMS if name in manifest}
             cases.append(
                 build_case(
                     study,
@@ -301,7 +304,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                     scoring=scoring,
                     has_runs="imported" not in manifest,
                     failures=tuple(failures),
-                    **stated,
+                    **{name: manifest[name] for name in OF_ALGORITHMS if name in manifest},
                 )
             )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:

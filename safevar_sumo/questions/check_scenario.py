@@ -51,8 +51,7 @@ def check_scenario(file: str, ego: str, findings: Columns) -> Answer:
     try:
         source = open_file(os.path.abspath(file))
         tables["parameters"] = tabulate("Parameters", PARAMETERS, _parameters(source))
-        values = next(source.combinations({}), {})
-        played = play(source.concrete, values, ego)
+        played = play(source.concrete, next(source.combinations({}), {}), ego)
     except InputError as error:
         problem = (error.problem, file, "", error.legal, "file", "change the file as expected")
         verdict = f"{name} does not play: {error.problem}. Expected: {error.legal}."
@@ -116,8 +115,7 @@ def _draw(played: Played, ego: str, name: str, answer: Answer) -> Figure:
 
     figure, axes = new_figure(name, 1, 1, (8.0, 4.0))
     axis = axes[0][0]
-    led = played.profile - played.speed
-    way = played.speed * played.duration + STEP * float(led.sum())
+    way = played.speed * played.duration + STEP * float((played.profile - played.speed).sum())
     paths = {ego: np.array([-played.ego.length / 2, way])}
     for one in played.others:
         paths[one.name] = (one.place - played.start.place) / played.start.facing

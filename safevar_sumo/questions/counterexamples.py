@@ -138,8 +138,7 @@ def as_printed(
             scale = 10.0 ** (item.digits + further)
             away = np.round if item.is_scenario else np.ceil if value > item.original else np.floor
             # What is a rounding error of the scaled value is none of the value.
-            scaled = away(np.round(value * scale, 6))
-            printed[column] = min(max(scaled / scale, lower), upper)
+            printed[column] = min(max(away(np.round(value * scale, 6)) / scale, lower), upper)
     return printed
 
 

@@ -9,20 +9,20 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 
-import msgspec
 import numpy as np
+from msgspec.structs import replace as replace_in
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
-from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.campaign.questions import (
+from safevar_sumo.campaign.batches import (
     ask_why_no_verdict,
     compile_vehicle,
     evaluate_all,
     repeat_first_batches,
 )
+from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
@@ -117,8 +117,8 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def plan(self, settings: NamedValues, least: int = 1) -> None:
-        """Plan the phases of a question, each with the number of settings that it is expected to
+    def begin(self, settings: NamedValues, least: int = 1) -> None:
+        """Begin a question of these phases, each with the number of settings that it is expected to
         simulate; below the `least` number there is no answer.
         """
         expected = sum(settings.values())
@@ -225,8 +225,7 @@ class Evaluator:
         )
         evaluations = self.evaluate(pairs, stage)
         worst = np.argmin(unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1)
-        first_rows = np.arange(len(settings)) * len(encounters)
-        return evaluations.take(first_rows + worst)
+        return evaluations.take((np.arange(len(settings)) * len(encounters)) + worst)
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
@@ -327,7 +326,7 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
     def choose_criterion(
-        self, text: Unsafe | str | None, source: Study | Case, original: Evaluations | None = None
+        self, text: Unsafe | str | None, source: Subject, original: Evaluations | None = None
     ) -> Unsafe:
         """The criterion that an option states, or else the default for the solutions of results, or
         for settings over the whole domain of a study.
@@ -346,8 +345,8 @@ class Evaluator:
             return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        first = self.at_most(FIRST_SETTINGS, 8)
-        evaluations = self.evaluate(settings[:first], stage)
+        # The most of a few simulations is the question's, not the criterion's.
+        evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
         if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
@@ -373,10 +372,8 @@ class Evaluator:
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
         # The interval may be no multiple of this step.
-        metrics = msgspec.structs.replace(self.study.metrics, sampling_interval=None)
-        return self.for_study(
-            msgspec.structs.replace(self.study, step_length=step, metrics=metrics)
-        )
+        metrics = replace_in(self.study.metrics, sampling_interval=None)
+        return self.for_study(replace_in(self.study, step_length=step, metrics=metrics))
 
     def end(self) -> None:
         """Have user code simulate again what it began with: an error if it does not repeat it."""

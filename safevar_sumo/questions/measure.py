@@ -19,7 +19,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
 
 if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.case import Case, Subject
 
 STAGE = "solutions by the measure"
 
@@ -57,9 +57,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     return replace_in(study, metrics=metrics, matrix=matrix)
 
 
-def subject_by(
-    subject: Study | Case | Path, unsafe: Unsafe, evaluator: Evaluator
-) -> Study | Case | Path:
+def subject_by(subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator) -> Subject | Path:
     """A subject of a question by a criterion; files stay as they are."""
     if isinstance(subject, Path):
         return subject

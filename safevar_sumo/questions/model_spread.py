@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.records import Evaluations, FloatArray, NamedValues, finite_or_none
@@ -128,13 +129,7 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
     systems = []
     for k, other in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
-        systems.append(
-            assemble(
-                msgspec.structs.replace(
-                    other, origin=msgspec.structs.replace(other.origin, called=called)
-                )
-            )
-        )
+        systems.append(assemble(replace(other, origin=replace(other.origin, called=called))))
     return [drive_and_score(system, settings) for system in systems]
 
 
@@ -208,4 +203,4 @@ def value_of(study: Study, name: str) -> float:
 
 def _as_tables(study: Study) -> Any:
     """The study as plain tables; a weather's name is replaced by the weather's table."""
-    return msgspec.to_builtins(msgspec.structs.replace(study, weather=weather_of(study.weather)))
+    return msgspec.to_builtins(replace(study, weather=weather_of(study.weather)))

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -108,7 +108,7 @@ class Model(NamedTuple):
         return robustness
 
     def robustness_by(self, evaluations: Evaluations) -> FloatArray:
-        """What evaluated settings leave; see `left`."""
+        """What evaluated settings leave; see `robustness`."""
         return np.where(evaluations.valid, self.unsafe.robustness(evaluations), np.inf)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
@@ -143,11 +143,6 @@ class Models(NamedTuple):
     members: tuple[Model, ...]
     left_out: tuple[Model, ...]
 
-    @classmethod
-    def own_alone(cls, evaluator: Evaluator, unsafe: Unsafe) -> Self:
-        """The study's own parameter set."""
-        return cls((Model(0, evaluator, unsafe),), ())
-
     @property
     def own(self) -> Model:
         return self.members[0]
@@ -159,7 +154,7 @@ class Models(NamedTuple):
 
 def limit_criterion(
     evaluator: Evaluator,
-    subject: Study | Case,
+    subject: Subject,
     unsafe: Unsafe | str | None,
     margin: float | None,
     original: Evaluations,

@@ -58,8 +58,7 @@ class SharesOverSets(NamedTuple):
         members = np.array([is_first, *groups])[:, is_chosen]
         others = list[FloatArray]()
         if evaluator.left is None and number:
-            models = models_of(evaluator, unsafe, None, with_unsafe_originals=True)
-            for model in models.members[1:]:
+            for model in models_of(evaluator, unsafe, None, with_unsafe_originals=True).members[1:]:
                 runs = model.evaluator.evaluate(part, STAGE)
                 counted = members & runs.valid
                 totals = counted.sum(axis=1)

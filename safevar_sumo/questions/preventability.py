@@ -133,8 +133,7 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
         points = [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())]
         counts = (driver, avoided, avoided_later, number - avoided, len(verdicts) - number)
         rows.append((*counts, share_of.get(driver), low, high, share_of.get(later), points))
-    frame = pd.DataFrame(rows, columns=[*COLUMNS])
-    return frame.astype(
+    return pd.DataFrame(rows, columns=[*COLUMNS]).astype(
         {
             "later": "Int64",
             "share": float,
@@ -194,8 +193,7 @@ def _assess_at_point(
     if approach is None:
         return np.full((len(settings), len(drivers)), np.nan)
     with_original = np.concatenate([system.characteristics.original_settings, settings])
-    scenario = system.points[0].scenario
-    is_led = scenario.pre_crash in (PreCrash.LEAD_DECELERATING, PreCrash.CUT_IN)
+    is_led = system.points[0].scenario.pre_crash in (PreCrash.LEAD_DECELERATING, PreCrash.CUT_IN)
     is_searched = len(system.characteristics.scenario) > 0
     for driver, (model, parameters) in drivers.items():
         if (

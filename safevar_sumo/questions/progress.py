@@ -93,8 +93,7 @@ class Phases:
         else:
             # The mean of the rounds so far, and of one as it was planned.
             self._planned_round = self._planned_round or self._expected / most
-            of_round = (self._planned_round + done) / number
-            self._expected = done + (most - number + 1) * of_round
+            self._expected = done + (most - number + 1) * ((self._planned_round + done) / number)
         self._show()
 
     def _begin(self, name: str, settings: float | None = None) -> None:

@@ -20,6 +20,7 @@ from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import ValueTexts, question
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from safevar_sumo.questions.case import Case
 
 CELLS_STAGE = "cells and robustness layers"
 """The phase of progress."""
@@ -96,7 +96,7 @@ CELLS: Columns = TEST | {
     cells=CELLS,
 )
 def rating(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     set: ValueTexts = (),
@@ -140,7 +140,7 @@ def rating(
 
 
 def _variant(
-    subject: Study | Case, evaluator: Evaluator, changes: tuple[str, ...], solution: str | None
+    subject: Subject, evaluator: Evaluator, changes: tuple[str, ...], solution: str | None
 ) -> dict[str, FloatArray]:
     """The variant's setting by its name; empty if the options describe none.
 
@@ -298,8 +298,7 @@ def _cells(
 
 
 def _changes(study: Study, setting: FloatArray) -> NamedValues:
-    characteristics = CharacteristicSet.of(study)
-    pairs = zip(characteristics, setting.tolist(), strict=True)
+    pairs = zip(CharacteristicSet.of(study), setting.tolist(), strict=True)
     return {item.name: value for item, value in pairs if value != item.original}
 
 
@@ -430,7 +429,7 @@ def _draw_matrix(axis: Axes, protocol: Protocol, scores: Points, matrix: CellMat
     from matplotlib.colors import ListedColormap
 
     # Rows and columns, and the cell at each place.
-    columns = [*(f"{value:g}" for value in matrix.column_values), ""]
+    columns = [*(f"{value:g}" for value in matrix.impact_locations or matrix.target_speeds), ""]
     rows = [
         f"{row.vut_speed:g}{' FCW' * matrix.is_rated_by_warning(number)}"
         for number, row in enumerate(matrix.rows)

@@ -58,8 +58,7 @@ def falsify_limits(
         just_within[:, end[1]] = box.end(*end)
         settings = np.concatenate([settings, just_within])
     settings = np.unique(settings, axis=0)
-    known = [settings] * len(judges)
-    return falsify(box, judges, known, budget + len(judges) * len(settings), rng)
+    return falsify(box, judges, [settings] * len(judges), budget + len(judges) * len(settings), rng)
 
 
 def reach(

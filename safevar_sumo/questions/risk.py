@@ -34,7 +34,7 @@ from safevar_sumo.questions.answer import (
     with_interval,
 )
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.price import LEAST_SETTINGS
@@ -106,7 +106,7 @@ confidence interval; R2 is what a regression explains.
     sensitivity=COLUMNS,
 )
 def risk(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     samples: Count = 10_000,
@@ -131,11 +131,10 @@ def risk(
     has_design = not (model.is_correlated or model.region or study.scenario.search)
     block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
     of_design = has_design * BASE_POINTS * block
-    evaluator.plan({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
+    evaluator.begin({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = model.draw(samples, default_rng(study.search.seed))
-    drawn = evaluator.evaluate(vehicles, SAMPLING)
+    drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)
 
     # How many are unsafe.
     simulated = drawn.take(np.flatnonzero(drawn.valid))
@@ -437,8 +436,7 @@ def _table(
             values |= {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
             head = f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
             meaning = f"share of the variance of {of_what}: {meaning}"
-            is_detail = output == "unsafe"
-            column = Column("-", meaning, ".2f", head=head, is_detail=is_detail)
+            column = Column("-", meaning, ".2f", head=head, is_detail=output == "unsafe")
             columns |= with_interval(name, column)
 
     # The characteristic that decides most comes first.

@@ -18,7 +18,7 @@ import pandas as pd
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.price import LEAST_SETTINGS
@@ -26,7 +26,6 @@ from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import join_phrases, percentage, with_scope
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SAMPLED_STAGE = "vehicles sampled over the whole domain"
@@ -75,11 +74,7 @@ COLUMNS: Columns = {
     rules=COLUMNS,
 )
 def rules(
-    subject: Study | Case,
-    evaluator: Evaluator,
-    *,
-    samples: Count = 16_384,
-    unsafe: Criterion = None,
+    subject: Subject, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None
 ) -> Answer:
     """Find rules, in physical units, that say where in the domain a study is unsafe.
 
@@ -96,7 +91,7 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.plan({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
+    evaluator.begin({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)

@@ -4,8 +4,9 @@ the light.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import islice
+from typing import Any
 
 from msgspec.structs import replace as replace_in
 
@@ -16,6 +17,16 @@ from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
 from safevar_sumo.sumo.system import assemble
 
 
+def are_numbers(values: Iterable[object]) -> bool:
+    """Whether the values of an axis are numbers, none of which is a bool."""
+    return all(type(value) in (int, float) for value in values)
+
+
+def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
+    """A test with one value of each of these axes."""
+    return replace_in(test, over={**test.over, **{name: [values[name]] for name in values}})
+
+
 def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
     """The tests of a study's matrix, each with its points; of a study at one point that test
     alone.
@@ -24,8 +35,7 @@ def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixT
     if study.matrix.point:
         of_point = dict(points[0].parameters)
         test = next(test for test in study.matrix.tests if test.name == of_point["test"])
-        over = {name: [of_point[name]] for name in test.over}
-        return [(replace_in(test, over=over), [*points])]
+        return [(at_values(test, {name: of_point[name] for name in test.over}), [*points])]
     rest = iter(points)
     tests = []
     for test in study.matrix.tests:
@@ -47,9 +57,7 @@ def moving_axes(study: Study, test: MatrixTest, scenario: Scenario) -> list[str]
     return [
         name
         for name, values in test.over.items()
-        if name in searchable
-        and len(values) > 1
-        and all(type(value) in (int, float) for value in values)
+        if name in searchable and len(values) > 1 and are_numbers(values)
     ]
 
 

@@ -18,7 +18,7 @@ from safevar_sumo.study import Study, StudyLike, study_names
 if TYPE_CHECKING:
     import pandas as pd
 
-    from safevar_sumo.questions.case import Case
+    from safevar_sumo.questions.case import Case, Subject
 
 MAX_CHANGES_NAMED = 3
 """Maximum number of changes that an error names."""
@@ -104,7 +104,7 @@ def load(directory: str | Path) -> Results:
 
 def study_or_case(
     source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False
-) -> Study | Case:
+) -> Subject:
     """The subject of a question: a study, or the case of results; `source` may be a name or a path.
 
     With `results_only`, a name or path means a directory, even if a study has the same name.
@@ -156,12 +156,12 @@ def study_or_case(
     return read_study(source)
 
 
-def study_in(subject: Study | Case) -> Study:
+def study_in(subject: Subject) -> Study:
     """The study itself, or the study of the results."""
     return subject if isinstance(subject, Study) else subject.study
 
 
-def reduce_to_point(subject: Study | Case, point: str | None) -> Study | Case:
+def reduce_to_point(subject: Subject, point: str | None) -> Subject:
     """A study or results at one point of the study's matrix; the subject itself without a point.
 
     Raises

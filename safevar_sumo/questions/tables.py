@@ -236,8 +236,7 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
             if is_end:
                 texts = intervals
             else:
-                is_exact = frame[ends[0]] == frame[ends[1]]
-                behind = zip(texts, intervals, is_exact, strict=True)
+                behind = zip(texts, intervals, frame[ends[0]] == frame[ends[1]], strict=True)
                 texts = [
                     text if exact or text == "-" else f"{text} ({interval})"
                     for text, interval, exact in behind

@@ -18,6 +18,7 @@ from safevar_sumo.records.driving import (
     Contact as Contact,
     Encounter as Encounter,
     FloatArray as FloatArray,
+    FloatOrArray as FloatOrArray,
     IntArray as IntArray,
     JsonObject as JsonObject,
     NamedValues as NamedValues,
@@ -27,6 +28,7 @@ from safevar_sumo.records.driving import (
     PedalTables as PedalTables,
     Quantity as Quantity,
     SimulationRuns as SimulationRuns,
+    TextArray as TextArray,
     Trace as Trace,
     finite_or_none as finite_or_none,
 )

@@ -16,6 +16,8 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int_]
+TextArray = npt.NDArray[np.str_]
+FloatOrArray = float | FloatArray
 Quantity = Any
 """A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N
 encounters.
@@ -81,7 +83,7 @@ class Observation(NamedTuple):
     closing_speed: FloatArray
     lateral: FloatArray
     lateral_speed: FloatArray
-    visibility: float | FloatArray
+    visibility: FloatOrArray
     obstacle_speed: FloatArray = ZERO
     throttle: FloatArray = ZERO
     brake: FloatArray = ZERO
@@ -233,7 +235,7 @@ class Contact(NamedTuple):
     0 without a contact.
     """
 
-    side: npt.NDArray[np.str_]
+    side: TextArray
     place: FloatArray
     speed: FloatArray
 
@@ -262,7 +264,7 @@ class SimulationRuns:
 
     trace: Trace
     encounter: Encounter
-    outcome: npt.NDArray[np.str_]
+    outcome: TextArray
     collision_speed: FloatArray
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)

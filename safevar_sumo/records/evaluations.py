@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records.driving import BoolArray, FloatArray, Outcome
+from safevar_sumo.records.driving import BoolArray, FloatArray, Outcome, TextArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
@@ -50,7 +50,7 @@ class Evaluations:
     """
 
     settings: FloatArray
-    outcome: npt.NDArray[np.str_]
+    outcome: TextArray
     collision_speed: FloatArray
     metrics: Mapping[str, FloatArray]
     f_diff: FloatArray

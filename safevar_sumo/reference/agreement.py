@@ -16,6 +16,7 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
 from safevar_sumo.questions.research_questions.statistics import rounded_to_rank
@@ -29,7 +30,6 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, study_names, tables_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from safevar_sumo.questions.case import Case
 
 COLUMNS: Columns = {
     "metric": (
@@ -52,7 +52,7 @@ SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_len
 @contents(
     "rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS
 )
-def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> Answer:
+def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     """Compare a study with settings and metrics in the published package's CSV format, row by row.
 
     Rows with values outside the domains, and rows that cannot be simulated, are left out.
@@ -64,7 +64,7 @@ def validate(subject: Study | Case, evaluator: Evaluator, reference: Path) -> An
     """
     # The reference's settings, simulated here.
     study = evaluator.study
-    evaluator.plan({STAGE: 1})
+    evaluator.begin({STAGE: 1})
     data = read_reference(reference, evaluator.characteristics)
     here = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
     if not here.valid.any():

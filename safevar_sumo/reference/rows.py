@@ -163,8 +163,7 @@ def _plain_name(name: str) -> str:
 
 def _parse_numbers(path: Path, column: pd.Series[str], lowest: float, highest: float) -> FloatArray:
     values = pd.to_numeric(column, errors="coerce")
-    invalid_cells = column[~(np.isfinite(values) & values.between(lowest, highest))]
-    for row, cell in invalid_cells.items():
+    for row, cell in column[~(np.isfinite(values) & values.between(lowest, highest))].items():
         legal = "a finite number" if lowest == -np.inf else f"a number in [{lowest:g}, {highest:g}]"
         fault = "is empty" if pd.isna(cell) else f"= {cell!r}"
         raise InputError(path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal)

@@ -132,10 +132,9 @@ class Comparison:
         tracks = dict[str, Film]()
         samples = count()
         length = len(self.runs.trace.time)
-        settings = self.evaluations.settings
         drive_again(
             self.system,
-            settings,
+            self.evaluations.settings,
             self.runs,
             lambda world: world.film(tracks, next(samples), length),
         )
@@ -158,8 +157,7 @@ class Comparison:
 
         # A collision, or how else it ends.
         if not math.isnan(runs.closing_speed[row]):
-            own = runs.collision_speed[row]
-            return collision_in_words(runs.closing_speed[row], own, digits=1)
+            return collision_in_words(runs.closing_speed[row], runs.collision_speed[row], digits=1)
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             distance = runs.encounter.separation if self.system.has_simulator else runs.trace.gap

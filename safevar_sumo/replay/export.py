@@ -298,9 +298,7 @@ def export(
     if system.characteristics.named(setting).get(PHASE):
         problem = f"solution {solution} has a {PHASE}, which another simulator does not have"
         raise InputError(directory, problem, "a solution of a study that does not search it")
-    vehicle = system.characteristics.vehicle
-    of_vehicle = setting[system.characteristics.of_vehicle]
-    values = vehicle.named(of_vehicle)
+    values = system.characteristics.vehicle.named(setting[system.characteristics.of_vehicle])
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
     comparison = comparison_of(

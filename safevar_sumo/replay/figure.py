@@ -103,24 +103,22 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
     ) -> None:
         point = (trace.time[sample], value)
         colour = COLOURS[row]
-        size = 12 - 4 * row + 2 * (mark == IMPACT_MARK)
         axis.plot(
             *point,
             mark,
             color=colour,
-            markersize=size,
+            markersize=12 - 4 * row + 2 * (mark == IMPACT_MARK),
             linestyle="",
             zorder=6 + row,
             markeredgecolor="white",
         )
-        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}
         axis.annotate(
             text,
             point,
             textcoords="offset points",
             color=colour,
             fontweight="bold",
-            bbox=box,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
             zorder=5,
             **place,
         )

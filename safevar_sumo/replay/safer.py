@@ -57,8 +57,7 @@ def rises_again(frame: pd.DataFrame, name: str, characteristics: CharacteristicS
     """
     original = characteristics.original[characteristics.names.index(name)]
     for side in (frame[frame[name] <= original], frame[frame[name] >= original]):
-        degrees = side.sort_values(name)[SAFETY_DEGREE].dropna()
-        steps = np.sign(np.diff(degrees))
+        steps = np.sign(np.diff(side.sort_values(name)[SAFETY_DEGREE].dropna()))
         if (steps > 0).any() and (steps < 0).any():
             return True
     return False

@@ -139,7 +139,6 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
             distance = np.hypot(track_x - vut.x[samples, row], track_y - vut.y[samples, row])
             if np.any(distance < MAX_DISTANCE + track.length):
                 x, y = rotation @ (np.stack([track_x, track_y]) - start[:, np.newaxis])
-                heading = track.heading[samples, row] - turn
                 body = FlatBody(
                     name,
                     row,
@@ -149,7 +148,7 @@ def lay_out_scene(comparison: Comparison) -> FlatScene:
                     track.width,
                     x,
                     y,
-                    heading,
+                    track.heading[samples, row] - turn,
                 )
                 bodies.append(body)
 

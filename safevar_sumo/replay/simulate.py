@@ -44,7 +44,7 @@ from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.safer import rises_again, why_safer
 from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
-from safevar_sumo.scenarios import degree_note, pre_crash_sentence
+from safevar_sumo.scenarios import FROM_CENTRES, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, PHASE_DECIMALS, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import (
@@ -211,8 +211,7 @@ def show_simulation(
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
     # Several values of a characteristic are a sweep.
-    is_sweep = any(len(options) > 1 for options in values.values())
-    if is_sweep:
+    if any(len(options) > 1 for options in values.values()):
         if trace or animate or gui or spread:
             expected = (
                 "one value for each characteristic with --trace, --animate, --gui or --spread"
@@ -321,8 +320,7 @@ def _answer(target: Target, system: System, simulation: Simulation, *, with_spre
         rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = _remark_table(remarks)
-    members = system.characteristics.vehicle
-    if texts := change_texts(members, system.characteristics.named(setting)):
+    if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
     verdict += _meets(system, setting)
     solution = {} if target.handle is None else {"solution": str(target.handle)}
@@ -457,7 +455,9 @@ def _sweep(study: Study, system: System, settings: FloatArray, names: list[str])
 
     # What a reader should know of the settings.
     collisions = int(evaluations.collided[1:].sum())
-    remarks = [*_remarks(system), degree_note(contact)]
+    centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
+    note = f"Safety degree: least distance in m{centres}, or minus the collision speed in m/s."
+    remarks = [*_remarks(system), note]
     read_first = list[str]()
     if unsafe_originals := np.count_nonzero(system.measuring.scoring.violation(evaluations)[1:]):
         read_first.append(f"Remark: In {unsafe_originals} of {len(frame)} settings {NOT_SAFE}.")

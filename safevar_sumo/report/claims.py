@@ -201,8 +201,7 @@ class Packed:
                 usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
                 answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
-            command = answer.command.replace(f"{folder}/", "")
-            self._answers[text] = replace(answer, command=command)
+            self._answers[text] = replace(answer, command=answer.command.replace(f"{folder}/", ""))
         return self._answers[text]
 
     def _answer_json(self, text: str) -> bytes:
@@ -375,8 +374,7 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
 
     # The first lines that differ, around the first character that does.
     lines = claim.packed.decode().splitlines(keepends=True)
-    lines_here = here.decode().splitlines(keepends=True)
-    pairs = zip_longest(lines, lines_here, fillvalue="nothing")
+    pairs = zip_longest(lines, here.decode().splitlines(keepends=True), fillvalue="nothing")
     first, second = next(
         (_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1
     )

@@ -160,8 +160,7 @@ def _pack_study(
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
-    show_part = Parts(progress).begin(study.name)
-    packed = Packed(described, files, study.origin.places, jobs, show_part)
+    packed = Packed(described, files, study.origin.places, jobs, Parts(progress).begin(study.name))
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
 

@@ -349,8 +349,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
                 frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False
             ):
                 changes.setdefault(tuple(sorted(row)), (row, encounter))
-    causes = [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]
-    for row, encounter in causes:
+    for row, encounter in [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]:
         name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
 

@@ -67,7 +67,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
 
     # The table, and what it is about.
     *tests, road = claim.numbers.get("scope", "").split("; ")
-    rows = {} if missing else {row["characteristic"]: row for row in _records(limits.table())}
+    rows = {} if missing else _rows_of(limits)
     items = study.case.characteristics.vehicle
     parts = [
         (
@@ -127,7 +127,7 @@ def speed_question(study: ReportedStudy) -> str:
     is_contact = unsafe == "collision" and margin
     words = ["--margin", f"{margin:g}"] if is_contact else ["--unsafe", unsafe]
     words += ["--quick"] * limits.numbers["rough"]
-    rows = {row["characteristic"]: row for row in _records(limits.table())}
+    rows = _rows_of(limits)
     for item in study.case.characteristics.vehicle:
         if item.is_for_workshop or item.name not in study.case.study.unmeasured:
             low, high = _together(item, rows.get(item.name))
@@ -148,6 +148,10 @@ def with_speed(study: ReportedStudy, ask: Callable[[str], Answer]) -> ReportedSt
 
 def _limits_of(study: ReportedStudy) -> Answer | None:
     return next((answer for answer in study.answers if answer.question == "tolerance"), None)
+
+
+def _rows_of(limits: Answer) -> dict[str, dict[Any, Any]]:
+    return {row["characteristic"]: row for row in _records(limits.table())}
 
 
 def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
@@ -202,7 +206,7 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     if not numbers["box"]:
         return "No limits were found that hold at the same time."
     items = study.case.characteristics.vehicle
-    rows = {row["characteristic"]: row for row in _records(limits.table())}
+    rows = _rows_of(limits)
     measured = [item for item in items if item.is_for_workshop]
     vague = [
         item for item in measured if not item.is_decidable(*_together(item, rows.get(item.name)))

@@ -120,11 +120,10 @@ def load_runs(directory: str | Path) -> StoredResults:
     frame.insert(
         2, "evaluation", all_positions
     )  # behind algorithm and run; rows are in the order of their runs
-    solutions = solutions_frame(characteristics, solutions_of_runs)
     return StoredResults(
         manifest,
         frame,
-        solutions,
+        solutions_frame(characteristics, solutions_of_runs),
         tuple(run_key for run_key, _ in solutions_of_runs),
         tuple(failures),
     )

@@ -64,11 +64,6 @@ def journal_file(directory: Path, run: str) -> Path:
     return path
 
 
-def stored_runs(directory: Path) -> set[str]:
-    """Names of the runs that have a journal."""
-    return {path.stem for path in (directory / RUNS).glob("*.jsonl")}
-
-
 def make_directory(path: Path) -> None:
     """Make a directory for results, if there is none, and check that it can be written.
 

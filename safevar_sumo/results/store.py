@@ -34,7 +34,6 @@ from safevar_sumo.results.manifest import (
     make_directory,
     read_manifest,
     run_name,
-    stored_runs,
     write_manifest,
     write_whole,
 )
@@ -129,7 +128,8 @@ class ResultsDirectory:
                 f"{self.path}: each run had {before} evaluations before and has {now} now: an id"
                 " such as nsga2:0:0 may name another solution than in earlier output and reports"
             )
-        if left_out := sorted(stored_runs(self.path) - set(names)):
+        stored = {path.stem for path in (self.path / RUNS).glob("*.jsonl")}
+        if left_out := sorted(stored - set(names)):
             remarks.append(
                 f"{self.path}: earlier runs are left out of the results: {', '.join(left_out)}"
             )

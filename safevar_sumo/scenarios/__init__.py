@@ -118,14 +118,6 @@ def distance_in_words(safety_degree: float, contact: float) -> str:
     return f"{safety_degree:.2f} m{gap}"
 
 
-def degree_note(contact: float) -> str:
-    """A sentence on the safety degrees of a table; bodies touch at a safety degree of `contact`
-    [m].
-    """
-    from_centres = f" ({FROM_CENTRES.strip()}: bodies touch at {contact:.2f} m)" if contact else ""
-    return f"Safety degree: least distance in m{from_centres}, or minus the collision speed in m/s."
-
-
 def pre_crash_sentence(points: Iterable[Point]) -> str:
     """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has
     a type.

@@ -7,7 +7,7 @@ or brakes (CCRb); a motorcyclist stands (CMRs) or brakes (CMRb).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
-from safevar_sumo.scenarios.base import PreCrash, Scenario
+from safevar_sumo.scenarios.base import NamedScenarios, PreCrash
 from safevar_sumo.scenarios.euro_ncap import (
     SAME_DIRECTION,
     Direction,
@@ -149,7 +149,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """The target moves along beside the vehicle's path; a car is in the next lane."""
         for place in BESIDE:
             name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
@@ -257,7 +257,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """Gap to the target at the start [m]."""
         return self.parameter("headway") * self.speed * KMH
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """A car is in the next lane."""
         return next_lane(self)
 
@@ -338,9 +338,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]
 
 
-def next_lane(
-    test: LaneTest, headways: Sequence[float] = HEADWAYS
-) -> Iterator[tuple[str, Scenario]]:
+def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> NamedScenarios:
     """Benign scenes of a test in which a car stands in the next lane at these headways [s], each
     with a description.
     """

@@ -279,7 +279,7 @@ class Scenario:
         """Remarks for the user on the scenario's parameters."""
         return []
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """Scenes like this one in which nobody needs to brake, each with a description; none by
         default.
         """
@@ -288,6 +288,10 @@ class Scenario:
     def obstacle(self) -> str:
         """What the vehicle hits in a collision, in words."""
         return OBSTACLES.get(self.pre_crash, "what is in its way")
+
+
+NamedScenarios = Iterable[tuple[str, Scenario]]
+"""Scenarios, each with what it is in words."""
 
 
 class WorldScenario(Scenario):

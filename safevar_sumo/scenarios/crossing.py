@@ -4,7 +4,6 @@ junction.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
-from safevar_sumo.scenarios.base import PreCrash, Scenario
+from safevar_sumo.scenarios.base import NamedScenarios, PreCrash
 from safevar_sumo.scenarios.euro_ncap import (
     FROM_LEFT,
     FROM_RIGHT,
@@ -277,7 +276,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         crossing = Track("target", target, *BODIES[target], x, y, *start.direction, speed)
         return [crossing, *self._parked_cars(impact)] if self.parameter("hidden") else [crossing]
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next
         lane.
         """

@@ -7,7 +7,6 @@ the other's, with bodies that stay parallel to the lanes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ from msgspec import Meta
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import LANE_WIDTH, VEHICLE_SPEED, next_lane
-from safevar_sumo.scenarios.base import PreCrash, Scenario, XmlChanges
+from safevar_sumo.scenarios.base import NamedScenarios, PreCrash, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
 from safevar_sumo.scenarios.roads import Roads
 from safevar_sumo.scenarios.tracks import (
@@ -61,7 +60,7 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         changes = super().actors(roads)
         return {**changes, DEPARTURE: {**(changes[DEPARTURE] or {}), **lane}}
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """A car stays in the next lane."""
         return next_lane(self)
 

@@ -4,7 +4,6 @@ both lanes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import product
 from typing import Annotated, NamedTuple
 
@@ -21,8 +20,8 @@ from safevar_sumo.scenarios.base import (
     VUT,
     Grade,
     Layout,
+    NamedScenarios,
     PreCrash,
-    Scenario,
     Scene,
     WorldScenario,
     XmlChanges,
@@ -164,12 +163,11 @@ class PedestrianCrossing(
             return None
         return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
         nobody.
         """
-        target_speed = WALKING_SPEED * KMH_PER_MS
-        near = Crossing(test="CPNA", target_speed=target_speed, time_to_impact=7.0)
+        near = Crossing(test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0)
         for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
             yield from replace(walk, speed=speed).benign()
 
@@ -326,7 +324,7 @@ class LeadVehicleStopped(
             VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
         )
 
-    def benign(self) -> Iterable[tuple[str, Scenario]]:
+    def benign(self) -> NamedScenarios:
         """A car is in the next lane."""
         for speed in CITY_SPEEDS:
             yield from CarToCar(speed=speed).benign()

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray, Quantity
+from safevar_sumo.records import FloatArray, FloatOrArray, Quantity
 
 NETWORK_KEY = "scenario.parameters.network"
 MAX_BEND = 0.05
@@ -159,7 +159,7 @@ class World(Protocol):
     def person_width(self, actor: str) -> float:
         """Width of a person [m]."""
 
-    def walk(self, person: str, speed: float | FloatArray) -> None:
+    def walk(self, person: str, speed: FloatOrArray) -> None:
         """Make a person continue at a walking speed [m/s], one for all copies or one for each."""
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import tomli_w
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
@@ -141,7 +142,7 @@ def checked_study(raw: StudyTables) -> Study:
         )
     for name in study.spread:
         locate_parameter(msgspec.to_builtins(study), name)
-    return msgspec.structs.replace(study, origin=raw.origin)
+    return replace(study, origin=raw.origin)
 
 
 def _without_characteristics(model: object) -> InputError:
@@ -353,7 +354,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
         If the file cannot be written.
     """
     if re.fullmatch(NAME_PATTERN, path.stem):
-        study = msgspec.structs.replace(study, name=path.stem)
+        study = replace(study, name=path.stem)
 
     # A comment of printable characters.
     lines = (

@@ -73,8 +73,7 @@ def files_of_scenario(
                 **test.parameters,
                 **dict(zip(test.over, combination, strict=True)),
             }
-            texts = frozenset(item for item in point.items() if isinstance(item[1], str))
-            points[texts] = point
+            points[frozenset(item for item in point.items() if isinstance(item[1], str))] = point
 
     # The file itself, its catalogs and its road.
     files: dict[str, str] = {}
@@ -133,8 +132,7 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
     search = scenario.get("search", {})
-    of_file = [*values, *(name for name in search if name not in WEATHER)]
-    for name in of_file:
+    for name in [*values, *(name for name in search if name not in WEATHER)]:
         if name not in offered.values:
             raise unknown_name(
                 "scenario", f"the file declares no parameter {name}", name, offered.values

@@ -90,8 +90,7 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
     problem, _, location = message.partition(" - at `$")
     place = _place(raw, table, prefix, location)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
-        path = _path_text([*place.path, field[1]])
-        return _unknown_key(path, field[1], place.kind, table)
+        return _unknown_key(_path_text([*place.path, field[1]]), field[1], place.kind, table)
     if field := re.match(r"Object missing required field `(.*)`", problem):
         return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
@@ -126,8 +125,7 @@ def _expected_in_words(place: _Place, expected: str) -> str:
     for meta in getattr(place.declared[-1], "__metadata__", ()):
         if meta.pattern and meta.description:
             return str(meta.description)
-    names = r"\b(?:" + "|".join(WORDS) + r")\b"
-    legal = re.sub(names, lambda word: WORDS[word[0]], expected)
+    legal = re.sub(r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected)
     return legal.replace("`", "").replace(" | ", " or ")
 
 

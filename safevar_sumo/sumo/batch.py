@@ -77,8 +77,8 @@ def reason_for_sumo(system: System) -> str:
     return system.scenes.reason_for_sumo(system.points)
 
 
-def is_recorded(system: System, engine: Engine = Engine.RECORDED) -> bool:
-    """Whether the vehicles drive in recorded scenes instead of SUMO."""
+def needs_no_sumo(system: System, engine: Engine = Engine.RECORDED) -> bool:
+    """Whether the vehicles drive without SUMO, in recorded scenes or among bodies on tracks."""
     return engine is Engine.RECORDED and not reason_for_sumo(system)
 
 
@@ -110,7 +110,7 @@ def drive_all(
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
         traffic = traffic_of(system, encounters)
-        if not is_recorded(system, engine):  # in SUMO, among the other actors that it moves
+        if not needs_no_sumo(system, engine):  # in SUMO, among the other actors that it moves
             with open_points_world(system, encounters, traffic) as sumo_world:
                 observer = observer_of(scenario, sumo_world, traffic)
                 runs = drive(on_road, vehicles, sumo_world, observer, listen)
@@ -178,8 +178,7 @@ def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
         starts = n_encounters * np.arange(len(points))
         group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
-    last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
-    n_samples = round(last_sample) + 1
+    n_samples = round(max(float(np.max(last_sample_of(point, step))) for point in points)) + 1
     return Traffic(points, group, n_encounters=n_encounters, n_samples=n_samples, step=step)
 
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import (
@@ -19,6 +18,7 @@ from safevar_sumo.records import (
     FloatArray,
     IntArray,
     Quantity,
+    TextArray,
 )
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
@@ -306,7 +306,7 @@ class Touches(NamedTuple):
     body's middle was then behind the vehicle's front [m].
     """
 
-    side: npt.NDArray[np.str_]
+    side: TextArray
     age: FloatArray
     behind_front: FloatArray
 

@@ -9,7 +9,6 @@ from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.ads import Ads, FullBrake
 from safevar_sumo.ads.varied import with_tau
@@ -27,6 +26,7 @@ from safevar_sumo.records import (
     Outcome,
     Quantity,
     SimulationRuns,
+    TextArray,
     Trace,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
@@ -294,7 +294,7 @@ class _Outcomes:
         self.is_checked = np.ones(n, dtype=bool)
         self.collision_speed = np.full(n, np.nan)
         self.warning_ttc = np.full(n, np.nan)
-        self.ended: npt.NDArray[np.str_] = np.array([])
+        self.ended: TextArray = np.array([])
         """The outcomes of all runs, once no run is open."""
         self._has_moved = np.zeros(n, dtype=bool)
         self._has_stopped = np.zeros(n, dtype=bool)
@@ -333,7 +333,7 @@ class _Outcomes:
             is_first = warns & self.is_open & np.isnan(self.warning_ttc) & (closing_speed > 0)
             np.copyto(self.warning_ttc, scene.gap / closing_speed, where=is_first)
 
-    def classify(self) -> npt.NDArray[np.str_]:
+    def classify(self) -> TextArray:
         """The outcomes of all runs, once no run is open."""
         outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, dtype="U16")
         outcome[self._is_over] = Outcome.PASSED

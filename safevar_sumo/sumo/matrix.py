@@ -27,7 +27,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, WORST, Study
-from safevar_sumo.sumo.batch import drive_all, is_recorded, score
+from safevar_sumo.sumo.batch import drive_all, needs_no_sumo, score
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.system import System, assemble
@@ -134,7 +134,7 @@ def drive_and_score(
     scenario, row i also holds the safety degree of the original vehicle in the encounter of setting
     i, unless `with_originals` is false.
     """
-    # Large batches are cut.
+    # Large batches are cut; beside each setting drives the original in its encounter.
     takes_pairs = with_originals and len(system.characteristics.scenario) > 0
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:
@@ -213,7 +213,7 @@ def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
     if system.has_simulator:  # each result is journaled at once
         return 1
-    if not is_recorded(system, engine):
+    if not needs_no_sumo(system, engine):
         return MAX_COPIES
     if len(
         system.characteristics.scenario
@@ -237,7 +237,7 @@ def batch_size(system: System, engine: Engine) -> int:
     """
     if system.has_simulator:
         return 1
-    if is_recorded(system, engine):
+    if needs_no_sumo(system, engine):
         return largest_batch(system)
     lanes = max(
         number_of_lanes(open_network(network))
@@ -284,7 +284,7 @@ def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Ite
     # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
-    if is_recorded(system, engine) and (not searched or [*searched] == [PHASE]):
+    if needs_no_sumo(system, engine) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         runs = drive_all(replace(system, matrix=points), settings, engine)
@@ -299,8 +299,7 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     if not system.matrix:
         return system.points[0]
     at_points = [result.evaluations for result in simulate_all_points(system, setting[np.newaxis])]
-    number = int(worst_points(system, at_points)[0])
-    return system.points[number]
+    return system.points[int(worst_points(system, at_points)[0])]
 
 
 def at_point(study: Study, name: str) -> Study:
@@ -382,8 +381,7 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
         measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
         # An impact may be allowed: then the measure says how bad a collision is.
-        by_measure = ~has_collided | (name == IMPACT_EXCESS.name)
-        values = np.where(by_measure, measures, safety_degrees)
+        values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf

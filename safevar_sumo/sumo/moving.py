@@ -52,7 +52,8 @@ class Moving(NamedTuple):
         Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so
         that a vehicle that is never faster again has avoided it.
     level
-        `IN_PATH`, `BESIDE` or 0; below 0 for a body that is not met at all.
+        `IN_PATH`, `BESIDE` (who moves there) or 0 (who stands there); of several bodies those of
+        the highest level count. Below 0 for a body that is not met at all.
     is_rotated, faces_along
         Whether it is ever rotated against the lane, and whether it always faces along it.
     """

@@ -157,10 +157,9 @@ def _roads_in(folder: Path) -> str:
             name for name in names if name == options_in(folder / OPTIONS_FILE).get("net-file")
         ] or names
     if len(names) != 1:
-        problem = f"has {' and '.join(names) or 'no network'}"
         raise InputError(
             folder,
-            problem,
+            f"has {' and '.join(names) or 'no network'}",
             f"{LEGAL_FOLDERS}; of several networks, net-file in {OPTIONS_FILE} names one",
         )
     return names[0]

@@ -323,8 +323,7 @@ class TraciView:
         network's parts.
         """
         if domain not in SENSED:
-            of_all_copies = getattr(self._api, domain).getIDList()
-            return tuple(dict.fromkeys(map(_original_ids, of_all_copies)))
+            return tuple(dict.fromkeys(map(_original_ids, getattr(self._api, domain).getIDList())))
         own = [VUT] if domain == "vehicle" else []
         return (*own, *self._traffic.seen[self._copy].actors[domain])
 

@@ -120,8 +120,7 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     for start in range(0, len(order), size):
         rows = order[start : start + size]
         chosen = runs.of(rows)
-        in_sumo = drive_again(system, settings[rows], chosen)
-        _compare(system, settings[rows], chosen, in_sumo)
+        _compare(system, settings[rows], chosen, drive_again(system, settings[rows], chosen))
 
 
 def _compare(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame, lane_through
@@ -278,7 +278,7 @@ class SumoWorld:
     def person_width(self, actor: str) -> float:
         return float(self.api.person.getWidth(self.ids(actor)[0]))
 
-    def walk(self, person: str, speed: float | FloatArray) -> None:
+    def walk(self, person: str, speed: FloatOrArray) -> None:
         for id_, value in zip(
             self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True
         ):

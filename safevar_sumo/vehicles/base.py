@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Legal, Returned
-from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, FloatOrArray, Observation
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -41,8 +41,8 @@ class Slope(NamedTuple):
     negative downhill; `down` onto the road.
     """
 
-    back: float | FloatArray
-    down: float | FloatArray
+    back: FloatOrArray
+    down: FloatOrArray
 
 
 LEVEL = Slope(0.0, GRAVITY)
@@ -186,7 +186,7 @@ class Vehicle:
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        water: float | FloatArray = 0.0,
+        water: FloatOrArray = 0.0,
     ) -> Prepared:
         """Constants of a run with a time step of `step` seconds.
 

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import GRAVITY, TIME_ROUNDING, BoolArray, Command, FloatArray, Observation
+from safevar_sumo.records import (
+    GRAVITY,
+    TIME_ROUNDING,
+    BoolArray,
+    Command,
+    FloatArray,
+    FloatOrArray,
+    Observation,
+)
 from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
@@ -150,7 +158,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        water: float | FloatArray = 0.0,
+        water: FloatOrArray = 0.0,
     ) -> _Prepared:
         from safevar_sumo.vehicles.carla_step import (
             TYRE_STEPS,
@@ -260,7 +268,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         wheel_speed = rim / p.radius
         resistance = p.wheel_damping * wheel_speed + p.radius * force
 
-        def engine_in(ratio: float | FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        def engine_in(ratio: FloatOrArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             """Torque through the clutch and torque that remains for the brake [N m], and engine
             speed [rad/s].
             """

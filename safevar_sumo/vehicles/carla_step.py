@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, FloatOrArray
 from safevar_sumo.vehicles.compiled import compiled, equation
 
 BLOCK = 64
@@ -22,7 +22,6 @@ processor's first cache.
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
 NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
-FloatOrArray = float | FloatArray
 """A number of one vehicle; in records outside the compiled step those of N, shape (N,)."""
 
 

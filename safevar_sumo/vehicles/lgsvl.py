@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, Observation
+from safevar_sumo.records import Command, FloatArray, FloatOrArray, Observation
 from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
@@ -71,7 +71,7 @@ class _Prepared(NamedTuple):
     mass: FloatArray
     weight: FloatArray  # load on the road [N]
     body: FloatArray
-    slope_deceleration: float | FloatArray  # by the slope, g sin(angle) [m/s^2]
+    slope_deceleration: FloatOrArray  # by the slope, g sin(angle) [m/s^2]
     standstill: FloatArray
     radius: FloatArray
     inertia: FloatArray
@@ -164,7 +164,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        water: float | FloatArray = 0.0,
+        water: FloatOrArray = 0.0,
     ) -> _Prepared:
         # Inertia of the wheels, and constants of the equations of motion.
         c = characteristics

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from safevar_sumo.records import FloatArray, Observation
+from safevar_sumo.records import FloatArray, FloatOrArray, Observation
 from safevar_sumo.vehicles.base import (
     FRICTION,
     LEVEL,
@@ -48,7 +48,7 @@ class _PreparedSumo(NamedTuple):
     drive: FloatArray
     brake: FloatArray
     decel: FloatArray
-    grip: float | FloatArray
+    grip: FloatOrArray
     max_speed: FloatArray
     actuator_lag: FloatArray
     tau: FloatArray
@@ -109,7 +109,7 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        water: float | FloatArray = 0.0,
+        water: FloatOrArray = 0.0,
     ) -> _PreparedSumo:
         c = characteristics
 
@@ -165,7 +165,7 @@ class _PreparedWorn(NamedTuple):
     mass: FloatArray
     drive: FloatArray
     brake: FloatArray
-    grip: float | FloatArray
+    grip: FloatOrArray
     lift: FloatArray
     max_speed: float
     front_load: FloatArray
@@ -275,7 +275,7 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         road_friction: float,
         step: float,
         slope: Slope = LEVEL,
-        water: float | FloatArray = 0.0,
+        water: FloatOrArray = 0.0,
     ) -> _PreparedWorn:
         c = characteristics
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from pythonfmu.builder import FmuBuilder
 from pythonfmu3.builder import FmuBuilder as FmuBuilder3
 
@@ -126,14 +127,14 @@ def test_each_vehicle_has_an_instance_of_an_fmu_of_either_standard(
     small: Make, source: str
 ) -> None:
     commands = driven(small(source=source), [40.0, 20.0, 10.0])
-    np.testing.assert_array_equal(commands[:, 0], 0)
-    np.testing.assert_array_equal(commands[:, 1], [[0, 0], [1, 0], [1, 1]])
+    assert_array_equal(commands[:, 0], 0)
+    assert_array_equal(commands[:, 1], [[0, 0], [1, 0], [1, 1]])
 
 
 def test_instances_begin_anew_in_each_run(small: Make) -> None:
     system = small("self.pedal = self.steps / 10")
     for _ in range(2):
-        np.testing.assert_allclose(driven(system, [20.0] * 3)[:, 1, 0], [0.1, 0.2, 0.3])
+        assert_allclose(driven(system, [20.0] * 3)[:, 1, 0], [0.1, 0.2, 0.3])
 
 
 def test_an_acceleration_drives_as_the_same_law_in_python(small: Make) -> None:
@@ -160,8 +161,8 @@ class Law(Ads):
     settings = np.random.default_rng(5).uniform(members.lower, members.upper, (12, len(members)))
     expected = drive_and_score(law, settings)
     results = drive_and_score(fmu, settings)
-    np.testing.assert_array_equal(results.outcome, expected.outcome)
-    np.testing.assert_array_equal(results.f_safe, expected.f_safe)
+    assert_array_equal(results.outcome, expected.outcome)
+    assert_array_equal(results.f_safe, expected.f_safe)
     assert len({*expected.outcome}) > 1
 
 
@@ -180,9 +181,7 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
     assert message in error.value.problem
     assert "\n" not in error.value.problem
-    np.testing.assert_array_equal(
-        driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault"
-    )
+    assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")
 
 
 @pytest.mark.parametrize(

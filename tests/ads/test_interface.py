@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from pythonfmu.builder import FmuBuilder
 
 from safevar_sumo.ads import Ads, ScalarAds
@@ -55,7 +56,7 @@ def test_pedals_are_those_of_the_original_vehicles_tables(
     many.start(2, KNOWN, 0.05)
     for nominal in (None, KNOWN):
         command = many.pedals(np.full(2, acceleration), np.full(2, 10.0), nominal)
-        np.testing.assert_allclose(command, [[throttle] * 2, [brake] * 2])
+        assert_allclose(command, [[throttle] * 2, [brake] * 2])
     tilted = one.pedals(acceleration, 10.0, Trim(np.array(0.1), np.array(0.0)))
     assert tilted == pytest.approx((throttle + (0.1 if throttle else 0.0), brake))
 
@@ -110,7 +111,7 @@ def test_an_ads_knows_how_long_the_obstacle_and_its_own_vehicle_are(
     size = {"vut_length": 4.7, "vut_width": 1.85}
     ads = listened({**scenario, "parameters": {**scenario["parameters"], **size}})
     assert (ads.nominal.length, ads.nominal.width) == (4.7, 1.85)
-    np.testing.assert_allclose(np.array(ads.sizes)[:, :, 0], [extent] * len(ads.sizes))
+    assert_allclose(np.array(ads.sizes)[:, :, 0], [extent] * len(ads.sizes))
 
 
 TELLS = """
@@ -158,7 +159,6 @@ def step(traci, vehicle_id):
 
 def test_a_traci_controller_reads_them_by_its_own_calls(in_tmp: Path) -> None:
     (in_tmp / "reads.py").write_text(CONTROLLER)
-    table = {"kind": "traci", "model": "reads:step"}
-    system: System = assemble(load_study("native", ads=table))
+    system: System = assemble(load_study("native", ads={"kind": "traci", "model": "reads:step"}))
     with pytest.raises(UserCodeError, match=r"4\.700 m and \d\.\d+ m"):
         drive_and_score(system, original_of(system))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from pandas.testing import assert_frame_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -67,7 +68,7 @@ def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
         assert sv.simulate("smoke", changes).to_dict() == expected
     settings = [pd.Series(plain_setting), {"tireFric": np.array(1.1)}]
     frame = sv.evaluate("smoke", [plain_setting, {"tireFric": 1.1}], jobs=1)
-    pd.testing.assert_frame_equal(sv.evaluate("smoke", settings, jobs=1), frame)
+    assert_frame_equal(sv.evaluate("smoke", settings, jobs=1), frame)
 
 
 def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
@@ -102,7 +103,7 @@ def test_evaluate_is_simulate_row_by_row() -> None:
     for name, value in {**one.metrics, **one.objectives}.items():
         assert frame.loc["a", name] == value
     again = sv.evaluate("sun", frame[list(one.setting)].to_numpy(), jobs=1)
-    pd.testing.assert_frame_equal(again, frame.reset_index(drop=True))
+    assert_frame_equal(again, frame.reset_index(drop=True))
 
 
 def test_a_value_that_is_missing_is_the_originals() -> None:
@@ -138,7 +139,7 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
         )
     alone = sv.simulate(sv.load_study("wear", matrix={"point": name}), {"brakeTorque": 0.6})
     assert (alone.original.numbers, alone.numbers) == (one.original.numbers, one.numbers)
-    pd.testing.assert_frame_equal(alone.trace, one.trace)
+    assert_frame_equal(alone.trace, one.trace)
 
 
 @pytest.mark.parametrize(
@@ -185,11 +186,11 @@ def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond() -> None:
 
 def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     again = sv.load(results.directory)
-    pd.testing.assert_frame_equal(again.solutions, results.solutions)
+    assert_frame_equal(again.solutions, results.solutions)
     assert tables_of(again.study) == tables_of(load_study("smoke"))
     assert len(again.evaluations) > 300
     stored = pd.read_csv(results.directory / "solutions.csv")
-    pd.testing.assert_frame_equal(again.solutions, stored, check_dtype=False)
+    assert_frame_equal(again.solutions, stored, check_dtype=False)
 
 
 @pytest.mark.slow

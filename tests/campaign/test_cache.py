@@ -17,13 +17,14 @@ from pathlib import Path
 import diskcache
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import cache, questions
+from safevar_sumo.campaign import batches, cache
+from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
 from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.campaign.questions import ask_why_no_verdict, evaluate_all
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Use, unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
@@ -62,7 +63,7 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
         numbers.append(len(rows))
         return evaluate_settings(task, rows)
 
-    monkeypatch.setattr(questions, "evaluate_settings", count)
+    monkeypatch.setattr(batches, "evaluate_settings", count)
     return numbers
 
 
@@ -76,16 +77,25 @@ def some_settings(study: Study, number: int) -> FloatArray:
     return sobol_settings(CharacteristicSet.of(study), number)
 
 
+@pytest.fixture
+def eight(folder: Path, simulated: list[int]) -> tuple[Study, FloatArray]:
+    """A study, and eight settings of it that were simulated."""
+    study = load_study("smoke")
+    settings = some_settings(study, 8)
+    evaluated(study, settings)
+    return study, settings
+
+
 def assert_equal(one: Evaluations, other: Evaluations) -> None:
     """To the bit, in every array."""
-    np.testing.assert_array_equal(one.settings, other.settings)
+    assert_array_equal(one.settings, other.settings)
     assert [*one.results] == [*other.results]
     for name, values in one.results.items():
-        np.testing.assert_array_equal(values, other.results[name])
+        assert_array_equal(values, other.results[name])
         assert values.dtype == other.results[name].dtype
-    np.testing.assert_array_equal(one.points, other.points)
+    assert_array_equal(one.points, other.points)
     for mine, theirs in zip(one.cells or (), other.cells or (), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+        assert_array_equal(mine, theirs)
 
 
 @pytest.mark.parametrize("name", ["smoke", "alks", "sun"])
@@ -135,7 +145,7 @@ def test_an_interrupted_question_goes_on_where_it_was(
     folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Portions that had ended when it was interrupted are not simulated again."""
-    monkeypatch.setattr(questions, "PORTION", 16)
+    monkeypatch.setattr(batches, "PORTION", 16)
     study = load_study("smoke")
     settings = some_settings(study, 64)
     kept = list[int]()
@@ -195,8 +205,8 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     folder: Path, simulated: list[int], in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What user code reads cannot be known: here a file whose name no study has."""
-    monkeypatch.setattr(questions, "PORTION", 16)
-    monkeypatch.setattr(questions, "SMALL_PORTION", 16)
+    monkeypatch.setattr(batches, "PORTION", 16)
+    monkeypatch.setattr(batches, "SMALL_PORTION", 16)
     (in_tmp / "threshold.py").write_text(
         "from pathlib import Path\nTTC = float(Path('t').read_text())"
     )
@@ -250,25 +260,23 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     assert sum(simulated) == 64
 
 
-def test_an_altered_entry_is_simulated_again(folder: Path, simulated: list[int]) -> None:
+def test_an_altered_entry_is_simulated_again(
+    eight: tuple[Study, FloatArray], folder: Path, simulated: list[int]
+) -> None:
     """One byte of each entry is changed, and one entry takes another one's place."""
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
     with diskcache.Cache(str(folder)) as entries:
         for key in [*entries]:
             content = bytearray(entries[key])
             content[-20] ^= 1
             entries[key] = bytes(content)
-    evaluated(study, settings)
+    evaluated(*eight)
     assert sum(simulated) == 16
 
 
-def test_nothing_is_unpickled(folder: Path, simulated: list[int], tmp_path: Path) -> None:
+def test_nothing_is_unpickled(
+    eight: tuple[Study, FloatArray], folder: Path, simulated: list[int], tmp_path: Path
+) -> None:
     """An entry that somebody has planted would make a file."""
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
 
     class Planted:
         def __reduce__(self) -> tuple[object, ...]:
@@ -278,7 +286,7 @@ def test_nothing_is_unpickled(folder: Path, simulated: list[int], tmp_path: Path
         database.execute(
             "UPDATE Cache SET mode = 4, filename = NULL, value = ?", [pickle.dumps(Planted())]
         )
-    evaluated(study, settings)
+    evaluated(*eight)
     assert sum(simulated) == 16
     assert not (tmp_path / "planted").exists()
 
@@ -339,17 +347,16 @@ def test_an_answer_is_the_same_from_the_cache(
     first = sv.risk("smoke", samples=100, jobs=1)
     assert sum(simulated) > 100
     simulated.clear()
-    monkeypatch.setattr(questions, "carry_out", None)
+    monkeypatch.setattr(batches, "carry_out", None)
     assert sv.risk("smoke", samples=100, jobs=1).render("json") == first.render("json")
     assert not simulated
 
 
-def test_evidence_does_not_check_itself(folder: Path, simulated: list[int]) -> None:
-    study = load_study("smoke")
-    settings = some_settings(study, 8)
-    evaluated(study, settings)
+def test_evidence_does_not_check_itself(
+    eight: tuple[Study, FloatArray], simulated: list[int]
+) -> None:
     with simulate_anew():
-        evaluated(study, settings)
+        evaluated(*eight)
     assert sum(simulated) == 16
 
 

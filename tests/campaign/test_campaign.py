@@ -13,14 +13,15 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
+from numpy.random import default_rng
+from pandas.testing import assert_frame_equal
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
+from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.campaign import deal, measure_speed
 from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.campaign.runs import Run
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import PUBLISHED_SCORING
@@ -49,7 +50,7 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
         load_runs(tmp_path / name).evaluations.query("algorithm == 'rs' and run == 3")
         for name in ("together", "alone")
     )
-    pd.testing.assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
+    assert_frame_equal(one.reset_index(drop=True), other.reset_index(drop=True))
 
 
 @pytest.mark.parametrize(
@@ -106,7 +107,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     carried_out(second, tmp_path / "fresh")
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
     results = load_runs(tmp_path / "out")
-    pd.testing.assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
+    assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
     assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
@@ -137,7 +138,7 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(
     journal.finish([0], 1)
     journal.close()
     run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1, PUBLISHED_SCORING)  # type: ignore[arg-type]
-    result = run.finish(np.random.default_rng(0))
+    result = run.finish(default_rng(0))
     for found in (result.solutions, result.sample):
         assert np.array_equal(found.settings, both.settings[:1])
 
@@ -150,8 +151,7 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
     path = journal_file(tmp_path, "rs-00")
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
     monkeypatch.setattr(
-        "safevar_sumo.campaign.share.random_generator_of",
-        lambda study, key: np.random.default_rng(7),
+        "safevar_sumo.campaign.share.random_generator_of", lambda study, key: default_rng(7)
     )
     with pytest.raises(
         SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"
@@ -159,14 +159,19 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
         carried_out(study, tmp_path)
 
 
+def at_times(monkeypatch: pytest.MonkeyPatch, pool: FormulaPool, *seconds: float) -> None:
+    """The pool evaluates, and the clock shows these seconds."""
+    times = iter(seconds)
+    monkeypatch.setattr("time.perf_counter", lambda: next(times))
+    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+
+
 @pytest.mark.parametrize(("workers", "runs"), [(1, None), (4, None), (2, 2)])
 def test_the_speed_of_a_study_is_that_of_all_workers_that_have_a_run(
     workers: int, runs: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pool = FormulaPool(4 if runs else workers)
-    seconds = iter([10.0, 14.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    at_times(monkeypatch, pool, 10.0, 14.0)
     task = Task(study=load_study("smoke"), batch_size=200)
     assert measure_speed(task, pool, runs) == workers * 200 / 4
     assert sorted(pool.sizes) == [200] * 2 * workers, "those before are not measured"
@@ -177,9 +182,7 @@ def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
 ) -> None:
     """0.5 s for one vehicle: ten are enough."""
     pool = FormulaPool(1)
-    seconds = iter([0.0, 0.5, 1.0, 6.0])
-    monkeypatch.setattr("time.perf_counter", lambda: next(seconds))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+    at_times(monkeypatch, pool, 0.0, 0.5, 1.0, 6.0)
     study = load_study("smoke", ads={"model": "highway_idm", "parameters": {}})
     assert measure_speed(Task(study=study, batch_size=200), pool) == 10 / 5
     assert pool.sizes == [1, 1, 10]

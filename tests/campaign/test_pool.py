@@ -10,10 +10,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import psutil
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import evaluation
@@ -101,14 +101,14 @@ def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(poo
     with pytest.raises(SafevarError, match=f"study 'smoke': {why}"):
         carry_out(take, [(Task(study=study), 9)], pool)
     assert not processes(), "it would keep a core busy beside its successor"
-    mine = msgspec.structs.replace(study, ads=ModelTable(model="my_ads:Mine"), spread={})
+    mine = replace(study, ads=ModelTable(model="my_ads:Mine"), spread={})
     with pytest.raises(UserCodeError, match=r"probably in ads\.model = 'my_ads:Mine'"):
         carry_out(take, [(Task(study=mine), 9)], pool)
 
 
 def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     study = load_study("smoke")
-    wrong = msgspec.structs.replace(study, ads=ModelTable(model="world_on_roads"), spread={})
+    wrong = replace(study, ads=ModelTable(model="world_on_roads"), spread={})
     with pytest.raises(InputError, match="world_on_roads") as caught:
         carry_out(evaluate_settings, [(Task(study=wrong), SUN.original_settings)], pool)
     assert "expected" in str(caught.value)
@@ -118,7 +118,7 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
 
 
 STUDY = load_study("sun")
-WITH_USER_CODE = msgspec.structs.replace(
+WITH_USER_CODE = replace(
     STUDY, ads=ModelTable(model="my_ads:Mine"), spread={}, origin=Origin(called="my study.toml")
 )
 

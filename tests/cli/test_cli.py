@@ -30,6 +30,8 @@ from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import json_of, refused, run
 
+SLOW = pytest.mark.slow
+
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
 
@@ -81,7 +83,7 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
     assert loaded("import safevar_sumo.cli") == set()
 
 
-@pytest.mark.slow
+@SLOW
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
     assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == {"pandas"}
@@ -136,7 +138,7 @@ def test_a_change_is_a_value_a_share_or_a_sweep(change: str, values: list[float]
     assert result == pytest.approx(values)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     """Every number stands once, and the test case of the least degree is named."""
     lead, _, _ = simulate("wear").stdout.partition("\n┏")
@@ -147,7 +149,7 @@ def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     assert "simulated" not in simulate("wear").stdout
 
 
-@pytest.mark.slow
+@SLOW
 def test_why_a_heavier_car_looks_safer_is_said_from_its_pedals_and_its_frames() -> None:
     """At 10 km/h a heavy car slows down less at first, and its driving system brakes fully."""
     heavy = sv.simulate("wear", {"payload": 300})
@@ -189,7 +191,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "from centre to centre: bodies touch at 4.70 m" in remark
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,7 +267,7 @@ def test_before_a_total_is_known_a_terminal_says_searching() -> None:
     assert re.fullmatch(r"searching [━╸╺ ]+", last)
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_user_code_prints_leaves_the_json_alone(
     in_tmp: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

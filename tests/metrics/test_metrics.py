@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy import signal
 
 from safevar_sumo.api.simulation import load_study
@@ -329,7 +330,7 @@ def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_sec
 
 
 def test_rms_agrees_with_scipys_filters() -> None:
-    speed = np.cumsum(np.random.default_rng(1).normal(size=(200, 3)), axis=0)
+    speed = np.cumsum(default_rng(1).normal(size=(200, 3)), axis=0)
     high = 2 * np.pi * 0.4
     corner = 2 * np.pi * 2
     first = signal.bilinear(*signal.butter(2, high, "high", analog=True), fs=1 / SAMPLED)
@@ -346,7 +347,7 @@ def test_rms_agrees_with_scipys_filters() -> None:
     "name", sorted(OPTIONAL_METRICS.keys() - {"stopping_distance", "impact_excess", "impact_speed"})
 )
 def test_each_vehicle_counts_for_itself_to_the_bit_and_not_on_a_collision(name: str) -> None:
-    speed = np.cumsum(np.random.default_rng(2).normal(size=(150, 7)), axis=0)
+    speed = np.cumsum(default_rng(2).normal(size=(150, 7)), axis=0)
     assert np.array_equal(
         comfort(name, speed)[[4]], comfort(name, speed[:, 4].copy()), equal_nan=True
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import Encounter, FloatArray, Outcome, SimulationRuns
@@ -103,7 +104,7 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
     """Both divide the gap by the closing speed, and half its square by the gap, at the ends of
     steps.
     """
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     traffic = list[str]()
     nodes = edges = ""
     for i in range(RUNS):
@@ -135,7 +136,7 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
 
 @pytest.mark.slow
 def test_before_and_behind_who_crosses_pet_is_that_of_the_device(tmp_path: Path) -> None:
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     traffic = ['<route id="east" edges="wc ce"/><route id="north" edges="sc cn"/>']
     for i in range(RUNS):
         own, its = rng.uniform(5, 8.5, 2)  # nobody slows down before the junction

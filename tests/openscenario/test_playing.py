@@ -205,8 +205,7 @@ def test_a_trajectory_ends_where_its_line_ends(tmp_path: Path) -> None:
     """10 + 12 m at 5 m/s from 1 s on; what waits for its end begins then."""
     along = event(polyline(*VERTICES, timing="<None/>"), AT_ONCE.format(1))
     then = event(speed(9), DONE.format("event", "Event"), "Then")
-    car = teleport(at(-2, 90)), speed(5)
-    played = staged(tmp_path, along, then, car=car)
+    played = staged(tmp_path, along, then, car=(teleport(at(-2, 90)), speed(5)))
     assert played.events[0][3] == pytest.approx(5.4)
     assert np.flatnonzero(only(played).speed > 5)[0] * STEP == pytest.approx(5.4)
 

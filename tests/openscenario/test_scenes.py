@@ -123,16 +123,24 @@ def test_what_happens_to_an_ego_that_keeps_its_speed(tmp_path: Path, scene: str)
     assert found == {"-": "", "NO_EVENT": NO_EVENT}.get(third, nobody)
 
 
+def walks_after_v(folder: Path) -> str:
+    """The file of a pedestrian who walks after v seconds."""
+    return writing.write(
+        folder,
+        event(speed(1.5), AT_V),
+        car=walker(200, 15, 0),
+        entities=PERSON,
+        parameters=writing.PARAMETER,
+    )
+
+
 def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(
     tmp_path: Path,
 ) -> None:
     """A pedestrian is passed at 0.75 m, by any vehicle; in a search the original's encounter
     decides on a verdict.
     """
-    walks = event(speed(1.5), AT_V)
-    file = writing.write(
-        tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER
-    )
+    file = walks_after_v(tmp_path)
     for when in (99, 3):
         table = f'extends = "wear"\nname = "mine"\n[scenario]\nfile = "{file}"\nvalues.v = {when}'
         (tmp_path / "mine.toml").write_text(table)
@@ -155,10 +163,7 @@ def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Pat
     """The pedestrian walks after v seconds: at 3 s in time, at 50 s never, and vehicles of that
     encounter are left out whatever they do.
     """
-    walks = event(speed(1.5), AT_V)
-    file = writing.write(
-        tmp_path, walks, car=walker(200, 15, 0), entities=PERSON, parameters=writing.PARAMETER
-    )
+    file = walks_after_v(tmp_path)
     search = {"v": {"lower": 0.0, "upper": 99.0, "original": 3.0}}
     system = assemble(load_study("wear", scenario={"file": file, "search": search}))
     members = system.characteristics

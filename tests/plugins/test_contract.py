@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -113,18 +115,25 @@ PRESSED = (
 )
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_ctrl_c_passes(name: str, mine: Mine) -> None:
-    """Its handler is the same afterwards."""
-    ctrl_c = mine(SCALAR + PRESSED.format(name))
+@contextmanager
+def handled_by_default(name: str) -> Iterator[None]:
+    """A signal interrupts, also if these tests run in a background in which it is ignored; its
+    handler is the same afterwards.
+    """
     number = signal.Signals[name]
     handler = signal.signal(number, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt):
-            drive_and_score(ctrl_c, original_of(ctrl_c))
+        yield
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_ctrl_c_passes(name: str, mine: Mine) -> None:
+    ctrl_c = mine(SCALAR + PRESSED.format(name))
+    with handled_by_default(name), pytest.raises(KeyboardInterrupt):
+        drive_and_score(ctrl_c, original_of(ctrl_c))
 
 
 def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
@@ -142,14 +151,9 @@ def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_command_is_interrupted_by_ctrl_c(name: str, mine: Mine, folder: Path) -> None:
-    """Even if these tests were started in a background in which Ctrl-C is ignored."""
     mine(SCALAR + PRESSED.format(name))
-    number = signal.Signals[name]
-    handler = signal.signal(number, signal.default_int_handler)
-    try:
+    with handled_by_default(name):
         assert "interrupted" in run("simulate", str(folder / "mine.toml"), expect=130).stderr
-    finally:
-        signal.signal(number, handler)
 
 
 def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:

@@ -10,9 +10,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
+from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
@@ -32,6 +33,8 @@ from tests.in_process import InlinePool, searched
 from tests.made_up import drawn
 from tests.manual import ROOT
 
+SLOW = pytest.mark.slow
+
 BASES = {
     "pedestrian_crossing": "sun",
     "lead_vehicle_stopped": "native",
@@ -44,10 +47,7 @@ FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 
 
 def each(names: Iterable[str], *others: str) -> list[Any]:
-    return [
-        pytest.param(name, *others, marks=() if name in FAST else pytest.mark.slow)
-        for name in names
-    ]
+    return [pytest.param(name, *others, marks=() if name in FAST else SLOW) for name in names]
 
 
 def copied(model: Any, folder: Path) -> str:
@@ -68,7 +68,7 @@ def assert_equal(ours: Study, theirs: Study) -> None:
     found = results_of(theirs)
     assert expected.keys() == found.keys()
     for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+        assert_array_equal(found[name], values, err_msg=name)
 
 
 def with_scenario(name: str, model: str, **tables: Any) -> Study:
@@ -76,9 +76,7 @@ def with_scenario(name: str, model: str, **tables: Any) -> Study:
     study = load_study(
         BASES.get(name, "wear"), scenario={"model": name}, **{"matrix": None, **tables}
     )
-    return msgspec.structs.replace(
-        study, scenario=msgspec.structs.replace(study.scenario, model=model)
-    )
+    return replace(study, scenario=replace(study.scenario, model=model))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +100,7 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     base = load_study(
         BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search}
     )
-    copy = msgspec.structs.replace(base, scenario=msgspec.structs.replace(base.scenario, model=own))
+    copy = replace(base, scenario=replace(base.scenario, model=own))
     assert_equal(base, copy)
 
 
@@ -127,10 +125,9 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
     for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
         domain = ("km/h", 40, *((20, 60) if model == "deer:Deer" else (10, 80)))
         search = {"speed": {}, "visibility": {"lower": 0.5}}
-        test = {"name": "it", "model": model}
         for tables in (
             {"scenario": {"model": model, "search": search}, "matrix": None},
-            {"scenario": {"search": search}, "matrix": {"tests": [test]}},
+            {"scenario": {"search": search}, "matrix": {"tests": [{"name": "it", "model": model}]}},
         ):
             found = load_study("wear", **tables).scenario.search
             speed = found["speed"]
@@ -164,10 +161,8 @@ def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
         None,
     )
     ours = load_study(base or "wear", matrix=None, **{} if base else {table: {"model": name}})
-    own = msgspec.structs.replace(
-        getattr(ours, table), model=copied({**VEHICLES, **ADS}[name], in_tmp)
-    )
-    assert_equal(ours, msgspec.structs.replace(ours, **{table: own}))
+    own = replace(getattr(ours, table), model=copied({**VEHICLES, **ADS}[name], in_tmp))
+    assert_equal(ours, replace(ours, **{table: own}))
 
 
 def assert_same_solutions(ours: Study, theirs: Study, folder: Path) -> None:
@@ -187,7 +182,7 @@ def short(study: str, algorithm: str) -> Study:
     return load_study(study, search=search)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
@@ -205,14 +200,13 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     functions = {inspect.getfile(one): one for one in own_functions}
     modules = [copied(function, in_tmp).partition(":")[0] for function in functions.values()]
     lines = [
-        "import msgspec",
+        "from msgspec.structs import replace",
         *(f"from {module} import *" for module in modules),
         "from safevar_sumo.metrics import Measure",
     ]
     lines.append("known = [one for one in list(globals().values()) if isinstance(one, Measure)]")
     lines.append(
-        "globals().update({one.name: msgspec.structs.replace(one, name='own_' + one.name) for one"
-        " in known})"
+        "globals().update({one.name: replace(one, name='own_' + one.name) for one in known})"
     )
     lines.append(
         "def largest(settings, characteristics): return characteristics.largest_change(settings)"
@@ -231,15 +225,13 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     )
     found = drive_and_score(system, drawn(system, 8, 2))
     for name in shipped:
-        np.testing.assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
-    np.testing.assert_array_equal(found.column("own_f_diff"), found.f_diff)
+        assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
+    assert_array_equal(found.column("own_f_diff"), found.f_diff)
     values = system.measuring.scoring.values(found)
-    np.testing.assert_array_equal(
-        values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1)
-    )
+    assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,21 +242,20 @@ def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
         monkeypatch.setattr("safevar_sumo.protocol.cells.MODELS", models)
         system = assemble(study)
         points.append(drive_and_score(system, drawn(system, 2, 2)).column("rating_points"))
-    np.testing.assert_array_equal(*points)
+    assert_array_equal(*points)
     assert points[0].max() > 0
 
 
 def with_own_models(study: Study, folder: Path) -> Study:
     """A study with copies of its scenario, vehicle and driving system."""
-    tables = {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}
-    for key, shipped in tables.items():
+    for key, shipped in {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}.items():
         table = getattr(study, key)
-        own = msgspec.structs.replace(table, model=copied(shipped[table.model], folder))
-        study = msgspec.structs.replace(study, **{key: own})
+        own = replace(table, model=copied(shipped[table.model], folder))
+        study = replace(study, **{key: own})
     return study
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ["smoke", "sun_joint", "alks_joint"])
 def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     name: str, in_tmp: Path
@@ -273,7 +264,7 @@ def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
     assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
 
 
-@pytest.mark.slow
+@SLOW
 def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,9 +280,7 @@ def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
     ours = load_study("wear", matrix=None, scenario=scenario, repair=change)
     answers = []
     for study in (ours, with_own_models(ours, in_tmp)):
-        slower = msgspec.structs.replace(
-            study, ads=msgspec.structs.replace(study.ads, parameters={"response_time": 0.6})
-        )
+        slower = replace(study, ads=replace(study.ads, parameters={"response_time": 0.6}))
         worn = ["brakeTorque >= 0.5"]
         repaired = sv.repair(
             study, promise=worn, change=["response_time"], fits=0, pool=InlinePool()

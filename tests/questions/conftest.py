@@ -5,16 +5,17 @@ unsafe region is known.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import questions
+from safevar_sumo.campaign import batches
+from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.campaign.questions import Batches
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.questions import between, evaluator, measure, scope
 from safevar_sumo.questions.evaluator import Evaluator
@@ -25,19 +26,19 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Limit, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, searched
 from tests.made_up import made_up_evaluations
 
 
 @pytest.fixture(autouse=True)
 def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have no vehicle model whose batches could be measured."""
-    choose = questions.choose_batches
+    choose = batches.choose_batches
 
     def choose_batches(study: Study, selection: Selection) -> Batches:
         return Batches(100, True, False) if study.name == "made-up" else choose(study, selection)
 
-    monkeypatch.setattr(questions, "choose_batches", choose_batches)
+    monkeypatch.setattr(batches, "choose_batches", choose_batches)
 
 
 @pytest.fixture(autouse=True)
@@ -48,8 +49,8 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(
             module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
         )
-    system_of = questions.system_of
-    for module in (evaluator, questions):
+    system_of = batches.system_of
+    for module in (evaluator, batches):
         monkeypatch.setattr(
             module,
             "system_of",
@@ -67,11 +68,8 @@ def made_up_study(n: int) -> Study:
         name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
         for name in "abcdefghijkl"[:n]
     }
-    return msgspec.structs.replace(
-        smoke,
-        name="made-up",
-        spread={},
-        vehicle=msgspec.structs.replace(smoke.vehicle, characteristics=rows),
+    return replace(
+        smoke, name="made-up", spread={}, vehicle=replace(smoke.vehicle, characteristics=rows)
     )
 
 
@@ -148,6 +146,27 @@ def two_islands(settings: FloatArray) -> BoolArray:
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
     return (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
+
+
+@pytest.fixture
+def ahead(request: pytest.FixtureRequest, in_tmp: Path) -> Study:
+    """The study that the test's module has as `AHEAD`."""
+    (in_tmp / "ahead.toml").write_text(request.module.AHEAD)
+    return load_study("ahead.toml")
+
+
+@pytest.fixture(scope="module")
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the module's `STUDY` and its results are."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.toml").write_text(request.module.STUDY)
+    searched(load_study(str(folder / "tiny.toml")), folder / "results")
+    return folder
+
+
+def model_of(study: Study, **unsafe: float) -> Model:
+    """Its own model, which is simulated here."""
+    return Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe(**unsafe))
 
 
 def box_of(

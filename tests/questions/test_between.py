@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -24,6 +25,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
+from tests.questions.conftest import model_of
 
 AHEAD = """
 extends = "wear"
@@ -43,12 +45,6 @@ AT_TESTS_ALONE = {
 """Limits of `wear` that hold at its tests; between them, at 59 km/h, a car keeps 0.25 m."""
 
 
-@pytest.fixture
-def ahead(in_tmp: Path) -> Study:
-    (in_tmp / "ahead.toml").write_text(AHEAD)
-    return load_study("ahead.toml")
-
-
 def box_within(model: Model, ends: dict[str, float]) -> Box:
     members = model.evaluator.characteristics
     end = members.setting(ends)
@@ -57,13 +53,13 @@ def box_within(model: Model, ends: dict[str, float]) -> Box:
 
 
 def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study) -> None:
-    own = Model(0, Evaluator(ahead, InlinePool(), verified=0), Unsafe(keep=0.3))
+    own = model_of(ahead, keep=0.3)
     box = box_within(own, AT_TESTS_ALONE)
     corners = box.corners(0, 0)
     assert own.robustness(corners, "").min() >= 0
     (test,) = moving_tests(own, own.unsafe)
     assert test.axes == ("speed",)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     worst = corners[np.argsort(own.robustness(corners, ""))[:64]]
     judges = [lambda rows: test.robustness(rows, "")]
     found = falsify(test.box(box), judges, [test.spread(worst, rng)], 2000, rng)
@@ -78,11 +74,11 @@ def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study
 
 
 def test_an_encounter_between_counts_only_where_the_original_is_safe(ahead: Study) -> None:
-    own = Model(0, Evaluator(ahead, InlinePool(), verified=0), Unsafe(keep=0.3))
+    own = model_of(ahead, keep=0.3)
     worn = own.evaluator.characteristics.setting({"sensorLatency": 0.4})[np.newaxis]
     for new_car, counts in ((own.unsafe, True), (Unsafe(keep=99.0), False)):
         (test,) = moving_tests(own, new_car)
-        left = test.robustness(test.spread(worn, np.random.default_rng(0)), "")
+        left = test.robustness(test.spread(worn, default_rng(0)), "")
         assert np.isfinite(left[left < np.inf]).any() == counts
 
 
@@ -136,7 +132,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             row["together_low"],
             row["together_high"],
         )
-    points = np.random.default_rng(5).random((300, len(members)))
+    points = default_rng(5).random((300, len(members)))
     points[:100] = np.round(points[:100])
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])
     (test,) = study.matrix.tests

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy
 import tomli_w
+from numpy.testing import assert_allclose
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -20,6 +21,8 @@ from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
+
+SLOW = pytest.mark.slow
 
 LONGER = {
     "ads": {"model": "aeb", "parameters": {"braking_share": 0.65, "response_time": 0.3}},
@@ -47,7 +50,7 @@ def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
     return tuple(answer.numbers[name] for name in ("only_a_unsafe", "only_b_unsafe", "both"))  # type: ignore[return-value]
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_another_version_avoids_is_what_simulations_say() -> None:
     wear, earlier = sv.load_study("wear", **ONE_TEST), sv.load_study("wear", **ONE_TEST, **LONGER)
     answer = sv.compare(wear, earlier, samples=32, unsafe="collision", pool=POOL)
@@ -65,14 +68,14 @@ def test_what_another_version_avoids_is_what_simulations_say() -> None:
     lines = [one.f_safe.reshape(4, 8).mean(axis=0) for one in runs]
     assert answer.numbers["p"] == pytest.approx(scipy.stats.wilcoxon(*lines).pvalue)
     assert "8 straight lines" in answer.tested
-    np.testing.assert_allclose(answer.tables["pairs"][["a", "b"]], np.transpose(lines))
+    assert_allclose(answer.tables["pairs"][["a", "b"]], np.transpose(lines))
     assert re.search(r"line 7 +│ +-?\d", text := answer.render("text", details=True))
     assert "The same settings" not in text
     assert only_a > 0
     assert both < 16, "most vehicles with random changes of all characteristics collide in both"
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("limits", [(), ("treadDepth >= 3", "brakeTorque >= 0.8")])
 def test_settings_lie_on_lines_from_the_original_and_within_the_limits(
     limits: tuple[str, ...],
@@ -92,7 +95,7 @@ def test_settings_lie_on_lines_from_the_original_and_within_the_limits(
         assert shares[1] / shares[0] == pytest.approx(0.5) or shares[1] / shares[
             0
         ] == pytest.approx(1.5)
-        np.testing.assert_allclose(
+        assert_allclose(
             of_line / shares[:, np.newaxis], [of_line[0] / shares[0]] * len(of_line), atol=1e-9
         )
     if limits:
@@ -147,7 +150,7 @@ VERSIONS = {
 }
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("version", VERSIONS)
 def test_none_of_four_worse_versions_is_released(
     version: str, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
@@ -172,7 +175,7 @@ def test_none_of_four_worse_versions_is_released(
         assert float(speed) == pytest.approx(-answer.numbers["b_degree"], abs=0.005)
 
 
-@pytest.mark.slow
+@SLOW
 def test_without_benign_scenes_nothing_is_called_better() -> None:
     wear, early = (
         load_study("wear", **ONE_TEST),
@@ -186,7 +189,7 @@ def test_without_benign_scenes_nothing_is_called_better() -> None:
     assert answer.numbers["metres_earlier"] > 0
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("few_simulations")
 def test_margin_and_rounding_are_those_of_tolerance() -> None:
     smoke, later = load_study("smoke"), load_study("smoke", name="later")
@@ -208,7 +211,7 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
     assert answer["verdict"].startswith("RELEASE: B does not differ from A in anything")
 
 
-@pytest.mark.slow
+@SLOW
 def test_original_values_that_differ(in_tmp: Path) -> None:
     Path("heavy.toml").write_text(
         'extends = "smoke"\nname = "heavy"\n[vehicle.characteristics]\nmass = { original = 2500.0,'
@@ -217,7 +220,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     answer = sv.compare("smoke", "heavy.toml", samples=50, pool=POOL)
     frame = answer.tables["settings"]
     assert frame["b_mass"].min() >= 2450
-    np.testing.assert_allclose(frame["b_mass"] - frame["mass"], 96)
+    assert_allclose(frame["b_mass"] - frame["mass"], 96)
     assert answer.tables["limits"].set_index("characteristic").loc["mass", ["a", "b"]].tolist() == [
         2404,
         2500,
@@ -227,7 +230,7 @@ def test_original_values_that_differ(in_tmp: Path) -> None:
     assert answer.figure().axes
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
@@ -248,7 +251,7 @@ def weathers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     ]
 
 
-@pytest.mark.slow
+@SLOW
 def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     wet, dry = (sv.load(path) for path in reversed(weathers))
     answer = sv.compare(wet, dry, samples=20, pool=POOL)
@@ -273,7 +276,7 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     assert pairs["a"].tolist() == pytest.approx(a)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Path) -> None:
     dry, wet = map(str, weathers)
     page = (

@@ -13,7 +13,7 @@ import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.questions import COMPILING
+from safevar_sumo.campaign.batches import COMPILING
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -53,11 +53,13 @@ from tests.questions.conftest import (
     two_islands,
 )
 
+SLOW = pytest.mark.slow
+
 RESOLUTION = 1 / 16_384
 """Accuracy of a boundary that `find_boundary_shares` promises, as a share of the line."""
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> None:
     answer = json.loads(explained.render("json"))
     output = [str(handle) for handle in handles_of(case.solutions)]
@@ -96,7 +98,7 @@ def test_the_most_frequent_robust_cause_leads(explained: Answer) -> None:
     assert causes["share"].isin(shares).all() or len(shares) == MAX_DISTINCT
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> None:
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     by_reason = {
@@ -112,7 +114,7 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
     assert explained.numbers["explained"] == len(explained.tables["solutions"]) == 3
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     safe = (
         case.solutions["f_num_diff"].where(case.solutions["f_safe"] > 1).idxmin()
@@ -145,7 +147,7 @@ def test_every_boundary_is_unsafe_as_it_is_printed(case: Case, explained: Answer
     assert case.unsafe.of(drive_and_score(assemble(case.study), np.array(settings))).all()
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
     slippery: Path, case: Case
 ) -> None:
@@ -202,7 +204,7 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
 COLLISION = Unsafe()
 
 
-@pytest.mark.slow
+@SLOW
 @given(table=st.lists(st.booleans(), min_size=32, max_size=32), full=st.integers(0, 31))
 def test_all_minimal_unsafe_subsets_and_no_other_whatever_the_outcomes(
     table: list[bool], full: int
@@ -417,7 +419,7 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     shown = list[tuple[str, int, int]]()
     study = made_up_study(1)
     evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
-    evaluator.plan({"first": 1, "all calls": 1})
+    evaluator.begin({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
     with evaluator.phases.stage("all calls", 4):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")

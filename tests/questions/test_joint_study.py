@@ -61,23 +61,14 @@ QUESTIONS = {
 }
 
 
-@pytest.fixture(scope="module")
-def joint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with the study's file and its results."""
-    folder = tmp_path_factory.mktemp("joint")
-    (folder / "tiny.toml").write_text(STUDY)
-    searched(load_study(str(folder / "tiny.toml")), folder / "results")
-    return folder
-
-
 @pytest.fixture
-def case(joint: Path) -> Case:
-    return load_cases([joint / "results"])[0]
+def case(folder: Path) -> Case:
+    return load_cases([folder / "results"])[0]
 
 
 @pytest.fixture(autouse=True)
-def _few_encounters(joint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(joint)
+def _few_encounters(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(scans, "SCAN_VALUES", 11)
     monkeypatch.setattr(evaluator, "ENCOUNTERS", 4)
     monkeypatch.setattr(evaluator, "CANDIDATES", 64)
@@ -148,14 +139,14 @@ class TakesAll:
 """
 
 
-def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(joint: Path) -> None:
-    (joint / "takes.py").write_text(TAKES_ALL)
+def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(folder: Path) -> None:
+    (folder / "takes.py").write_text(TAKES_ALL)
     own = 'extends = "tiny.toml"\nname = "own"\nsearch.algorithms = ["takes:TakesAll"]\n'
-    (joint / "own.toml").write_text(own)
+    (folder / "own.toml").write_text(own)
     study = load_study("own.toml")
     warnings: list[str] = []
-    searched(study, joint / "own", warn=warnings.append)
-    case = load_cases([joint / "own"])[0]
+    searched(study, folder / "own", warn=warnings.append)
+    case = load_cases([folder / "own"])[0]
     infeasible = (~case.evaluations["feasible"]).sum()
     assert 0 < infeasible < 80 == len(case.solutions) + infeasible
     (warning,) = (one for one in warnings if "TakesAll" in one)
@@ -163,9 +154,9 @@ def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(joint: 
 
 
 def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refused(
-    joint: Path,
+    folder: Path,
 ) -> None:
-    (joint / "far.toml").write_text(
+    (folder / "far.toml").write_text(
         'extends = "tiny.toml"\nname = "far"\nscenario.margin = 40\nsearch.evaluations = 10\n'
     )
     text = run("study", "far.toml", "--out", "far").stdout
@@ -236,8 +227,8 @@ def test_changes_are_those_of_the_vehicle(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_two_studies_are_compared_in_the_encounters_that_both_search(joint: Path) -> None:
-    (joint / "wider.toml").write_text(
+def test_two_studies_are_compared_in_the_encounters_that_both_search(folder: Path) -> None:
+    (folder / "wider.toml").write_text(
         STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
     )
     answer = json_of("compare", "results", "wider.toml", "--samples", "64", expect=4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
@@ -108,7 +109,7 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
         return (np.abs(rows[:, 0] - 6.25) < 0.25) & (np.abs(rows[:, 1:] - 6.5) < 0.7).all(axis=1)
 
     found = box_of(3, tooth, {"a": Limit(at_least=3, at_most=7)})
-    assert not tooth(found.box.at(np.random.default_rng(1).random((20_000, 3)))).any()
+    assert not tooth(found.box.at(default_rng(1).random((20_000, 3)))).any()
     assert relative_volume(found) > 0.02
     assert found.validations[0].attacked == (1 + CONFIRMATIONS) * 2000
     hit = falsify(
@@ -116,7 +117,7 @@ def test_a_tooth_between_corners_is_found_and_left_out() -> None:
         [lambda rows: np.where(tooth(rows), -1.0, np.abs(rows - 6.3).max(axis=1))],
         [],
         2000,
-        np.random.default_rng(0),
+        default_rng(0),
     )
     assert hit.robustness[0] == -1
     assert hit.simulated < 2000, "it ends soon after"
@@ -131,7 +132,7 @@ def test_the_box_holds_in_every_fit() -> None:
     found = box_of(3, linear, {}, [second])
     assert [model.fit for model in found.members] == [0, 1]
     settings = np.concatenate(
-        [found.box.corners(0, 0), found.box.at(np.random.default_rng(2).random((5000, 3)))]
+        [found.box.corners(0, 0), found.box.at(default_rng(2).random((5000, 3)))]
     )
     assert not linear(settings).any()
     assert not second(settings).any()

@@ -21,6 +21,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 from tests.in_process import json_of, run, searched
 from tests.made_up import HARDEST_BRAKING
 
+SLOW = pytest.mark.slow
+
 STUDY = """
 extends = "rain"
 name = "tiny"
@@ -51,7 +53,7 @@ def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert Unsafe.parse(str(Unsafe.parse(text))) == Unsafe.parse(text)
 
 
-@pytest.mark.slow
+@SLOW
 def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
     rated = load_study("euro_ncap_rating")
     assert study_by(rated, Unsafe.parse("rating_points < 35")).matrix == rated.matrix
@@ -59,7 +61,7 @@ def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
         study_by(load_study("wear"), Unsafe.parse("rating_points < 35"))
 
 
-@pytest.mark.slow
+@SLOW
 def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
     """The worn car stops nearest to a pedestrian at another point than where it had to brake
     hardest.
@@ -76,7 +78,7 @@ def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
     assert by_degree["f_safe"][0] < by_drac["f_safe"][0]
 
 
-@pytest.mark.slow
+@SLOW
 def test_every_question_takes_an_own_metric(folder: Path) -> None:
     searched(load_study("tiny.toml"), folder / "results")
     few = ("--characteristics", "tireFric,maxBrakeTorque")
@@ -93,7 +95,7 @@ def test_every_question_takes_an_own_metric(folder: Path) -> None:
         assert "hardest > 6.8" in answer["verdict"], typed
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     criterion = ("--unsafe", "hardest > 6.8")
     studied = json_of("study", "tiny.toml", "--out", "results", "--quiet", *criterion)
@@ -117,7 +119,7 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
     assert verified["numbers"]["passed"], verified["tables"]["claims"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_its_own(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

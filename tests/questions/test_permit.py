@@ -7,18 +7,17 @@ import re
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 from hypothesis import given, settings, strategies as st
+from msgspec.structs import replace
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import EncounterRange, ranges_of, span_of
 from safevar_sumo.questions.permit.search import PermitSearch
@@ -28,7 +27,8 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of, refused, run
+from tests.in_process import json_of, refused, run
+from tests.questions.conftest import model_of
 
 SHORT = """
 extends = "wear_joint"
@@ -75,8 +75,8 @@ def are_unsafe(
     own = studies_of_sets(study)[fit]
     assert own.matrix is not None
     for test in own.matrix.tests:
-        alone = msgspec.structs.replace(own.matrix, tests=[test])
-        single = msgspec.structs.replace(own, matrix=alone)
+        alone = replace(own.matrix, tests=[test])
+        single = replace(own, matrix=alone)
         system = assemble(single)
         if phase:
             system = assemble(in_phases(single, system))
@@ -93,7 +93,7 @@ def are_unsafe(
 def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
     study = load_study("wear_joint")
     members = assemble(study).characteristics.vehicle
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     settings = np.vstack(
         [members.original, members.lower + rng.random((3, 7)) * (members.upper - members.lower)]
     )
@@ -193,7 +193,7 @@ def test_all_cars_within_limits(short: Study) -> None:
     assert row["up_to"] <= 37, "a worn car of another test"
     assert "brakeTorque 1 -> 0.7" in row["because"]
     members = assemble(short).characteristics.vehicle
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     cars = np.tile(members.original, (40, 1))
     for name, values in (("treadDepth", [3, 8]), ("payload", [75, 525]), ("brakeTorque", [0.7, 1])):
         cars[:, members.names.index(name)] = rng.choice(values, 40)
@@ -257,7 +257,7 @@ over = { speed = [40, 60] }
 
 def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     span = span_of(study, None)
-    own = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    own = model_of(study)
     values = np.arange(span.low, span.high + 1)
     return PermitSearch(Models((own,), ()), span, values, budget)
 
@@ -268,7 +268,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     span = span_of(study, None)
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
     assert (span.ending, span.left_out) == (("CPFA",), ("CPLA",))
-    model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    model = model_of(study)
     ends = [(each.test, each.low, each.high) for each in ranges_of(model, span)]
     assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)

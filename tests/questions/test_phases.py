@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -58,7 +59,7 @@ def test_an_encounter_that_begins_a_whole_step_later_is_the_same(name: str) -> N
     if name in ("sensing", "wear_idm"):
         assert not np.allclose(later, now, atol=1e-6, equal_nan=True)
     else:
-        np.testing.assert_allclose(later, now, atol=1e-6)
+        assert_allclose(later, now, atol=1e-6)
 
 
 def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
@@ -69,7 +70,7 @@ def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
         scenario = system.points[0].scenario.at({"time_to_impact": 6 + phase * STEP})
         later = system.points[0]._replace(scenario=scenario)
         expected = degrees(replace(system, matrix=(later,)), settings)
-        np.testing.assert_allclose(degrees(at_phase(system, phase), settings), expected, atol=1e-9)
+        assert_allclose(degrees(at_phase(system, phase), settings), expected, atol=1e-9)
 
 
 def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
@@ -81,7 +82,7 @@ def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
     found = degrees(phased, np.column_stack([settings, phases]))
     for row, phase in enumerate(phases.tolist()):
         alone = degrees(at_phase(system, phase), settings[[row]])
-        np.testing.assert_array_equal(found[:, row], alone[:, 0])
+        assert_array_equal(found[:, row], alone[:, 0])
 
 
 def test_sumo_repeats_a_phase_to_the_bit() -> None:
@@ -90,7 +91,7 @@ def test_sumo_repeats_a_phase_to_the_bit() -> None:
     settings = drawn(system, 3, 4)
     runs = [drive_all(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)]
     here, there = (score(system, settings, one).f_safe for one in runs)
-    np.testing.assert_array_equal(here, there)
+    assert_array_equal(here, there)
 
 
 def ahead(**search: object) -> Study:
@@ -121,12 +122,12 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     judge = partial(claim.robustness, stage="phases")
     rows, worst = at_worst_phases(claim, judge, settings[some])
     line = np.interp(speeds[some], speeds[lower], left[lower])
-    np.testing.assert_allclose(worst, line, atol=0.01)
+    assert_allclose(worst, line, atol=0.01)
     assert (worst <= left[some]).all()
 
     # What is printed is what was simulated.
-    np.testing.assert_array_equal(judge(rows), worst)
-    np.testing.assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
+    assert_array_equal(judge(rows), worst)
+    assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
 
 
 def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:

@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 import scipy
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -34,6 +34,8 @@ from tests.in_process import InlinePool
 from tests.made_up import drawn, made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
 
+SLOW = pytest.mark.slow
+
 COLLISION = Unsafe()
 
 
@@ -56,9 +58,7 @@ ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.value
 def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
     scenario = ScenarioTable(model="crossing", parameters=parameters)
-    return Evaluator(
-        msgspec.structs.replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool()
-    )
+    return Evaluator(replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
 
 
 def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
@@ -116,23 +116,23 @@ def test_who_has_no_verdict_is_counted_with_the_points() -> None:
     assert drivers_frame(nobody, 1)[["share", "share_low", "share_high"]].isna().all(axis=None)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not() -> None:
     found = avoiders(evaluator(test="CPFA", speed=30), vehicle(), vehicle(brakes=0.1))
     assert found == ["competent driver", "nobody"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
     """He hits it in the original vehicle."""
     assert avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99)) == ["full braking"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_verdict() -> None:
     tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
-    here = Evaluator(msgspec.structs.replace(study, ads=BLIND), InlinePool())
+    here = Evaluator(replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(
         *assess_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
     )
@@ -143,7 +143,7 @@ def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_ve
     assert point.startswith("CCRb, speed 50")
 
 
-@pytest.mark.slow
+@SLOW
 def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """Of 30 collisions, the 20 of the lowest engine speeds are the brakeless ones: those that come
     first when settings are sorted.
@@ -265,7 +265,7 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     assert unbraked is None
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
     study = load_study("alks_joint")
     evaluator = Evaluator(study, InlinePool(), verified=0)

@@ -22,30 +22,35 @@ is its end.
 LEAST_RIGHT = {"repair wear": 0.85, "tolerance wear": 0.85}
 """The least share of the seconds in which the time left is right, where it is below 1."""
 Shown = list[tuple[str, int, int]]
-FAST: list[tuple[Callable[..., Any], Mapping[str, Any]]] = [
+QUESTIONS: list[Any] = [
     (sv.explain, {"quick": True, "fits": 2, "unsafe": "below=2.7"}),
     (lambda study, **options: sv.compare(study, "smoke", **options), {"samples": 100}),
     (sv.risk, {"samples": 200}),
     (sv.rules, {"samples": 200}),
-]
-SLOW: list[tuple[Callable[..., Any], Mapping[str, Any]]] = [
-    (sv.tolerance, {"quick": True}),
-    (sv.repair, {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1}),
+    pytest.param(sv.tolerance, {"quick": True}, marks=pytest.mark.slow),
+    pytest.param(
+        sv.repair,
+        {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1},
+        marks=pytest.mark.slow,
+    ),
 ]
 
 
-@pytest.mark.parametrize(
-    ("ask", "options"), [*FAST, *(pytest.param(*one, marks=pytest.mark.slow) for one in SLOW)]
-)
+def assert_counts(shown: Shown) -> None:
+    """Every phase comes once, and no more is done than in all."""
+    in_order = [phase for phase, _ in groupby(phase for phase, _, _ in shown)]
+    assert len(in_order) == len(set(in_order))
+    assert all(done <= total for _, done, total in shown)
+
+
+@pytest.mark.parametrize(("ask", "options"), QUESTIONS)
 def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
     ask: Callable[..., Any], options: Mapping[str, Any]
 ) -> None:
     shown = Shown()
     ask("smoke", jobs=1, progress=lambda *one: shown.append(one), **options)
-    in_order = [phase for phase, _ in groupby(phase for phase, _, _ in shown)]
-    assert len(in_order) == len(set(in_order))
+    assert_counts(shown)
     assert all(earlier[1] <= later[1] for earlier, later in pairwise(shown))
-    assert all(done <= total for _, done, total in shown)
     assert shown[-1][1] > 0
 
 
@@ -62,9 +67,7 @@ def test_any_order_of_parts_is_counted_without_a_way_back(parts: list[tuple[str,
         phases.begin_part(name, number)
         phases.add(number)
     assert shown[-1][1] == sum(number for _, number in parts)
-    assert all(done <= total for _, done, total in shown)
-    in_order = [phase for phase, _ in groupby(phase for phase, _, _ in shown)]
-    assert len(in_order) == len(set(in_order))
+    assert_counts(shown)
 
 
 def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:

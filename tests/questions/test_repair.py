@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from msgspec.structs import replace as replace_in
+from numpy.random import default_rng
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
@@ -34,6 +35,8 @@ from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
 from tests.made_up import original_of
+
+SLOW = pytest.mark.slow
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -160,7 +163,7 @@ def gap_for(grip: float) -> float:
     return MARGIN + SPEED**2 / (2 * grip)
 
 
-@pytest.mark.slow
+@SLOW
 def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Path) -> None:
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
@@ -181,7 +184,7 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Pat
     assert max(map(len, table.splitlines())) <= 100
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     planted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,7 +206,7 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     assert "in the encounters with speed 30 to 72 km/h that a new vehicle survives" in found.verdict
 
 
-@pytest.mark.slow
+@SLOW
 def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -> None:
     answers = [
         sv.repair(planted, change=["always"], pool=pool).to_dict()
@@ -258,7 +261,7 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
     assert found == pytest.approx(changed, abs=0.005)
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
     planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
     found = sv.repair(planted, change=["gap"], pool=InlinePool())
@@ -267,7 +270,7 @@ def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
     assert not found.numbers["not_repairable"]  # full braking sees far enough
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
@@ -311,7 +314,7 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
             parameters=[],
             unsafe=Unsafe(keep=0.3),
         )
-        settings = problem.promise.draw(20, np.random.default_rng(1))
+        settings = problem.promise.draw(20, default_rng(1))
         driver = problem.best_driver
         is_safe = (
             full_braking.robustness_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
@@ -381,7 +384,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     )
     ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
-    values = np.random.default_rng(1).uniform(low, high, (3, len(names)))
+    values = default_rng(1).uniform(low, high, (3, len(names)))
     settings = np.tile(system.characteristics.original, (3, 1))
     together = drive_and_score(replace(system, ads=VariedAds(system.ads, names, values)), settings)
     for row, one in enumerate(values):
@@ -392,7 +395,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
         )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
     system = assemble(sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}}))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
@@ -137,7 +138,7 @@ def test_first_order_indices_of_correlated_characteristics() -> None:
 def drawn(**variation: dict[str, Any]) -> FloatArray:
     correlations = variation.pop("correlations", [])
     study = load_study(made_up_study(2), variation=variation, correlations=correlations)
-    return VariationModel(study).settings(np.random.default_rng(1).random((20_000, 2)))
+    return VariationModel(study).settings(default_rng(1).random((20_000, 2)))
 
 
 def test_every_distribution_has_its_moments() -> None:
@@ -267,7 +268,7 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
 def test_shares_have_a_range_over_the_parameter_sets() -> None:
     """Of risk, and of rules for the whole sample and for each region."""
     study = load_study("wear")
-    vehicles = VariationModel(study).draw(400, np.random.default_rng(study.search.seed))
+    vehicles = VariationModel(study).draw(400, default_rng(study.search.seed))
     unsafe = np.array(
         [
             drive_and_score(assemble(one), vehicles, with_originals=False).collided

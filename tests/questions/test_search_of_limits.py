@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
@@ -20,7 +21,7 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.vehicles import region_of
 from tests.in_process import InlinePool
-from tests.questions.conftest import made_up_study
+from tests.questions.conftest import made_up_study, model_of
 
 
 def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
@@ -37,9 +38,9 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
         )
 
     def alone(number: int) -> Falsification:
-        return falsify(boxes[number], [judge, judge], [], 2000, np.random.default_rng(number))
+        return falsify(boxes[number], [judge, judge], [], 2000, default_rng(number))
 
-    rngs = [np.random.default_rng(number) for number in (0, 1)]
+    rngs = [default_rng(number) for number in (0, 1)]
     for one, other in zip(
         falsify_all(boxes, [judge, judge], [(), ()], 2000, rngs), map(alone, (0, 1)), strict=True
     ):
@@ -53,7 +54,7 @@ def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() 
     """
     study = made_up_study(2)
     region = region_of(study)
-    model = Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe())
+    model = model_of(study)
     search = BoxSearch(model, [0, 1], {}, np.array([[9.0, 9.5], [9.5, 8.0]]))
     whole = Box(region, np.array([0.0, 0.0]), np.array([10.0, 10.0]))
     cut = Extension(search).cut(whole, 0.8)
@@ -72,7 +73,7 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
     model = Model(0, evaluator, Unsafe(keep=0.1))
     new_car = Box(evaluator.region, lower, upper)
     worn = Box(evaluator.region, np.where(members.of_vehicle, members.lower, lower), upper)
-    robustness = model.robustness(new_car.draw(16, np.random.default_rng(5)), "new car")
+    robustness = model.robustness(new_car.draw(16, default_rng(5)), "new car")
     assert robustness.min() >= study.scenario.margin - 0.1
     assert broken_specification(new_car, [model], {0: ()}) == {}
     assert evaluator.simulated == 16
@@ -92,4 +93,4 @@ def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its
 def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
     study = at_point(load_study("wear"), point)
     assert scope_of(study).startswith(scope)
-    assert moving_tests(Model(0, Evaluator(study, InlinePool()), Unsafe()), Unsafe()) == []
+    assert moving_tests(model_of(study), Unsafe()) == []

@@ -32,6 +32,8 @@ from tests.in_process import InlinePool, run
 from tests.made_up import case_of
 from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_islands
 
+SLOW = pytest.mark.slow
+
 
 def degrees(rows: FloatArray) -> FloatArray:
     return 8 - np.abs(rows[:, 0] - 5)
@@ -64,7 +66,7 @@ def test_islands_and_the_safe_interval_around_the_original() -> None:
     assert len(first.profile) > 201
 
 
-@pytest.mark.slow
+@SLOW
 @settings(max_examples=30)
 @given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
 def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: list[float]) -> None:
@@ -84,7 +86,7 @@ def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: lis
         )
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
     answer = answer_of(
         2, two_islands, lambda rows: (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75), unsafe="collision"
@@ -156,7 +158,7 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     assert share_of_domain(two) == 1, "the solution changes others as well"
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
     """Unsafe: where digits of the logarithm of a change are below q. The share is q in every box:
     any box with a bound below q is wrong.
@@ -244,7 +246,7 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
     assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_car_beyond_a_joint_limit_is_near_to_it_and_within_those_of_the_other_parts() -> None:
     """Of the response no such car is found; that of its limit alone is 0.1 s further."""
     names = ("brakeTorque", "brakeResponse")
@@ -283,7 +285,7 @@ def test_a_refusal_says_which_limits_would_hold() -> None:
     )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
 def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
     study = tmp_path / "mine.toml"
@@ -302,7 +304,7 @@ def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, c
     assert decel["together_low"] == (float(limit) if code == 0 else None)
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_margin_is_added_to_a_collision_alone() -> None:
     """Safety degrees are 8 - |a - 5|, and 1 m less than 5 m is left from a = 8 on."""
 

@@ -55,12 +55,6 @@ distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "ga
 ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
 
-@pytest.fixture
-def ahead(in_tmp: Path) -> Study:
-    (in_tmp / "ahead.toml").write_text(AHEAD)
-    return load_study("ahead.toml")
-
-
 def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: Study) -> None:
     def over(study: Study) -> list[Any]:
         return [test.over["speed"] for test in study.matrix.tests]

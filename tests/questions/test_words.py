@@ -71,14 +71,6 @@ def silence(patch: pytest.MonkeyPatch) -> int:
     return replaced
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("words")
-    (folder / "tiny.toml").write_text(STUDY)
-    searched(load_study(str(folder / "tiny.toml")), folder / "results")
-    return folder
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("typed", TYPED, ids=" ".join)
 @pytest.mark.usefixtures("few_simulations")

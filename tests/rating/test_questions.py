@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -28,6 +28,8 @@ from tests.in_process import InlinePool, json_of
 from tests.made_up import case_of, original_of
 from tests.sumo.test_recording import still as still
 
+SLOW = pytest.mark.slow
+
 STUDY = load_study("euro_ncap_rating")
 WHOLE = protocol_of(EURO_NCAP_2026)
 
@@ -40,22 +42,22 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         speeds = {"CCRs": (10, 50, 80), "CPNA": (50,)}.get(matrix.test_name, ())
         rows = tuple(row for row in matrix.rows if row.vut_speed in speeds)
         if rows:
-            matrices.append(msgspec.structs.replace(matrix, rows=rows))
+            matrices.append(replace_in(matrix, rows=rows))
     layers = tuple(
         layer
         for layer in WHOLE.layers
         if layer.test_name in ("CCRs", "CPNA") and layer.name not in ("Trajectory/Heading",)
     )
-    protocol = msgspec.structs.replace(WHOLE, matrices=tuple(matrices), layers=layers)
+    protocol = replace_in(WHOLE, matrices=tuple(matrices), layers=layers)
     monkeypatch.setattr(rater, "protocol_of", lambda name: protocol)
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_is_shipped_passes_the_check() -> None:
     assert not check_study(load_study("euro_ncap_rating"))
 
 
-@pytest.mark.slow
+@SLOW
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     answer = tolerance.compute(
@@ -76,7 +78,7 @@ def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     assert answer.figure().get_axes()
 
 
-@pytest.mark.slow
+@SLOW
 def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     members = evaluator.characteristics
@@ -120,7 +122,7 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     assert endings.startswith(f"At {matrix[4].name}: ")
 
 
-@pytest.mark.slow
+@SLOW
 def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -> None:
     criterion = ("--unsafe", "rating_points < 2.2")
     study = (
@@ -151,7 +153,7 @@ def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -
     assert (sv.evaluate("rated.toml", cars, filtered=False, jobs=1)["rating_points"] >= 2.2).all()
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rating_begins_with_the_reason_and_a_robot_drives_who_does_nothing(still: str) -> None:
     rated = json_of("rating", still)
     assert rated["numbers"]["driven"] is (

@@ -10,6 +10,8 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec.structs import replace
+from numpy.random import default_rng
 
 from calibration import fit
 from safevar_sumo.api.simulation import load_study
@@ -38,9 +40,7 @@ PLANS = sorted((Path(fit.__file__).parent).glob("*.toml"))
 def data() -> ReferenceData:
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
-    settings = np.random.default_rng(3).uniform(
-        characteristics.lower, characteristics.upper, (24, 12)
-    )
+    settings = default_rng(3).uniform(characteristics.lower, characteristics.upper, (24, 12))
     return ReferenceData(settings, dict(drive_and_score(system, settings).metrics))
 
 
@@ -111,7 +111,7 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     error = np.abs(here.f_safe - data.metrics["safety_degree"]).mean()
     only = fit.Target([], {"safety_degree": 1.0}, original=0.0, rank=0.0, collisions=0.0)
     for unit in (1.0, 2.0):
-        study = msgspec.structs.replace(nearer, repeatability={"safety_degree": unit})
+        study = replace(nearer, repeatability={"safety_degree": unit})
         assert fit.loss_of_file(data, here, study, only) == pytest.approx(error / unit)
     published = {"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0])}
     there = data.take(np.arange(24) < 6)._replace(metrics=published)
@@ -126,7 +126,7 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     study = load_study("sun")
     characteristics = assemble(study).characteristics
     width = characteristics.upper - characteristics.lower
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
     settings[:, 3] = characteristics.original[3]
     slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
@@ -140,9 +140,7 @@ def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: Refe
     distances from the original, at least 0.3.
     """
     sets = {GAP: [value_of(load_study("sun"), GAP)] * 2}
-    study = msgspec.structs.replace(
-        load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9}
-    )
+    study = replace(load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9})
     ch = assemble(study).characteristics
     away = np.maximum(
         np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)), 0.3

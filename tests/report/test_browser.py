@@ -31,6 +31,8 @@ from safevar_sumo.study.file import study_names
 from safevar_sumo.sumo.system import assemble
 from tests.report.test_sheet import sheet_of_shipped
 
+SLOW = pytest.mark.slow
+
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
 """The part of a page within its margins [px]."""
 TOO_WIDE = """return [...document.querySelectorAll(".wide")]
@@ -109,7 +111,7 @@ def try_player(browser: Chrome, player: object) -> None:
     assert "brakes" in player.text  # type: ignore[attr-defined]
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_animation_plays_and_scrubs_as_a_file(
     browser: Chrome, case: Case, tmp_path: Path
 ) -> None:
@@ -126,7 +128,7 @@ def test_an_animation_plays_and_scrubs_as_a_file(
     assert requests_of(browser) == [(tmp_path / "it.html").as_uri()]
 
 
-@pytest.mark.slow
+@SLOW
 def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
     browser: Chrome, report: Path
 ) -> None:
@@ -145,7 +147,7 @@ def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
     assert browser.execute_script(broken) == 0
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_keyboard_opens_a_replay_and_plays(browser: Chrome, report: Path) -> None:
     opened(browser, report)
     browser.execute_script(
@@ -161,7 +163,7 @@ def test_the_keyboard_opens_a_replay_and_plays(browser: Chrome, report: Path) ->
     try_player(browser, player)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1400, "dark")])
 def test_it_fits_the_screen_and_everybody_can_read_it(
     width: int, scheme: str, browser: Chrome, report: Path, axe: str
@@ -198,7 +200,7 @@ BROKEN_NAMES = """
 """Labels of one word that are on several lines."""
 
 
-@pytest.mark.slow
+@SLOW
 def test_it_prints_on_few_pages_what_is_unfolded_and_nothing_to_press(
     browser: Chrome, report: Path
 ) -> None:
@@ -229,7 +231,7 @@ def test_it_prints_on_few_pages_what_is_unfolded_and_nothing_to_press(
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", study_names())
 def test_each_shipped_study_has_its_sheet_on_one_page(
     name: str, browser: Chrome, tmp_path: Path
@@ -247,7 +249,7 @@ def test_each_shipped_study_has_its_sheet_on_one_page(
     assert pdf.count(b"/Type /Page\n") == 1
 
 
-@pytest.mark.slow
+@SLOW
 def test_without_javascript_it_stands_still_and_tells_the_same(
     browser: Chrome, report: Path
 ) -> None:

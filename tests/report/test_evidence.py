@@ -33,6 +33,8 @@ from tests.in_process import json_of, refused, run, searched
 from tests.manual import files_of
 from tests.questions.test_repair import planted as planted
 
+SLOW = pytest.mark.slow
+
 MINE = """
 from pathlib import Path
 from safevar_sumo.ads import ScalarAds
@@ -166,7 +168,7 @@ def verified(*arguments: str) -> list[str]:
     return [claim["claim"] for claim in claims]
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("coarse")
 def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_path: Path) -> None:
     pack = tmp_path / "pack.zip"
@@ -209,7 +211,7 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
     assert claim["here"] == f'"probability": {answers[1]["numbers"]["probability"]},'
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,7 +261,7 @@ def test_a_pack_holds_a_list_of_cars_without_their_names(
     refused("verify", named_elsewhere, "--run-code", message="1.csv")
 
 
-@pytest.mark.slow
+@SLOW
 def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: Path) -> None:
     run(
         "evidence",
@@ -287,7 +289,7 @@ def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
     return text.encode("latin-1" if "\xff" in text else "utf-8")
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "damage", DAMAGES, ids=[f"{row['in']}, {row.get('told', 'different')}" for row in DAMAGES]
 )
@@ -306,7 +308,7 @@ def test_a_damage_is_refused_or_named(damage: dict[str, Any], bare: Path, tmp_pa
         assert {*damage["different"]} == {claim["claim"] for claim in not_same(pack)}
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_differs_is_shown_from_both_sides(bare: Path, tmp_path: Path) -> None:
     texts = texts_of(bare)
     page = texts["1-slippery/report.html"] + b"\n"
@@ -333,7 +335,7 @@ def test_an_archive_is_its_files_and_nothing_else(
     refused("verify", str(tmp_path / "it.zip"), message=("it.zip", "bytes that belong to no file"))
 
 
-@pytest.mark.slow
+@SLOW
 def test_versions_and_machines_that_differ_are_named_and_so_is_what_needs_a_search(
     bare: Path, tmp_path: Path
 ) -> None:
@@ -390,7 +392,7 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
         _check_entries(Path("many.zip"), many)
 
 
-@pytest.mark.slow
+@SLOW
 def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(
     mine: Path, in_tmp: Path
 ) -> None:
@@ -440,7 +442,7 @@ class Careless(NamedTuple):
     error: str
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "careless",
     [
@@ -485,7 +487,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     assert "mine" not in sys.modules
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("planted")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
@@ -500,7 +502,7 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     assert "answer repair --quick" in verified("it.zip", "--run-code")
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
     assert verified(str(bare), "--search")[-2:] == ["search: outcomes", "search: solutions"]
     path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"collision": (\d)'))
@@ -510,7 +512,7 @@ def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_solution_that_a_run_returns_twice_is_no_damage(tmp_path: Path) -> None:
     results = searched(load_study("smoke", search={"algorithms": ["nsga2"]}), tmp_path / "results")
     assert load_runs(results).solutions.duplicated().any()

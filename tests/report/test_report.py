@@ -42,6 +42,8 @@ from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import run, searched
 from tests.report.conftest import ASK, page_of
 
+SLOW = pytest.mark.slow
+
 
 def words_of(page: str) -> str:
     """The text of a page, between single blanks."""
@@ -73,7 +75,7 @@ class Outline(HTMLParser):
         assert tag in self.VOID or self.open.pop() == tag
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     outline = Outline(page)
     assert outline.open == []
@@ -99,7 +101,7 @@ def test_the_page_is_sound_html_and_whole_in_itself(page: str) -> None:
     assert len(page.encode()) < 3_000_000
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_decides_leads_with_a_replay_and_the_rest_is_folded(page: str) -> None:
     front, _, details = page.partition('aria-label="Details of')
     verdict = r'<div class="first">\s*<p>(.*?)</p>\s*<div class="wide".*?<caption>(.*?)</caption>'
@@ -121,7 +123,7 @@ def test_what_decides_leads_with_a_replay_and_the_rest_is_folded(page: str) -> N
     assert 20 < len(re.findall(r"(?<![\w.])-?\d[\d,.]*", re.sub("<[^>]*>", " ", shown))) <= 400
 
 
-@pytest.mark.slow
+@SLOW
 def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
     page: str, case: Case
 ) -> None:
@@ -168,7 +170,7 @@ def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
     )
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_is_not_as_the_results_say_any_more_is_told(
     page: str, slippery: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,7 +220,7 @@ def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> No
     assert usual_questions(rated, "a point")[0] == "tolerance"
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"])
 def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "copy")
@@ -231,7 +233,7 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     assert "49" not in re.findall(r"<h2 id=.*?>(.*?)</h2>", page)[0]
 
 
-@pytest.mark.slow
+@SLOW
 def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(
         slippery,
@@ -265,7 +267,7 @@ def test_a_study_is_carried_out_from_what_its_results_record(
     assert asked["out"] == "its results-again"
 
 
-@pytest.mark.slow
+@SLOW
 def test_on_a_page_about_two_studies_each_is_headed_by_its_name_as_titles_may_be_equal(
     slippery: Path, tmp_path: Path
 ) -> None:
@@ -296,7 +298,7 @@ def test_an_answer_that_cannot_be_given_has_no_command() -> None:
     assert [*sections.page_commands(one)] == [("The answer rules", "rules it")]
 
 
-@pytest.mark.slow
+@SLOW
 def test_every_printed_command_gives_the_answer_of_the_page(slippery: Path, tmp_path: Path) -> None:
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
@@ -339,7 +341,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return searched(study, tmp_path_factory.mktemp("matrix") / "results")
 
 
-@pytest.mark.slow
+@SLOW
 def test_all_of_it_is_of_the_point(results: Path) -> None:
     page = page_of(results, ask=["rules --samples 20"], jobs=1, point=DAY)
     assert f"only the test case {DAY} of its matrix" in page

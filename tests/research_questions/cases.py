@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.case import Case, build_case
@@ -31,13 +31,9 @@ def made_up_study(
     **changes: Any,
 ) -> Study:
     smoke = load_study("smoke")
-    vehicle = msgspec.structs.replace(smoke.vehicle, characteristics=dict(characteristics))
-    search = msgspec.structs.replace(
-        smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100
-    )
-    return msgspec.structs.replace(
-        smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes}
-    )
+    vehicle = replace(smoke.vehicle, characteristics=dict(characteristics))
+    search = replace(smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100)
+    return replace(smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes})
 
 
 def row(

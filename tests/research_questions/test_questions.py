@@ -10,11 +10,11 @@ import re
 from itertools import product
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 import scipy
+from msgspec.structs import replace
 
 from safevar_sumo.questions.case import UnanswerableError
 from safevar_sumo.questions.research_questions import budgets
@@ -203,7 +203,7 @@ def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -
     joint = dataclasses.replace(
         case,
         evaluations=case.evaluations.assign(original_safety_degree=degrees),
-        scoring=msgspec.structs.replace(case.scoring, safe_original=0.5),
+        scoring=replace(case.scoring, safe_original=0.5),
     )
     none = dataclasses.replace(
         joint, evaluations=joint.evaluations.assign(original_safety_degree=0.1)
@@ -327,7 +327,7 @@ def test_results_without_a_solution_say_why(changes: JsonObject, reason: str) ->
     case = dataclasses.replace(
         case,
         evaluations=case.evaluations.assign(**changes),
-        scoring=msgspec.structs.replace(case.scoring, safe_original=0.5),
+        scoring=replace(case.scoring, safe_original=0.5),
     )
     assert reason in case.why_no_solution
     with pytest.raises(UnanswerableError, match="has no solution: "):

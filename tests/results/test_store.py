@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
@@ -149,7 +149,7 @@ def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_
 def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
     written(tmp_path, study)
     for other in (
-        msgspec.structs.replace(study, title="Another title", published={}),
+        replace(study, title="Another title", published={}),
         with_search(study, time_limit=7, runs=3, evaluations=900),
         with_search(study, algorithms=["rs"]),
     ):
@@ -160,13 +160,13 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
 
 def turned(record: Any, key: str) -> Any:
     """A record with the keys of one of its tables in the opposite order."""
-    return msgspec.structs.replace(record, **{key: dict(reversed(getattr(record, key).items()))})
+    return replace(record, **{key: dict(reversed(getattr(record, key).items()))})
 
 
 def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> None:
     wear, joint = load_study("wear"), load_study("wear_joint")
     tests = [turned(test, "over") for test in wear.matrix.tests]
-    matrix = msgspec.structs.replace(wear.matrix, tests=tests)
+    matrix = replace(wear.matrix, tests=tests)
     for study, order, changes in (
         (
             wear,
@@ -179,7 +179,7 @@ def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it()
         (wear, "", {"metrics": wear.metrics}),
     ):
         before = manifest_of(study, {})
-        after = manifest_of(msgspec.structs.replace(study, **changes), {})
+        after = manifest_of(replace(study, **changes), {})
         differences = [*manifest_differences(before, after)]
         assert (
             (identity_digest(before) == identity_digest(after)) == (not differences) == (not order)
@@ -408,10 +408,8 @@ def test_results_survive_a_study_whose_characteristics_are_in_another_order(
     copied: Path, case: Case, in_tmp: Path
 ) -> None:
     rows = case.study.vehicle.characteristics
-    vehicle = msgspec.structs.replace(
-        case.study.vehicle, characteristics=dict(reversed(rows.items()))
-    )
-    write_study(Path("slippery.toml"), msgspec.structs.replace(case.study, vehicle=vehicle), "")
+    vehicle = replace(case.study.vehicle, characteristics=dict(reversed(rows.items())))
+    write_study(Path("slippery.toml"), replace(case.study, vehicle=vehicle), "")
     before = contents(copied)
     command = ("study", "slippery.toml", "--runs", "2", "--out", str(copied), "--jobs", "1")
     refused(*command, message=("another study",))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from deap import tools
 from hypothesis import given, strategies as st
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
@@ -100,7 +101,7 @@ def begun(
         scoring=scoring,
     )
     return steps_of(
-        algorithm.search(problem, np.random.default_rng(seed)), partial(evaluate, characteristics)
+        algorithm.search(problem, default_rng(seed)), partial(evaluate, characteristics)
     )
 
 
@@ -297,7 +298,7 @@ def window(settings: list[list[float]], safety: list[float]) -> Evaluations:
 
 
 def test_models_predict_beyond_what_is_known_and_changes_are_computed() -> None:
-    known = np.random.default_rng(0).uniform(55, 80, (50, 2))
+    known = default_rng(0).uniform(55, 80, (50, 2))
     predict = _learn(evaluated(TWO, known, -known[:, 0] - known[:, 1]), problem(), 0)
     predicted = predict(np.array([[100.0, 50.0]]))
     assert predicted.f_safe[0] == pytest.approx(-150, abs=1)

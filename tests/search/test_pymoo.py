@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.api.running import run
 from safevar_sumo.api.simulation import load_study
@@ -93,8 +94,8 @@ def test_a_run_is_that_of_pymoos_own_loop(name: str) -> None:
         ) -> None:
             out["F"], out["G"] = standard.objectives(x - 1), np.zeros((len(x), 1))
 
-    ours = result_of(built(f"pymoo:{name}").search(problem, np.random.default_rng(3)), problem)
-    seed = int(np.random.default_rng(3).integers(2**31))
+    ours = result_of(built(f"pymoo:{name}").search(problem, default_rng(3)), problem)
+    seed = int(default_rng(3).integers(2**31))
     again = built(f"pymoo:{name}").begin(problem, seed)  # type: ignore[attr-defined]
     again.problem = None  # not begun
     theirs = minimize(Theirs(), again, termination=("n_eval", evaluations), seed=seed)

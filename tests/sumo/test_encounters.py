@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.questions.evaluator import Evaluator
@@ -28,6 +29,8 @@ from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, searched, verify_everywhere
 from tests.made_up import case_of, drawn
 from tests.sumo.planted import BRAKING, GAP
+
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
@@ -143,8 +146,8 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         both = np.stack([setting[of_vehicle], other.characteristics.original])
         alone = drive_and_score(other, both)
         assert alone.outcome[0] == evaluations.outcome[row]
-        np.testing.assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(
+        assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
+        assert_allclose(
             evaluations.metrics["original_safety_degree"][row],
             alone.f_safe[1],
             rtol=0,
@@ -167,7 +170,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     )
     in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
-    np.testing.assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
+    assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
     assert settings_per_batch(system, Engine.RECORDED) > len(settings)
 
 
@@ -184,7 +187,7 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
         drive_and_score(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
-    np.testing.assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
+    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
 
 
 def planted(**changes: Any) -> Study:
@@ -217,7 +220,7 @@ def planted(**changes: Any) -> Study:
     return load_study(tables)
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) -> None:
     """The original stops s = v^2 / (2 a mu) after it brakes and keeps the margin if s <= gap -
     margin; a share b of its brakes collides if s / b > gap. So the least wear that ever collides
@@ -235,10 +238,10 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
     assert ratio[collided].min() > 0.99
     assert ratio[~collided].max() < 1.01
     degrees = everything["original_safety_degree"]
-    np.testing.assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
+    assert_allclose(degrees[degrees > 0], (GAP - stops)[degrees > 0], atol=0.01 * GAP)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
     """In half of the encounters here the original collides; all algorithms simulate them and report
     none.
@@ -255,7 +258,7 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     assert (results.solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=SLOW)])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     name: str, tmp_path: Path
 ) -> None:
@@ -274,7 +277,7 @@ def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     assert (solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("coarse", "few_simulations")
 def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> None:
     """The encounters in which the original just keeps its margin are the hardest: 1 - margin / gap
@@ -289,7 +292,7 @@ def test_tolerance_holds_in_all_encounters_and_ends_where_the_formula_does() -> 
     assert answer.numbers["failures"] == 0
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounter_shows_it() -> (
     None
 ):

@@ -7,9 +7,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.protocol.driving_robot import DrivingRobot
@@ -37,7 +37,7 @@ TESTS = [
 
 
 def study(tests: list[MatrixTest]) -> Study:
-    return msgspec.structs.replace(BASE, matrix=MatrixTable(tests=tests))
+    return replace_in(BASE, matrix=MatrixTable(tests=tests))
 
 
 SYSTEM = assemble(study(TESTS))
@@ -65,7 +65,7 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
 
 
 SUN = assemble(load_study("sun"))
-WEAK = replace(SUN, vehicle=msgspec.structs.replace(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
+WEAK = replace(SUN, vehicle=replace_in(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
 MAX_RPM = SUN.characteristics.names.index("max_rpm")
 EAST = np.array([1.0, 0.0])
 
@@ -148,7 +148,7 @@ def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewh
         )
     ]
     steep = assemble(
-        msgspec.structs.replace(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests))
+        replace_in(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests))
     )
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = original_of(SUN)

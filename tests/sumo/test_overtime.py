@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome, differences
@@ -30,7 +30,7 @@ def creeping() -> System:
 def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> None:
     scenario = creeping.scenario
     assert isinstance(scenario, CarToCar)
-    patient = replace(creeping, scenario=msgspec.structs.replace(scenario, time_after=35.0))
+    patient = replace(creeping, scenario=replace_in(scenario, time_after=35.0))
     population = drawn(creeping, 60, 3)
     found = drive_and_score(creeping, population)
     assert set(found.outcome) <= {Outcome.STOPPED, Outcome.COLLISION}
@@ -59,7 +59,7 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, engine: Engine) -
 
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
     system = assemble(load_study("alks_joint"))
-    patient = replace(system, scenario=msgspec.structs.replace(system.scenario, duration=60.0))
+    patient = replace(system, scenario=replace_in(system.scenario, duration=60.0))
     population = drawn(system, 300, 1)
     found = drive_and_score(system, population, with_originals=False)
     assert not [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -172,17 +172,27 @@ def test_between_two_actions_sumos_driver_asks_for_what_he_decided(in_tmp: Path)
         runs = system("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
         run = drive_worst(runs, changed(runs))
         assert run.outcome[0] == Outcome.STOPPED
-        assert run.trace.gap[run.trace.active][-1] == pytest.approx(2.5, abs=0.3), "his minGap"
+        assert last_gap(run) == pytest.approx(2.5, abs=0.3), "his minGap"
 
 
 def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     runs = system("idle", CONTROLLERS)
     run = drive_worst(runs, changed(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
-    assert run.trace.gap[run.trace.active][-1] < 2  # of the 2.5 m that he wants
+    assert last_gap(run) < 2  # of the 2.5 m that he wants
     assert any("knows neither the delays of the vehicle" in remark for remark in runs.remarks)
-    close, far = (drive_worst(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    close, far = top_speeds(runs)
     assert close > far + 1  # m/s: the study's headway is his
+
+
+def last_gap(run: SimulationRuns) -> float:
+    return run.trace.gap[run.trace.active][-1]
+
+
+def top_speeds(system: System) -> Iterator[float]:
+    """With a short tau, and with a long one."""
+    for tau in (0.5, 2.0):
+        yield drive_worst(system, changed(system, tau=tau)).trace.speed.max()
 
 
 def braking(run: SimulationRuns) -> np.ndarray:
@@ -211,7 +221,7 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
         bare = bare_sumo(tmp_path / "traffic.rou.xml", lambda *_: None)
         bare_hardest.append(-np.diff(bare[:, 0]).min() / 0.1)
         _, run = native(**NO_DELAY, tau={"original": tau})
-        assert run.trace.gap[run.trace.active][-1] == pytest.approx(bare[-1, 1], abs=0.1)
+        assert last_gap(run) == pytest.approx(bare[-1, 1], abs=0.1)
         assert braking(run).max() == pytest.approx(bare_hardest[-1], rel=0.2)
     assert np.all(np.diff(bare_hardest) < 0)
 
@@ -247,7 +257,7 @@ def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> Non
     assert assemble(grippy).remarks == []
 
     runs = assemble(load_study("native", ads={"model": "idm"}))
-    fast, slow = (drive_worst(runs, changed(runs, tau=tau)).trace.speed.max() for tau in (0.5, 2.0))
+    fast, slow = top_speeds(runs)
     assert fast > slow + 1
     assert remarks("idm") == remarks("krauss") == []
     assert any("tau has no effect" in remark for remark in remarks("acc"))

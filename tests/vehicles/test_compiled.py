@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.questions import COMPILING, compile_vehicle
+from safevar_sumo.campaign.batches import COMPILING, compile_vehicle
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
@@ -69,7 +70,7 @@ def test_energy_is_never_created(model: str) -> None:
     engine; with the throttle closed it does not grow.
     """
     n = 300
-    rng = np.random.default_rng(12)
+    rng = default_rng(12)
     throttle = rng.choice([0.0, 0.4, 1.0], (8, n))
     brake = rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
     run = drive(model, drawn(model, n, 13), lambda time: (throttle[int(time)], brake[int(time)]), 8)
@@ -196,7 +197,7 @@ def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
 
 
 def test_two_continuations_of_a_history_know_nothing_of_each_other() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     first = rng.random(3)
     histories = [DelayedSignal.of(first, np.array([0.0, 0.17, 0.4]), 0.1)] * 2
     samples = [[first] * 6, [first] * 6]

@@ -20,7 +20,7 @@ from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare.differences import (
     BOTH,
     COLLISION,
@@ -67,7 +67,7 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.study import SAFETY_DEGREE, Study, limits_of
+from safevar_sumo.study import SAFETY_DEGREE, limits_of
 
 RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
 MAX_REASONS = 3
@@ -110,9 +110,9 @@ PAIR_COLUMNS: Columns = {
     settings=["source", *SETTING_COLUMNS, ...],
 )
 def compare(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
-    other: Study | Case,
+    other: Subject,
     *,
     samples: Count = 2000,
     limits: LimitTexts = (),
@@ -146,7 +146,7 @@ def compare(
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
-    evaluator.plan({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
+    evaluator.begin({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):
@@ -156,12 +156,13 @@ def compare(
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
+    # Of few simulations a third, a sixth in each study; the others are for the limits.
     pairs, outside = pairs_of((subject, other), common, criteria, evaluator.at_most(samples, 6))
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid, evaluators)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = _titles(study.name, second.study.name)
+    titles = ("A", "B") if study.name == second.study.name else (study.name, second.study.name)
     table = _table(common, settings)
 
     # What differs: settings, limits, the original vehicles, safety degrees or points.
@@ -200,11 +201,6 @@ def compare(
     )
 
 
-def _titles(*names: str) -> tuple[str, ...]:
-    """What sentences call A and B: the names of their studies if they differ."""
-    return names if names[0] != names[1] else ("A", "B")
-
-
 def _numbers(
     criterion: Unsafe,
     counts: Mapping[str, int],
@@ -229,7 +225,7 @@ def _numbers(
 
 
 def _criteria(
-    subjects: Sequence[Study | Case],
+    subjects: Sequence[Subject],
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
     unsafe: str | None,
@@ -256,9 +252,7 @@ def _criteria(
 
 
 def _default_criterion(
-    subjects: Sequence[Study | Case],
-    evaluators: Sequence[Evaluator],
-    originals: Sequence[Evaluations],
+    subjects: Sequence[Subject], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
 ) -> Unsafe:
     """A collision if any vehicle of either system collides, else a safety degree; points only if
     both are rated.
@@ -328,8 +322,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     metric = RATING_POINTS.name if are_rated else SAFETY_DEGREE
     a, b = (run.column(metric) for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
-    sample = frame[frame["source"] == SAMPLE]
-    pairs = sample.groupby(LINE)[[*SIDES]].mean()
+    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
     unit = "straight lines through the domain"
     if "run" in frame:

@@ -8,13 +8,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -192,10 +192,10 @@ def in_order_of(a: Study, b: Study) -> Study:
     units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
-        return msgspec.structs.replace(
+        return replace(
             b,
-            vehicle=msgspec.structs.replace(b.vehicle, characteristics=characteristics),
-            scenario=msgspec.structs.replace(
+            vehicle=replace(b.vehicle, characteristics=characteristics),
+            scenario=replace(
                 b.scenario, search={name: b.domains[name] for name in a.scenario.search}
             ),
         )
@@ -212,7 +212,7 @@ def in_order_of(a: Study, b: Study) -> Study:
 
 
 def pairs_of(
-    subjects: Sequence[Study | Case], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
+    subjects: Sequence[Subject], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
 ) -> tuple[Pairs, int]:
     """The solutions of both sides and the drawn settings, evaluated in both systems; and the number
     of solutions that are not in both domains.
@@ -271,8 +271,7 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
             axis=0,
         )
         step /= 2
-        beside = np.where(lines % 2, step, -step)
-        shares[lines] += np.choose(failures, [step, beside, -step])
+        shares[lines] += np.choose(failures, [step, np.where(lines % 2, step, -step), -step])
     return Pairs.joined(rounds)
 
 

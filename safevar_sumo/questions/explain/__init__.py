@@ -10,7 +10,7 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Range, question
-from safevar_sumo.questions.case import Case, are_collisions
+from safevar_sumo.questions.case import Case, Subject, are_collisions
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     OTHER_SETS,
@@ -105,7 +105,7 @@ LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
     distinct_causes=DISTINCT_COLUMNS,
 )
 def explain(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     solution: tuple[str, ...] = (),
@@ -146,7 +146,8 @@ def explain(
         top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe)
     runs = population.evaluations
-    is_caused = _has_causes(population, study)
+    # Of an unsafe original no change is a cause, but in another encounter it may be safe.
+    is_caused = bool(study.scenario.search or not population.unsafe.of(population.original)[0])
 
     # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
     # of a smaller one where few simulations are allowed.
@@ -197,7 +198,7 @@ def explain(
     )
 
 
-def _plan(subject: Study | Case, evaluator: Evaluator, quick: bool) -> int:
+def _plan(subject: Subject, evaluator: Evaluator, quick: bool) -> int:
     """Plan the phases; returns the number of simulations for minimal causes of failures."""
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
@@ -206,20 +207,11 @@ def _plan(subject: Study | Case, evaluator: Evaluator, quick: bool) -> int:
     else:
         limit = QUICK_LIMIT if quick else LIMIT
         planned = {TO_EXPLAIN: len(subject.solutions)}
-    evaluator.plan({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
+    evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit
 
 
-def _has_causes(population: Population, study: Study) -> bool:
-    """Whether changes can be causes: of an unsafe original none is, but in another encounter it may
-    be safe.
-    """
-    return bool(study.scenario.search or not population.unsafe.of(population.original)[0])
-
-
-def _counts(
-    population: Population, subject: Study | Case, analysed: int, explained: int
-) -> JsonObject:
+def _counts(population: Population, subject: Subject, analysed: int, explained: int) -> JsonObject:
     """The numbers of settings, and of failures that were analysed and are explained; how the
     original vehicle ends, and the number of collisions that the search simulated but its objectives
     leave out of the solutions.

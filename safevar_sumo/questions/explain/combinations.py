@@ -139,8 +139,7 @@ def staircase(
     """
     steps = [at_ends]
     while steps[-1].causes and len(steps) < len(SHARES):
-        share = SHARES[len(steps)]
-        step = enumerate_causes(evaluator, unsafe, limit, share, only_fewest=True)
+        step = enumerate_causes(evaluator, unsafe, limit, SHARES[len(steps)], only_fewest=True)
         if not step.tried:
             break
         limit -= step.tried * (1 + len(evaluator.critical_encounters))

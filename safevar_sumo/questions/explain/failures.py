@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.causes import (
     Cause,
     count_distinct_causes,
@@ -24,7 +23,7 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.words import ending_in_words
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, TextArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points, worst_points
@@ -83,10 +82,7 @@ class Population(NamedTuple):
 
 
 def gather_failures(
-    subject: Study | Case,
-    evaluator: Evaluator,
-    solutions: Sequence[str],
-    criterion: Unsafe | str | None,
+    subject: Subject, evaluator: Evaluator, solutions: Sequence[str], criterion: Unsafe | str | None
 ) -> Population:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain.
 
@@ -140,7 +136,7 @@ class _Candidates(NamedTuple):
 
     settings: FloatArray
     names: list[str]
-    recorded: npt.NDArray[np.str_]
+    recorded: TextArray
 
 
 def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
@@ -149,6 +145,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     if is_rated(study):
         number = RATED_SAMPLED_SETTINGS
+    # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
@@ -164,9 +161,8 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
     distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
     chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
     handles = handles_of(table)
-    settings = table[characteristics].to_numpy(dtype=float)[chosen]
     return _Candidates(
-        settings,
+        table[characteristics].to_numpy(dtype=float)[chosen],
         [str(handles[row]) for row in chosen],
         table["outcome"].to_numpy(dtype=str)[chosen],
     )

@@ -59,8 +59,7 @@ def robust_shares(
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
         return np.full((len(settings), len(factors)), np.nan)
-    seed = evaluator.seed
-    neighbours = draw_neighbours(evaluator.characteristics, settings, seed, count)
+    neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.seed, count)
     shares = []
     if evaluator.system.has_simulator:  # which keeps its own time step
         factors = (1.0,)

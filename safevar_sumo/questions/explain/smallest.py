@@ -93,8 +93,7 @@ class Smallest(NamedTuple):
     @property
     def numbers(self) -> JsonObject:
         up_to = max(self.at_ends.simulated, default=0)
-        complete = self.at_ends.complete_up_to
-        values = (self.at_ends.tried, up_to, complete, len(self.at_ends.causes))
+        values = (self.at_ends.tried, up_to, self.at_ends.complete_up_to, len(self.at_ends.causes))
         return dict(zip(SMALLEST_NUMBERS, values, strict=True))
 
     def sentences(self, evaluator: Evaluator, unsafe: Unsafe) -> Iterator[str]:
@@ -246,9 +245,8 @@ def draw_staircase(answer: Answer) -> Figure:
     for place, (share, number, causes) in enumerate(found):
         if place and causes == found[place - 1][2]:
             continue
-        parts = causes[0].replace(", ", "\n") + ("\n..." if len(causes) > 1 else "")
         axis.annotate(
-            escape_dollars(parts),
+            escape_dollars(causes[0].replace(", ", "\n") + ("\n..." if len(causes) > 1 else "")),
             (share, number),
             xytext=(0, 6),
             textcoords="offset points",

@@ -25,7 +25,7 @@ from safevar_sumo.questions.ask import (
     ValueTexts,
     question,
 )
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
@@ -34,7 +34,7 @@ from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
-from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch
+from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch, Repaired
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
@@ -55,7 +55,7 @@ NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
     sets=SETS,
 )
 def permit(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     cars: Annotated[Any, CARS_FILE] = None,
@@ -165,7 +165,7 @@ def _drive(
     asked: Sequence[Cars],
     *,
     is_rough: bool,
-) -> tuple[Permit, list[Permit], list[tuple[int, Permit] | None]]:
+) -> tuple[Permit, list[Permit], list[Repaired]]:
     """How far the new car and each of the others are safe, and the best repair of each.
 
     Raises
@@ -178,7 +178,7 @@ def _drive(
     repairs = [REPAIR_STAGE] if not is_rough and len(asked[0].vehicles) == 1 else []
     # Tests are simulated alone, so that settings at all points of a matrix are fewer.
     each = search.usual_simulations(1 + len(asked)) / len(evaluator.system.points)
-    evaluator.plan({**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)})
+    evaluator.begin({**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)})
     above = [-np.inf, *[None] * len(asked)]
     new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
     if new_car.up_to is None:
@@ -213,9 +213,8 @@ def read_cars(
         cars = {
             f"All cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
         }
-    written = [*CARS, DIGEST]
     return read_fleet(
-        study, members, cars, values, others=others, ignore=ignore, answer_columns=written
+        study, members, cars, values, others=others, ignore=ignore, answer_columns=[*CARS, DIGEST]
     )
 
 

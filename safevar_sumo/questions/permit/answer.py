@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 
@@ -27,7 +26,7 @@ from safevar_sumo.questions.permit.rows import (
     set_rows,
     verdict_of,
 )
-from safevar_sumo.questions.permit.search import Permit, PermitSearch
+from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
@@ -64,9 +63,7 @@ class PermitAnswer:
     is_box: bool
     assumed: Sequence[str]
 
-    def of(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
-    ) -> Answer:
+    def of(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Answer:
         """The answer about the cars of a list, in its order, each with its best repair."""
         span = self.span
         rows = self._rows(fleet, permits, repaired)
@@ -80,9 +77,8 @@ class PermitAnswer:
         ordered = cars.sort_values("up_to", kind="stable", na_position="first", ignore_index=True)
         ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
         unit = unit_text(span.unit)
-        is_cut = bool(span.ending)
-        driven = study_up_to(self.study, f"{span.name}={span.high!r}") if is_cut else self.study
-        scope = scope_of(driven)
+        end = f"{span.name}={span.high!r}"
+        scope = scope_of(study_up_to(self.study, end) if span.ending else self.study)
         own = self.models.own.unsafe
         slower = f"{number_of(too_slow, 'car')} may not drive {self.need or 0:g}{unit}"
         return Answer(
@@ -116,21 +112,19 @@ class PermitAnswer:
             listing=self._listing(cars, fleet),
         )
 
-    def _rows(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[tuple[int, Permit] | None]
-    ) -> Rows:
+    def _rows(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Rows:
         """A row of `CARS` for each car, in the order of the list."""
         vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
         words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)
-        is_proven = not self.is_quick
-        rows = list[tuple[Any, ...]]()
+        rows = []
         cells = assumed_cells(vehicle, fleet)
-        every = zip(fleet.names, permits, words, repaired, cells, strict=True)
-        for name, permit, found, best, assumed in every:
+        for name, permit, found, best, assumed in zip(
+            fleet.names, permits, words, repaired, cells, strict=True
+        ):
             verdict = verdict_of(
-                permit.up_to, new_car, self.span.high, self.need, is_proven=is_proven
+                permit.up_to, new_car, self.span.high, self.need, is_proven=not self.is_quick
             )
             reason = because(permit, found, verdict, self.span, new_car, self.need)
             after = (None, None) if best is None else (vehicle.names[best[0]], best[1].up_to)

@@ -14,12 +14,12 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, SimulationError, check_name
-from safevar_sumo.questions.between import domains_of_axes
+from safevar_sumo.questions.between import domains_of_axes, without_axes
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
-from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.scope import are_numbers, at_values, points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
 from safevar_sumo.study import PHASE, Study, unit_text
@@ -164,8 +164,7 @@ class EncounterRange(NamedTuple):
         rows = self.as_printed(settings)
         evaluations = self.model.evaluate(rows, stage)
         if evaluations.failed.any():
-            row = int(np.argmax(evaluations.failed))
-            reason = evaluations.reason(row)
+            reason = evaluations.reason(int(np.argmax(evaluations.failed)))
             raise SimulationError(f"a car cannot be simulated in test {self.test!r}: {reason}")
         robustness = self.model.robustness_by(evaluations)
         return np.where(self.model.evaluator.region.feasible(rows), robustness, np.inf)
@@ -201,7 +200,7 @@ def span_of(study: Study, by: str | None) -> Span:
     points = assemble(study).points
     tests = [] if matrix is None else points_of_tests(study, points)
     axes = {
-        test.name: {name: values for name, values in test.over.items() if _are_numbers(values)}
+        test.name: {name: values for name, values in test.over.items() if are_numbers(values)}
         for test, _ in tests
     }
     # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
@@ -242,10 +241,6 @@ def span_of(study: Study, by: str | None) -> Span:
     )
 
 
-def _are_numbers(values: list[float | str]) -> bool:
-    return all(type(value) in (int, float) for value in values)
-
-
 def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
@@ -275,12 +270,11 @@ def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
         return
     for test, points in points_of_tests(study, assemble(study).points):
         domains = domains_of_axes(study, test, points[0].scenario)
-        fixed = {name: values for name, values in test.over.items() if name not in domains}
+        fixed = without_axes(test, domains)
         weathers = [[weather] for weather in test.weathers] or [[]]
-        for weather, *place in product(weathers, *fixed.values()):
-            over = dict(zip(fixed, place, strict=True))
-            of_axes = {name: [value] for name, value in over.items()}
-            alone = replace_in(test, over=of_axes, weathers=weather)
+        for weather, *place in product(weathers, *fixed.over.values()):
+            over = dict(zip(fixed.over, place, strict=True))
+            alone = replace_in(at_values(fixed, over), weathers=weather)
             searched = {**study.scenario.search, **domains}
             yield (
                 test.name,

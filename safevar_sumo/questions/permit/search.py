@@ -56,6 +56,10 @@ class Permit(NamedTuple):
         return _order(self.up_to)
 
 
+Repaired = tuple[int, Permit] | None
+"""The column of the characteristic that raises a car's value most, and the car as it is then."""
+
+
 def _order(value: float | None) -> float:
     """Values in their order; None, of a car that is not safe at all, is the least."""
     return -np.inf if value is None else value
@@ -133,8 +137,7 @@ class PermitSearch:
                     search.falsify(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
-                failure = search.failures[number]
-                found[car].append(Reached(model.fit, search.up_to(number), failure))
+                found[car].append(Reached(model.fit, search.up_to(number), search.failures[number]))
         return [Permit(reached) for reached in found]
 
     def repair_first(
@@ -143,7 +146,7 @@ class PermitSearch:
         measured: BoolArray,
         original: FloatArray,
         permits: Sequence[Permit],
-    ) -> list[tuple[int, Permit] | None]:
+    ) -> list[Repaired]:
         """For each of K cars, shape (K, n), the measured characteristic that, as in the original,
         raises its value most, with the car as it is then; None where no single one does.
 
@@ -156,7 +159,7 @@ class PermitSearch:
         top = float(self.values[-1])
         bounds = list[dict[int, float]]()
         failures = list[list[LimitingFailure]]()
-        best = list[tuple[int, Permit] | None]([None] * len(settings))
+        best = list[Repaired]([None] * len(settings))
         known = [permit.order for permit in permits]  # with the best repair so far
         for row, permit in enumerate(permits):
             worn = np.flatnonzero(measured[row] & (settings[row] != original))

@@ -163,8 +163,7 @@ class SpeedSearch:
         # Values above a known failure of a car need not be met at other phases.
         known = [self.failures[car] for car in cars]
         most = [np.inf if failure is None else failure.value for failure in known]
-        values = encounters.values_in(rows)
-        is_open = values <= np.repeat(most, sizes)
+        is_open = encounters.values_in(rows) <= np.repeat(most, sizes)
         robustness = encounters.robustness(rows, self._stage)
         rows, robustness = encounters.at_worst_phases(rows, robustness, is_open, self._stage)
         ends = np.cumsum(sizes)[:-1]

@@ -29,7 +29,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.box import Proof
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
@@ -127,7 +127,7 @@ REPAIRS: Columns = {
     repairs=REPAIRS,
 )
 def repair(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     promise: LimitTexts = (),
@@ -192,7 +192,7 @@ def repair(
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
     budget = budget_of(quick=quick)
-    evaluator.plan({ROUNDS_STAGE: USUAL_ROUNDS * budget})
+    evaluator.begin({ROUNDS_STAGE: USUAL_ROUNDS * budget})
     models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -235,13 +235,12 @@ def repair(
     return answer
 
 
-def _first_vehicles(problem: RepairProblem, subject: Study | Case) -> FloatArray:
+def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
     """The new vehicle, corners and Sobol points of the promise, and failures of results in it;
     shape (L, n).
     """
     promise = problem.promise
-    seed = problem.study.search.seed
-    points = sobol_points(SOBOL_VEHICLES, len(promise.lower), seed)
+    points = sobol_points(SOBOL_VEHICLES, len(promise.lower), problem.study.search.seed)
     settings = [
         promise.region.characteristics.original[np.newaxis],
         promise.at(np.round(points)),

@@ -139,8 +139,7 @@ class Search:
             size = FIRST_SETTINGS
             while start < len(settings):
                 rows = settings[start : start + size]
-                problem = self.problems[number]
-                (robustness,), points = problem.robustness_of_each(
+                (robustness,), points = self.problems[number].robustness_of_each(
                     change[np.newaxis], rows, "changes with all vehicles"
                 )
                 worst = int(np.argmin(robustness))

@@ -35,7 +35,7 @@ from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     describe_evaluations,
     describe_rules,
-    few_evaluations,
+    few_evaluations_in_words,
 )
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import (
@@ -208,7 +208,11 @@ def answer_questions(
     of_all = [
         ("all", remark)
         for case in cases
-        for remark in (*case.remarks, few_evaluations(case), describe_runs_without_solutions(case))
+        for remark in (
+            *case.remarks,
+            few_evaluations_in_words(case),
+            describe_runs_without_solutions(case),
+        )
         if remark
     ]
     different = dict.fromkeys([*of_all, *remarks])

@@ -12,11 +12,10 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, are_collisions
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, TextArray
 from safevar_sumo.study import SAFETY_DEGREE
 
 ANY = "any"
@@ -59,7 +58,7 @@ def change_numbers(case: Case) -> list[str]:
     return [str(j) for j in range(1, len(case.characteristics.vehicle) + 1)]
 
 
-def count_changes(case: Case) -> npt.NDArray[np.str_]:
+def count_changes(case: Case) -> TextArray:
     """The number j of changed characteristics of each critical solution, "1".."n"."""
     return np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
 

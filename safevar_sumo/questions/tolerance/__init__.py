@@ -11,7 +11,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
@@ -30,7 +30,6 @@ from safevar_sumo.questions.tolerance.limits import (
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
 from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.wider import WIDER
-from safevar_sumo.study import Study
 
 
 @question
@@ -47,7 +46,7 @@ from safevar_sumo.study import Study
     wider=WIDER,
 )
 def tolerance(
-    subject: Study | Case,
+    subject: Subject,
     evaluator: Evaluator,
     *,
     limits: LimitTexts = (),
@@ -103,7 +102,7 @@ def tolerance(
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
     phases = phases_of(evaluator, len(columns), budget, fits)
     planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
-    evaluator.plan(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
+    evaluator.begin(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
     specified = specified_limits(study, limits, columns)
     original = evaluator.evaluate_original()
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.

@@ -9,7 +9,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Limit, Study, limits_of
@@ -47,7 +47,7 @@ class Asked(NamedTuple):
         those of each.
     """
 
-    subject: Study | Case
+    subject: Subject
     evaluator: Evaluator
     columns: list[int]
     limits: dict[str, Limit]
@@ -80,8 +80,7 @@ class Asked(NamedTuple):
         if self.up_to is None or not len(settings):
             return settings
         # They are unsafe in the whole study; those in encounters above the value do not count.
-        is_inside = (settings >= members.lower) & (settings <= members.upper)
-        settings = settings[is_inside.all(axis=1)]
+        settings = settings[((settings >= members.lower) & (settings <= members.upper)).all(axis=1)]
         evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
         return settings[evaluations.valid & self.unsafe.of(evaluations)]
 

@@ -104,8 +104,7 @@ class Extension:
         """
         search = self.search
         sides = search.sides_of(box)
-        inside = search.unsafe_inside(sides)
-        failures = search.extents(np.concatenate([inside, *avoided]))
+        failures = search.extents(np.concatenate([search.unsafe_inside(sides), *avoided]))
         failures = failures[(failures <= sides).all(axis=(1, 2))]
         if not len(failures):
             return box

@@ -17,7 +17,7 @@ from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Models, models_of
+from safevar_sumo.questions.models import Model, Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Frames, Rows, tabulate
@@ -173,7 +173,7 @@ def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
     is_scanned = is_safe or not is_sought
     within = None if is_scanned else [(members.original[column],) * 2 for column in asked.columns]
     scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_scanned else 1)
-    models = Models.own_alone(evaluator, asked.unsafe)
+    models = Models((Model(0, evaluator, asked.unsafe),), ())
     if is_sought and is_safe:
         models = models_of(evaluator, asked.unsafe, asked.fits)
     search_alone = AloneSearch(scans, asked.columns, models.own)
@@ -219,6 +219,8 @@ def _find_together(
                 phases.begin_round(number, len(models.members) - 1, is_known=True)
             search_alone.add(model, tests[model.fit])
             search_alone.attack(model, asked.budget)
+            # No joint box holds a failure of one characteristic alone, and what the joint search
+            # met of these moves limits alone.
             for _ in range(MAX_REFUTED):
                 if model.fit == 0:
                     joint.find(scans, np.concatenate([known, search_alone.failures]))
@@ -235,8 +237,7 @@ def _find_together(
 
 def answer_limits(asked: Asked) -> Answer:
     """The answer with limits alone and joint limits."""
-    evaluator = asked.evaluator
-    study = evaluator.study
+    study = asked.evaluator.study
     found = find_nested_limits(asked)
     models = found.models
     together = found.together

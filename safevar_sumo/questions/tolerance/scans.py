@@ -103,6 +103,7 @@ def scan(
     )
     if evaluator.left is not None:  # a rough answer
         rounds = 0
+    # All scans together take a sixth of few simulations.
     number = evaluator.at_most(number or usual, 6 * len(scanned))
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [

@@ -268,10 +268,8 @@ class BoxSearch(BoxGeometry):
     def corner_settings(self, boxes: FloatArray) -> FloatArray:
         """Settings at the C known corners of B boxes, shape (B, C, n)."""
         corners = np.array(self.corners)
-        below = boxes[:, :1]
-        above = boxes[:, 1:]
         return self.original + corners * np.where(
-            corners > 0, above, below
+            corners > 0, boxes[:, 1:], boxes[:, :1]
         )  # a corner of 0 is the original
 
     def points(self, sides: FloatArray, number: int) -> FloatArray:
@@ -309,8 +307,7 @@ class BoxSearch(BoxGeometry):
         """Know, for each change of K causes, the value nearest to the original from which on it is
         unsafe with the others: the settings in which all changes have these values, shape (K, n).
         """
-        is_changed = (causes != self.original) & self.is_free.any(axis=0)
-        rows, columns = np.nonzero(is_changed)
+        rows, columns = np.nonzero((causes != self.original) & self.is_free.any(axis=0))
         ends = causes[rows]
         starts = ends.copy()
         starts[np.arange(len(rows)), columns] = self.original[columns]

@@ -336,7 +336,7 @@ class JointSearch:
             if validator not in self._validators:
                 self._validators.append(validator)
         else:
-            self.found = self.found._replace(box=None)
+            self.give_up()
         self.found = self.found._replace(boxes=self.found.boxes + attempt + 1)
         self._note([validator.model, *met])
 
@@ -373,7 +373,7 @@ class JointSearch:
         box = self.found.box
         search = self._search
         if box is not None and not _has_room(search, box):
-            self.found = self.found._replace(box=None)
+            self.give_up()
         self.found = self.found._replace(
             searched=(*self.found.searched, *models),
             failures_alone=search.failures_alone,

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.scope import are_numbers, points_of_tests
 from safevar_sumo.scenarios import searchable_in
 from safevar_sumo.study import MatrixTest, Study, unit_text
 from safevar_sumo.sumo.system import assemble
@@ -103,8 +103,7 @@ def _matrix_up_to(study: Study, name: str, high: float) -> Study:
         units = [searchable_in(points[0].scenario) for _, points in by_test]
         unit = next((unit_text(each[name].unit) for each in units if name in each), "")
         problem = f"{name}={high:g} is not among the values that study {study.name!r} drives"
-        legal = f"a value from {min(driven):g} to {max(driven):g}{unit}"
-        raise InputError(OPTION, problem, legal)
+        raise InputError(OPTION, problem, f"a value from {min(driven):g} to {max(driven):g}{unit}")
     tests = list[MatrixTest]()
     for test, points in by_test:
         values = _values(test, name)
@@ -118,5 +117,5 @@ def _matrix_up_to(study: Study, name: str, high: float) -> Study:
 
 def _values(test: MatrixTest, name: str) -> Sequence[float]:
     """The values of an axis of a test; none without such an axis, or if they are no numbers."""
-    values = [value for value in test.over.get(name, ()) if type(value) in (int, float)]
-    return values if len(values) == len(test.over.get(name, ())) else []
+    values = test.over.get(name, ())
+    return values if are_numbers(values) else ()

@@ -94,8 +94,7 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
         with suppress(InputError):  # it ends below this value
             study = study_up_to(study, asked.up_to)
     other = evaluator.for_study(study)
-    original = other.evaluate_original()
-    unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)
+    unsafe = limit_criterion(other, study, asked.criterion, asked.margin, other.evaluate_original())
     models = models_of(other, unsafe, asked.fits)
     if together.box is None and not asked.limits:
         return []

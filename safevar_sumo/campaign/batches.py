@@ -34,7 +34,7 @@ from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_m
 from safevar_sumo.records import Evaluations, FloatArray, differences
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo import is_recorded, settings_per_batch
+from safevar_sumo.sumo import needs_no_sumo, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.terminal import Progress
@@ -194,7 +194,7 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
     """Choose how settings of a study fill batches."""
     task = Task(study=study, selection=selection)
     system = selection.of(system_of(study))
-    are_recorded = is_recorded(system)
+    are_recorded = needs_no_sumo(system)
     have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
     return Batches(
         settings_per_batch(system, task.engine), are_recorded and not have_turns, are_recorded
@@ -279,8 +279,7 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
     with open_pool(1) as pool:  # first, as a simulator may end its process
         (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(system, settings)
-    for row, difference in differences(here.results, there.results):
+    for row, difference in differences(drive_and_score(system, settings).results, there.results):
         from safevar_sumo.check import Finding  # slow to import, and rarely needed
 
         words = f"{difference} in a new process"
