@@ -38,7 +38,8 @@ class ProcessWorker:
     Parameters
     ----------
     last_words
-        The file in which the process says where it was when it crashed or exceeded a time limit.
+        The file in which the process says where it was when it crashed or exceeded a time limit;
+        its name is the worker's number.
     """
 
     def __init__(self, last_words: Path) -> None:
@@ -104,6 +105,7 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     this_process.last_words = file
+    this_process.worker = int(last_words.stem)
     threading.Thread(target=_end_with_caller, daemon=True).start()
 
 

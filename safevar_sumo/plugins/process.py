@@ -49,6 +49,8 @@ class _Process:
         a time limit.
     is_limited
         Whether a time limit is counting.
+    worker
+        The number of this process among those that simulate on this machine.
     """
 
     added_folders: list[str] = field(default_factory=list)
@@ -58,6 +60,7 @@ class _Process:
     is_listening: bool = False
     last_words: IO[str] | None = None
     is_limited: bool = False
+    worker: int = 0
 
 
 this_process = _Process()

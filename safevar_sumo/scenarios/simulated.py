@@ -126,6 +126,8 @@ class Simulator(Scenario):
         Distributions on whose versions results depend, such as `metadrive-simulator`.
     version
         The simulator's own version, if no distribution has it.
+    worker
+        What `open_worker` returned in this process.
     """
 
     __slots__ = ()
@@ -134,6 +136,7 @@ class Simulator(Scenario):
     OPTIONAL: ClassVar[tuple[str, ...]] = ()
     LIBRARIES: ClassVar[tuple[str, ...]] = ()
     version: ClassVar[str] = ""
+    worker: ClassVar[Any] = None
     network: str = ""
     duration: float = 60.0
 
@@ -154,5 +157,17 @@ class Simulator(Scenario):
         Without a trace it has `outcome`, `safety_degree` and any of the study's metrics by name.
         """
 
+    @classmethod
+    def open_worker(cls, worker: int) -> Any:
+        """Open what is slow to start, once in a process: the objects of the class find it as
+        `self.worker`. Processes that simulate on one machine at the same time have different
+        numbers, from 0; one that replaces a dead one has its number.
+        """
+        return None
+
+    @classmethod
+    def close_worker(cls, handle: Any) -> None:
+        """End what `open_worker` returned; nothing by default."""
+
     def close(self) -> None:
-        """End the simulator; nothing by default."""
+        """End the simulator when its process ends; nothing by default."""

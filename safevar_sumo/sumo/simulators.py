@@ -1,5 +1,5 @@
-"""Runs in a simulator of the user's own, which drives one vehicle after another; a process keeps
-it.
+"""Runs in a simulator of the user's own, which drives one vehicle after another; a process opens it
+once.
 """
 
 from __future__ import annotations
@@ -9,8 +9,11 @@ import inspect
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import replace
+from inspect import getattr_static
+from pathlib import Path
+from random import Random
 from typing import Any
 
 import msgspec
@@ -64,39 +67,74 @@ NO_TRACE: Mapping[str, FloatArray] = {
 """What stands in place of the trace of a run that has none."""
 
 
+ARRAYS = (np.generic, np.ndarray, np.random.Generator, np.random.RandomState)
+PLAIN = (bool, int, float, complex, str, bytes, tuple, list, dict, set, Random, *ARRAYS)
+"""Types of attributes of a simulator that each run has for itself, unlike an open connection."""
+
+
 class _Kept:
-    """The simulators of this process, one of each class, kept between runs; their fields are set
-    for each run.
+    """What this process keeps of the simulators of the user's own: of each class the handle that
+    its `open_worker` returned, and the object that simulated last.
     """
 
     def __init__(self) -> None:
-        self._simulators = dict[str, Simulator]()
+        self._last = dict[str, Simulator]()
+        self._handles = dict[str, tuple[int, type[Simulator], Any]]()
 
     def at(self, scenario: Simulator) -> Simulator:
-        """The simulator of a scenario's class, with its fields; a new one if the code was loaded
-        anew.
+        """An object as `scenario` was when it was created with its fields, with the handle of its
+        class; a new handle if the file of the class was edited.
         """
         kind = type(scenario)
         name = f"{kind.__module__}:{kind.__qualname__}"
-        if type(self._simulators.get(name)) is not kind:
+        has_worker = getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
+        file = inspect.getfile(kind.open_worker)
+        edited = Path(file).stat().st_mtime_ns if has_worker else id(kind)
+        if name in self._handles and self._handles[name][0] != edited:
             self._close(name)
-            self._simulators[name] = copy(scenario)
-        simulator = self._simulators[name]
-        is_struct = isinstance(simulator, msgspec.Struct)
+        if name not in self._handles:
+            handle = kind.open_worker(this_process.worker)
+            self._handles[name] = edited, kind, handle
+        handle = self._handles[name][2]
+
+        # Nothing that a run changes stays in the scenario. Without `open_worker`, what the run
+        # before opened and put into the object is handed on.
+        is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
-        for field in inspect.signature(kind).parameters:
-            if hasattr(scenario, field):
-                set_field(simulator, field, getattr(scenario, field))
+        simulator = _deep_copy(scenario) if has_worker or is_struct else copy(scenario)
+        if has_worker:
+            try:
+                set_field(simulator, "worker", handle)
+            except AttributeError:  # a Struct has its fields alone
+                kind.worker = property(lambda self: handle)
+        elif not is_struct:
+            for field, value in vars(simulator).items():
+                set_field(simulator, field, deepcopy(value) if isinstance(value, PLAIN) else value)
+            for field, value in vars(self._last.get(name, simulator)).items():
+                if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
+                    set_field(simulator, field, value)
+        self._last[name] = simulator
         return simulator
 
     def close(self) -> None:
         """End all simulators."""
-        for name in [*self._simulators]:
+        for name in [*self._handles]:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        if simulator := self._simulators.pop(name, None):
-            simulator.close()
+        last = self._last.pop(name, None)
+        _, kind, handle = self._handles.pop(name)
+        if last is not None:
+            last.close()
+        kind.close_worker(handle)
+
+
+def _deep_copy(scenario: Simulator) -> Simulator:
+    """A copy that shares nothing, where that can be copied."""
+    try:
+        return deepcopy(scenario)
+    except (TypeError, AttributeError, ValueError, RuntimeError):
+        return copy(scenario)
 
 
 _kept = _Kept()
@@ -124,8 +162,8 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
         scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
         assert isinstance(scenario, Simulator)
         with user_errors(system.source), end_if_longer(system.time_limit):
-            simulator = _kept.at(scenario)
             with _end_worker():
+                simulator = _kept.at(scenario)
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
             if TIME not in result:
                 _check_names(scenario, result, system)

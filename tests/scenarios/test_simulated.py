@@ -4,6 +4,7 @@ and what it cannot do is refused.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from safevar_sumo.metrics import METRICS
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
-from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import json_of, refused, run
 
@@ -117,10 +118,11 @@ seed = 1
 
 
 @pytest.fixture
-def wall(in_tmp: Path) -> Path:
+def wall(in_tmp: Path) -> Iterator[Path]:
     (in_tmp / "models.py").write_text(MODELS)
     (in_tmp / "wall.toml").write_text(STUDY)
-    return in_tmp / "wall.toml"
+    yield in_tmp / "wall.toml"
+    simulators.close_simulator()
 
 
 def system_of(study: Path, **changes: object) -> System:
@@ -203,6 +205,119 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     tests = [{"name": name, "model": f"models:{name}"} for name in ("Wall", "Listed", "Rig")]
     system = system_of(wall, matrix={"tests": tests})
     assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(18, abs=0.5)
+
+
+KEEPS = """
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+
+LOG = []
+
+
+@dataclass
+class Derives:
+    '''Stops after v^2 / 2a; values are derived at creation, and changed in a run.'''
+
+    UNITS = {"decel": "m/s^2", "delay": "s"}
+    OPTIONAL = ("delay",)
+    speed: float = 50.0
+    engine: Any = field(default=None, init=False)
+
+    def __post_init__(self):
+        self.v = self.speed / 3.6
+        self.rows = []
+        self.random = np.random.default_rng(1)
+
+    def simulate(self, setting):
+        if self.engine is None:
+            self.engine = LOG.append("engine") or object()
+        self.rows.append(self.v)
+        rest = 40 - self.v**2 / 2 / setting["decel"] + 1e-3 * self.random.random()
+        self.v = 0
+        if rest < 0:
+            impact = (-2 * setting["decel"] * rest) ** 0.5
+            return {"outcome": "collision", "safety_degree": -impact}
+        return {"outcome": "stopped", "safety_degree": rest / len(self.rows)}
+
+
+class Served(Derives):
+    @classmethod
+    def open_worker(cls, worker):
+        open("log", "a").write(f"{cls.__name__} open {worker}\\n")
+        return [worker]
+
+    @classmethod
+    def close_worker(cls, handle):
+        open("log", "a").write(f"{cls.__name__} close {handle[0]}\\n")
+
+    def simulate(self, setting):
+        assert self.worker and self.engine is None
+        return super().simulate(setting)
+
+
+class Struct(msgspec.Struct, frozen=True):
+    UNITS = Derives.UNITS
+    OPTIONAL = ("delay",)
+    speed: float = 50.0
+    open_worker = classmethod(Served.open_worker.__func__)
+    close_worker = classmethod(Served.close_worker.__func__)
+
+    def simulate(self, setting):
+        return {"outcome": "stopped", "safety_degree": float(len(self.worker))}
+
+
+class Dies(Served):
+    def simulate(self, setting):
+        if setting["decel"] < 8 and self.worker == [0] and open("dies", "a+").tell() == 0:
+            open("dies", "a").write("x")
+            __import__("os")._exit(7)
+        return super().simulate(setting)
+"""
+
+
+@pytest.mark.parametrize("name", ["Derives", "Served"])
+def test_each_setting_has_an_object_that_was_created_with_its_fields(wall: Path, name: str) -> None:
+    """What is derived at creation is that of the test point, and of no run before."""
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    tests = [{"name": "a", "over": {"speed": [20.0, 60.0, 90.0]}}]
+    system = system_of(wall, scenario={"model": f"keeps:{name}"}, matrix={"tests": tests})
+    for _ in range(2):
+        at_points = simulate_all_points(system, np.array([[8.0, 0.0], [8.0, 0.0]]))
+        degrees = [point.evaluations.f_safe.tolist() for point in at_points]
+        rests = [40 - (v / 3.6) ** 2 / 16 for v in (20, 60, 90)]
+        assert degrees == [pytest.approx([rest] * 2, abs=2e-3) for rest in rests]
+        assert len({*degrees[0]}) == 1
+    if name == "Derives":
+        assert __import__("sys").modules["keeps"].LOG == ["engine"]
+
+
+@pytest.mark.parametrize("name", ["Served", "Struct"])
+def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> None:
+    """Also where the code is loaded again, and with a number: 0 without worker processes."""
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    wall.write_text(STUDY.replace("models:Wall", f"keeps:{name}"))
+    assert json_of("check", "wall.toml")["numbers"]["passed"]
+    run("simulate", "wall.toml")
+    simulators.close_simulator()
+    assert Path("log").read_text().split("\n") == [f"{name} open 0", f"{name} close 0", ""]
+    wrong = KEEPS.replace("def open_worker(cls, worker)", "def open_worker(cls)")
+    (wall.parent / "keeps.py").write_text(wrong)
+    refused("check", "wall.toml", message=("open_worker that does not take (worker)",))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> None:
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    wall.write_text(STUDY.replace("models:Wall", "keeps:Dies"))
+    run("study", "wall.toml", "--out", "results", "--jobs", "2")
+    lines = Path("log").read_text().splitlines()
+    assert {line for line in lines if "open" in line} == {"Dies open 0", "Dies open 1"}
+    assert lines.count("Dies open 0") == lines.count("Dies close 0") + 2  # one died
+    assert lines.count("Dies open 1") == lines.count("Dies close 1")
 
 
 @pytest.mark.parametrize(
