@@ -16,9 +16,11 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
+from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import is_recorded
+from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -77,6 +79,11 @@ def try_simulations(
     many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(many))
     system = _system(study)
+    if system.has_simulator:
+        runs = drive_all(system.at(system.points[0]), settings[:1])
+        if contradiction := unit_contradiction(runs.trace):
+            expected = "speeds in m/s, and distances in m"
+            yield FailedCheck("contract", contradiction, expected, "the original vehicle")
     number, seconds = _affordable(system, settings)
     if vehicles is not None:
         number, seconds = vehicles, seconds * vehicles / number
@@ -114,8 +121,9 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     """
     timed = settings[: 1 if system.has_simulator else TIMED]
     # The first simulation loads what any does, and ends a driving system that does not end.
-    longest = system.time_limit if system.has_simulator else min(system.time_limit, LONGEST)
-    drive_and_score(replace(system, time_limit=longest), timed[:1])
+    if not system.has_simulator:  # which has simulated once
+        short = replace(system, time_limit=min(system.time_limit, LONGEST))
+        drive_and_score(short, timed[:1])
     start = time.perf_counter()
     drive_and_score(system, timed)
     seconds = RUNS_OF_ALL * (time.perf_counter() - start) / len(timed)

@@ -135,6 +135,8 @@ class LearnedDriver(Simulator):
                 strict=True,
             )
         )
+        if is_hit and not info["crash"]:  # the edge of the road is a body, too
+            trace["separation"][-1] = 0.0
         outcome = Outcome.STOPPED if ego.speed < 0.3 else Outcome.TIMEOUT
         outcome = Outcome.COLLISION if is_hit else outcome
         return {**trace, "outcome": outcome, "impact_speed": trace["speed"][-1]}

@@ -15,11 +15,11 @@ from inspect import getattr_static
 from pathlib import Path
 from random import Random
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
@@ -138,6 +138,8 @@ def _deep_copy(scenario: Simulator) -> Simulator:
 
 
 _kept = _Kept()
+_steps = WeakKeyDictionary[type, dict[str, float]]()
+"""The time step of each class, as this process has loaded it, at each point [s]."""
 
 
 @atexit.register
@@ -165,7 +167,9 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
             with _end_worker():
                 simulator = _kept.at(scenario)
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
-            if TIME not in result:
+            if TIME in result:
+                _check_step(simulator, result[TIME], point.name)
+            else:
                 _check_names(scenario, result, system)
         results.append(result)
     return _runs_of(results, system, point.allowed_impact_speed)
@@ -211,6 +215,17 @@ def joined(evaluations: Evaluations, repeats: int) -> Evaluations:
     )
 
 
+def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
+    """Refuse another time step than that of earlier runs of this process at a point."""
+    kind = type(simulator)
+    step = round(float(time[1] - time[0]), 6)
+    first = _steps.setdefault(kind, {}).setdefault(point, step)
+    if step != first:
+        steps = f"{min(step, first):g} and {max(step, first):g} s"
+        code = UserCode(f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind)
+        raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
+
+
 def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System) -> None:
     """Refuse metrics that nobody knows, and objectives that are missing, in a result without a
     trace.
@@ -235,10 +250,6 @@ def _runs_of(
     """The runs of N results, each with its own number of samples."""
     traces = [{**NO_TRACE, **result} if TIME not in result else result for result in results]
     logged = [result[TIME] for result in results if TIME in result] or [NO_TRACE[TIME]]
-    steps = {round(float(np.ptp(times[:2])), 6) for times in logged}
-    if len(steps) > 1:
-        problem = f"scenario.model: runs have time steps of {min(steps):g} and {max(steps):g} s"
-        raise InputError(system.source, problem, "one time step in all runs")
     step = float(np.diff(logged[0][:2])[0])
     lengths = np.array([len(trace[TIME]) for trace in traces])
     samples = np.arange(lengths.max())

@@ -207,6 +207,8 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(18, abs=0.5)
 
 
+ENDS = "lambda r: dict(r, "
+"""The beginning of a result that ends otherwise."""
 KEEPS = """
 from dataclasses import dataclass, field
 from typing import Any
@@ -336,6 +338,14 @@ def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> 
         ("lambda r: {'outcome': 'stopped'}", "a result without safety_degree"),
         ("lambda r: {'outcome': 'stopped', 'safety_degree': -1.0}", "safety_degree = -1.0"),
         ("lambda r: {'outcome': 'stopped', 'safety_degree': 1.0, 'ttx': 1.0}", "'ttx'"),
+        (f"{ENDS}separation=0 * r['speed'])", "'stopped' with a separation of 0"),
+        (f"{ENDS}speed=r['speed'] * 0 + 9)", "'stopped' at a speed of 9"),
+        (f"{ENDS}outcome='passed', separation=0 * r['speed'])", "'passed' with a separation of 0"),
+        (f"{ENDS}outcome='collision', impact_speed=1.0)", "a collision at a separation of 18"),
+        (
+            f"{ENDS}outcome='collision', impact_speed=36.0, separation=0 * r['speed'])",
+            "impact_speed = 36 after a speed of 0",
+        ),
         ("lambda r: 1 / 0", "division by zero"),
         ("lambda r: __import__('time').sleep(9)", "time limit of 0.5 s"),
     ],
@@ -379,10 +389,37 @@ def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
         system_of(wall, matrix={"tests": tests})
 
 
-def test_runs_of_one_batch_have_one_time_step(wall: Path) -> None:
-    system = wrong_system(wall, "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}")
+def test_runs_have_one_time_step(wall: Path) -> None:
+    """In one batch or in several, and in `check`, too."""
+    change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
+    system = wrong_system(wall, change)
+    simulators.simulate_each(system, np.array([[9.0, 0.0]]))
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
-        simulators.simulate_each(system, np.array([[9.0, 0.0], [4.0, 0.5]]))
+        simulators.simulate_each(system, np.array([[4.0, 0.5]]))
+    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    refused("check", "wall.toml", message=("time steps of 0.05 and 0.1 s",))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            "**{k: r[k] * 3.6 for k in ('speed', 'impact_speed') if k in r}",
+            "speed and position disagree",
+        ),
+        ("position=r['position'] * 3.6", "speed and position disagree"),
+        ("position=r['position'] * 0 + 1, gap=r['gap'] / 3.6", "speed and position disagree"),
+        ("gap=20 + (r['gap'] - 40) / 1.6", "speed and gap disagree"),
+        ("gap=40 + (r['gap'] - 40) / 1.4", ""),
+        ("gap=r['gap'] / 3.6, obstacle_speed=r['gap'] * 0 + 1", ""),
+    ],
+)
+def test_a_speed_that_disagrees_with_the_way_is_a_finding(
+    wall: Path, change: str, told: str
+) -> None:
+    wrong_system(wall, f"lambda r: {{**r, **dict({change})}}")
+    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    assert told in run("check", "wall.toml", expect=int(bool(told))).stdout
 
 
 @pytest.mark.parametrize("key", ["ads", "weather"])
