@@ -101,7 +101,7 @@ def try_simulations(
 
     expected = "the same, to the bit"
     if system.has_simulator:
-        expected += "; or repeats = N in [scenario], where the mean of N runs counts"
+        expected += "; or repeats = N in [scenario], where the share of unsafe runs counts"
     yield from _try(load, region.characteristics, settings, progress, expected)
 
     # Recorded scenes of a user's scenario hold in SUMO, too.

@@ -30,6 +30,7 @@ from safevar_sumo.study.marks import (
 from safevar_sumo.study.scenario_file import MODEL, files_of_scenario, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
+    OBJECTIVES,
     PYMOO,
     Origin,
     Parameters,
@@ -132,6 +133,12 @@ def checked_study(raw: StudyTables) -> Study:
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
+
+    # With repeats the search maximises the share of unsafe runs.
+    scenario, search = tables.get("scenario"), tables.get("search")
+    has_repeats = isinstance(scenario, dict) and scenario.get("repeats", 1) != 1
+    if has_repeats and isinstance(search, dict):
+        tables["search"] = {"objectives": ["unsafe_share", *OBJECTIVES[1:]], **search}
 
     # Records, and what concerns several of them.
     study = convert_table(tables, Study)

@@ -105,7 +105,7 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     The original vehicle drives in the same encounter as each variant, and must keep at least
     `margin` [m] between bodies there: otherwise the encounter does not count, as it shows nothing
     of the variant. A simulator of the user's own that is not deterministic simulates each setting
-    `repeats` times: the mean of each metric counts, and the worst outcome.
+    `repeats` times: the share of unsafe runs, the worst run, and means of metrics count.
     """
 
     search: Annotated[dict[str, Domain], ORDERED] = {}

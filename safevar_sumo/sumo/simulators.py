@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 import msgspec
 import numpy as np
 
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
@@ -59,6 +59,7 @@ SEVERITY = [
     Outcome.STOPPED,
 ]
 """Outcomes of the rounds of a setting, the worst first."""
+COLLISION = Unsafe()
 NO_TRACE: Mapping[str, FloatArray] = {
     TIME: np.array([0.0, 1.0]),
     "speed": np.zeros(2),
@@ -188,30 +189,46 @@ def _end_worker() -> Iterator[None]:
         raise
 
 
-def joined(evaluations: Evaluations, repeats: int) -> Evaluations:
-    """Of N settings that were simulated in several rounds, in their order, the mean of each metric,
-    where it is defined, and the worst outcome. The safety degree of each round is kept beside.
+def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION) -> Evaluations:
+    """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
+    safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
+    study's own criterion, and the mean of each other metric over the runs that define it. Metrics
+    by which a run is unsafe are kept of each round, too.
     """
+    n = len(evaluations) // repeats
+    columns = np.arange(n)
 
     def mean(values: FloatArray) -> FloatArray:
-        rounds = values.reshape(repeats, -1)
+        rounds = values.reshape(repeats, n)
         number = np.count_nonzero(~np.isnan(rounds), axis=0)
         total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
-    n = len(evaluations) // repeats
+    # The worst run.
     outcomes = evaluations.outcome.reshape(repeats, n)
     rank = {str(name): number for number, name in enumerate(SEVERITY)}
     severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
-    rounds = evaluations.f_safe.reshape(repeats, n)
+    degrees = evaluations.f_safe.reshape(repeats, n)
+    worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
+    metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
+    metrics[SAFETY_DEGREE] = degrees[worst, columns]
+
+    # The share of unsafe runs.
+    is_of_shares = criterion.measure == UNSAFE_SHARE.name
+    is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
+    metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
+    means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
+    rounds = {
+        f"{name}_{k + 1}": values
+        for name in evaluations.metrics
+        if name not in means_alone
+        for k, values in enumerate(evaluations.metrics[name].reshape(repeats, n))
+    }
     return replace(
-        evaluations.take(np.arange(n)),
-        outcome=outcomes[np.argmin(severity, axis=0), np.arange(n)],
-        collision_speed=mean(evaluations.collision_speed),
-        metrics={
-            **{name: mean(values) for name, values in evaluations.metrics.items()},
-            **{f"{SAFETY_DEGREE}_{k + 1}": values for k, values in enumerate(rounds)},
-        },
+        evaluations.take(columns),
+        outcome=outcomes[np.argmin(severity, axis=0), columns],
+        collision_speed=evaluations.collision_speed.reshape(repeats, n)[worst, columns],
+        metrics={**metrics, **rounds},
     )
 
 
@@ -239,6 +256,8 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
             raise code.wrong("simulate", f"a result without a trace, with {name!r}", legal)
     for objective in system.measuring.scoring.objectives:
         measure = measures.get(objective.name)
+        if objective.name == UNSAFE_SHARE.name:
+            continue
         if measure is not None and measure.of == "runs" and objective.name not in result:
             problem = f"a result without a trace and without {objective.name}"
             raise code.wrong("simulate", problem, "each metric that is an objective of the study")

@@ -14,7 +14,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import Evaluations
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
@@ -496,7 +496,7 @@ class Ends(Wall):
 
 
 def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wall: Path) -> None:
-    """The mean counts, each run is in the journal, and without repeats the study is refused."""
+    """The worst run counts, each is in the journal, and without repeats the study is refused."""
     (wall.parent / "noisy.py").write_text(NOISY)
     wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
     assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
@@ -504,30 +504,95 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wal
     assert json_of("check", "wall.toml")["numbers"]["passed"]
     found = drive_and_score(system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
     rounds = np.stack([found.metrics[f"safety_degree_{k}"] for k in range(1, 5)])
-    assert found.f_safe == pytest.approx(rounds.mean(axis=0))
+    assert found.f_safe == pytest.approx(rounds.min(axis=0))
+    assert found.metrics["unsafe_share"].tolist() == [0, 1, 0]
     assert len({*rounds[:, 0]}) == 4
     assert found.outcome.tolist() == ["stopped", "collision", "stopped"]
     run("study", "wall.toml", "--out", "results")
     assert '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
 
 
-def test_the_worst_outcome_of_all_runs_counts() -> None:
-    names = np.array(["stopped", "passed", "passed", "collision", "stopped", "timeout"])
-    evaluations = Evaluations.undefined(np.zeros((6, 1)), "", METRICS, f_diff=0, f_num_diff=0)
-    nothing = np.zeros(6)
+def test_the_worst_run_and_the_share_of_unsafe_runs_count() -> None:
+    """Metres and metres per second have no mean."""
+    evaluations = Evaluations.undefined(np.zeros((8, 1)), "", METRICS, f_diff=0, f_num_diff=0)
+    nothing = np.zeros(8)
+    degrees = np.array([2.0, 9.0, 2.0, 5.0, 2.0, 6.0, -6.0, 7.0])
+    speeds = np.where(degrees < 0, 8.0, np.nan)
+    names = np.array(["stopped", "passed", "passed", "stopped", "stopped"] + 3 * ["timeout"])
     found = simulators.joined(
         replace(
             evaluations,
-            outcome=names,
-            collision_speed=np.array([np.nan, np.nan, np.nan, 4.0, np.nan, np.nan]),
+            outcome=np.where(degrees < 0, "collision", names),
+            collision_speed=speeds,
+            metrics={
+                **evaluations.metrics,
+                "safety_degree": degrees,
+                "tet": np.array([1.0, 1.0, np.nan, 2.0, 3.0, 3.0, np.nan, np.nan]),
+            },
             f_diff=nothing,
             f_num_diff=nothing,
         ),
-        3,
+        4,
     )
-    assert found.outcome.tolist() == ["passed", "collision"]
-    assert found.collision_speed[1] == 4
-    assert np.isnan(found.collision_speed[0])
+    assert found.outcome.tolist() == ["collision", "timeout"]
+    assert found.f_safe.tolist() == [-6, 5]
+    assert found.collision_speed[0] == 8
+    assert np.isnan(found.collision_speed[1])
+    assert found.metrics["unsafe_share"].tolist() == [0.25, 0]
+    assert found.metrics["tet"].tolist() == [2, 2]
+    assert Unsafe.parse("below=6").runs(found).mean(axis=0).tolist() == [1, 0.25]
+    assert Unsafe.parse("unsafe_share > 0.2").of(found).tolist() == [True, False]
+    assert Unsafe().number(found) == 0.25
+    words = "collides at 6.00 m/s in 1 of 4 runs (95 % confidence interval 1 to 81 %)"
+    assert Unsafe().breach_in_words(found.take([0])) == words
+
+
+RARE = """
+from models import Wall
+
+
+class Rare(Wall):
+    '''Collides at 8 m/s in one of so many runs as the delay says.'''
+
+    number = {}
+
+    def simulate(self, setting):
+        key = tuple(setting.values())
+        Rare.number[key] = n = Rare.number.get(key, 0) + 1
+        if n % 20 < round(20 * setting["delay"]):
+            return {"outcome": "collision", "safety_degree": -8.0}
+        return {"outcome": "stopped", "safety_degree": 2.0}
+"""
+
+
+def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
+    """A vehicle that fails in 3 of 20 runs counts 0.15; limits are of the worst run."""
+    (wall.parent / "rare.py").write_text(RARE)
+    wall.write_text(STUDY.replace('"models:Wall"', '"rare:Rare"\nrepeats = 20'))
+    system = system_of(wall)
+    names = [one.name for one in system.measuring.scoring.objectives]
+    assert names == ["unsafe_share", "f_diff", "f_num_diff"]
+    own = wall.read_text() + 'objectives = ["safety_degree", "f_diff"]\n'
+    (wall.parent / "own.toml").write_text(own)
+    names = [one.name for one in system_of(wall.parent / "own.toml").measuring.scoring.objectives]
+    assert names == ["f_safe", "f_diff"]
+    found = json_of("simulate", "wall.toml", "--set", "delay=0.15")
+    assert (
+        "collides at 8.00 m/s in 3 of 20 runs (95 % confidence interval 3 to 38 %)"
+        in (found["verdict"])
+    )
+    assert found["numbers"]["unsafe_share"] == 0.15
+    assert found["numbers"]["safety_degree"] == -8
+    for question in ("risk", "rules"):
+        numbers = json_of(question, "wall.toml", "--simulations", "2000")["numbers"]
+        share = numbers["failures"] / numbers["samples"]
+        assert share == pytest.approx(0.5, abs=0.06)
+        low, high = numbers["interval"]
+        assert low < share < high
+    limit = json_of("tolerance", "wall.toml", "--simulations", "2000")["tables"]["limits"]["rows"]
+    assert max(row["alone_high"] or 0 for row in limit if row["characteristic"] == "delay") < 0.05
+    run("study", "wall.toml", "--out", "results")
+    assert "unsafe_share" in Path("results/solutions.csv").read_text()
 
 
 def test_repeats_are_for_simulators_of_the_users_own() -> None:
