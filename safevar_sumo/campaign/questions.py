@@ -30,10 +30,12 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.share import MAX_SKIPPED
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.records import Evaluations, FloatArray, differences
 from safevar_sumo.results import identity_digest
-from safevar_sumo.study import Study, user_code_names
+from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -47,6 +49,8 @@ BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
 time left is known.
 """
+FEW_SKIPPED = 100
+"""Number of settings up to which a question skips as many as of these."""
 PORTION = 4096
 """Number of settings whose results are kept together."""
 SMALL_PORTION = 256
@@ -108,7 +112,17 @@ def evaluate_all(
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations), len(portion))
         found.append(evaluations)
-    return Evaluations.concatenate(found).take(row_of.ravel())
+    evaluations = Evaluations.concatenate(found)
+    if study.search.failed == "skip":
+        pool.simulated += len(evaluations)
+        pool.failed += int(evaluations.failed.sum())
+        if pool.failed > MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
+            failures = evaluations.take(evaluations.failed)
+            numbers = f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
+            reason = f": {failures.reason(0)}" if len(failures) else ""
+            problem = f"search.failed = 'skip': {numbers}{reason}"
+            raise UserCodeError(study.source, problem, "a simulator that fails less often")
+    return evaluations.take(row_of.ravel())
 
 
 def repeat_first_batches(study: Study, pool: Pool) -> None:
@@ -272,6 +286,7 @@ def find_in_new_process(study: Study) -> list[Finding]:
     """What a simulator of the user's own returns otherwise in a new process, for the original and
     for both ends of the domains; nothing if the study says that it is not deterministic.
     """
+    study = without_skipping(study)
     system = system_of(study)
     if not system.has_simulator or system.repeats > 1:
         return []

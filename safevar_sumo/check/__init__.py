@@ -18,7 +18,7 @@ from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WHOLE, Study, keys_with, user_code
+from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.measuring import own_criterion
@@ -96,7 +96,10 @@ def study_to_check(name: str) -> Study:
 
 
 def check_study(study: Study, **how: Any) -> list[Finding]:
-    """Check the user code of a study; for `how` see `try_simulations`."""
+    """Check the user code of a study, in which no failure is skipped; for `how` see
+    `try_simulations`.
+    """
+    study = without_skipping(study)
     findings = list(find_defects(study, **how))
     if findings:
         return findings

@@ -8,12 +8,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
+from uuid import uuid4
 
 import platformdirs
 
@@ -49,6 +51,11 @@ class _Process:
         a time limit.
     is_limited
         Whether a time limit is counting.
+    attempts
+        The folder in which this process, if it is a worker, notes what it simulates, in case that
+        workers die of it.
+    mark
+        Marks the child processes of simulators in this process.
     worker
         The number of this process among those that simulate on this machine.
     """
@@ -61,9 +68,15 @@ class _Process:
     last_words: IO[str] | None = None
     is_limited: bool = False
     worker: int = 0
+    attempts: Path | None = None
+    mark: str = field(default_factory=lambda: uuid4().hex)
 
 
 this_process = _Process()
+MARK = "SAFEVAR_WORKER"
+"""The environment variable that child processes of a simulator inherit."""
+MAX_DEATHS = 1
+"""Number of workers that may die of a job: another process may have killed one."""
 REPRODUCED_BY = "; to reproduce it: "
 """What stands before a command that simulates a setting again."""
 
@@ -75,6 +88,33 @@ def note_work(text: str) -> None:
         words.truncate()
         words.write(f"{text}\n")
         words.flush()
+
+
+@contextmanager
+def set_variables(values: Mapping[str, str]) -> Iterator[None]:
+    """Within the block, environment variables have these values, also for child processes."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def end_children(mark: str) -> None:
+    """Kill the processes that have inherited a mark, on systems that tell."""
+    entry = f"{MARK}={mark}".encode()
+    for pause in (0.0, 0.02):  # what has just started tells nothing yet
+        time.sleep(pause)
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):
+                process = int(path.parent.name)
+                if entry in path.read_bytes().split(b"\0") and process != os.getpid():
+                    os.kill(process, signal.SIGKILL)
 
 
 class Interrupt(KeyboardInterrupt):

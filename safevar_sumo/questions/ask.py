@@ -95,11 +95,13 @@ ROUGH = (
     " nothing):"
 )
 """The beginning of such an answer."""
+Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
+"""The largest number of simulations."""
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
     (
-        *("simulations", Annotated[int | None, Range(1, 1_000_000_000)], None),
+        *("simulations", Simulations, None),
         (
             "At most so many simulations: a rough answer where more are usual. By default, as many"
             " as take 15 minutes where a simulation takes long."
@@ -174,6 +176,12 @@ class Option(NamedTuple):
         ):
             raise InputError(self.name, repr(value), words)
         return value
+
+
+SIMULATIONS = Option(
+    "simulations", int, get_args(Simulations)[1], (), None, False, None, "the largest number"
+)
+"""The option that questions on pages and in packs have, too."""
 
 
 class Question:
@@ -265,7 +273,6 @@ class Question:
 
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
-        command += "" if simulations is None else f" --simulations {simulations}"
         how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
@@ -285,7 +292,7 @@ class Question:
                 print_text(Console(stderr=True), f"{first.verdict}\n")
             called = _name(source)
             answer = self.answer(subjects, values, **how, progress=progress, called=called)
-        return replace(answer, command=command)
+        return replace(answer, command=command + answer.command)
 
     def answer(
         self,
@@ -299,7 +306,8 @@ class Question:
         called: str = "",
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
-        options. The command that comes next is about the first subject as it is `called`.
+        options. The command that comes next is about the first subject as it is `called`. The
+        answer's own command is the end of its command line: how many simulations it may do.
         """
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
@@ -351,7 +359,9 @@ class Question:
         sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
         verdict = " ".join(filter(None, sentences))
         following = self._following(subjects[0], evaluator, called) or answer.next
-        return replace(answer, verdict=verdict, numbers=numbers, next=following)
+        most = account.asked if account.most is None else account.most
+        command = "" if most is None else f" --simulations {most}"
+        return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
 
     def _following(self, subject: Study | Case, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
@@ -469,7 +479,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     # Options, each with its value.
     values = dict[str, Any]()
     waiting = iter(words)
-    options = {option.flag: option for option in asked.options}
+    options = {option.flag: option for option in (*asked.options, SIMULATIONS)}
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]

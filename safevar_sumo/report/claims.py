@@ -27,7 +27,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import has_criterion, with_criterion
+from safevar_sumo.questions.ask import SIMULATIONS, has_criterion, with_criterion
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
@@ -200,10 +200,21 @@ class Packed:
                     placed = with_list(text, str(path))
                 usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
+                if most := self.packed.simulations.get(text):
+                    placed = f"{placed} {SIMULATIONS.flag} {most}"
                 answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
             command = answer.command.replace(f"{folder}/", "")
             self._answers[text] = replace(answer, command=command)
         return self._answers[text]
+
+    def simulations(self) -> dict[str, int]:
+        """The largest number of simulations of each question whose text does not state it."""
+        flag = f" {SIMULATIONS.flag} "
+        return {
+            text: int(answer.command.rpartition(flag)[2])
+            for text, answer in self._answers.items()
+            if flag in answer.command and flag not in f" {text} "
+        }
 
     def _answer_json(self, text: str) -> bytes:
         return json_bytes(packed_answer(self.answer(text)))

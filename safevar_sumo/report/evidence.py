@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
+
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
@@ -163,7 +165,8 @@ def _pack_study(
     show_part = Parts(progress).begin(study.name)
     packed = Packed(described, files, study.origin.places, jobs, show_part)
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
-    return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
+    files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
+    return msgspec.structs.replace(described, simulations=packed.simulations()), files
 
 
 def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:

@@ -22,6 +22,7 @@ from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import (
+    SIMULATIONS,
     Criterion,
     Jobs,
     has_criterion,
@@ -229,8 +230,10 @@ def answer_to(
     if len(question.others) + 1 != len(cases):
         expected = f"{len(question.others) + 1} results directories"
         raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
+    simulations = values.pop(SIMULATIONS.name, None)
     command = question.command_line([str(directory) for directory in directories], point, values)
-    return replace(question.answer(cases, values, jobs=jobs, progress=progress), command=command)
+    answer = question.answer(cases, values, simulations=simulations, jobs=jobs, progress=progress)
+    return replace(answer, command=command + answer.command)
 
 
 def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any) -> Answer:

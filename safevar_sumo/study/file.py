@@ -382,6 +382,12 @@ def user_code_names(study: Study) -> list[str]:
     return [f"{key} = {name!r}" for key, name in (*user_code(study), *fmus_of(study))]
 
 
+def without_skipping(study: Study) -> Study:
+    """A study that stops where its simulator fails."""
+    search = msgspec.structs.replace(study.search, failed="stop")
+    return msgspec.structs.replace(study, search=search)
+
+
 def fmus_of(study: Study) -> list[tuple[str, str]]:
     """Key and path of a study's FMU."""
     return [("ads.model", study.ads.model)] if study.ads.kind == "fmu" else []

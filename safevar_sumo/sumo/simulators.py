@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy, deepcopy
 from dataclasses import replace
+from hashlib import sha256
 from inspect import getattr_static
 from pathlib import Path
 from random import Random
@@ -20,9 +21,18 @@ from weakref import WeakKeyDictionary
 import msgspec
 import numpy as np
 
+from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
 from safevar_sumo.plugins import UserCode, user_errors
-from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
+from safevar_sumo.plugins.process import (
+    MARK,
+    MAX_DEATHS,
+    REPRODUCED_BY,
+    end_children,
+    note_work,
+    set_variables,
+    this_process,
+)
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
@@ -148,6 +158,7 @@ def close_simulator() -> None:
     """End the simulators of this process, also where one fails to end."""
     with suppress(Exception):
         _kept.close()
+    end_children(this_process.mark)
 
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
@@ -161,10 +172,16 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
     results = []
     for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), rows, strict=True):
-        note_work(f"{REPRODUCED_BY}{system.command} {system.characteristics.options(row)}")
+        command = f"{system.command} {system.characteristics.options(row)}"
+        note_work(f"{REPRODUCED_BY}{command}")
         scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
         assert isinstance(scenario, Simulator)
-        with user_errors(system.source), end_if_longer(system.time_limit):
+        with (
+            set_variables({MARK: this_process.mark}),
+            user_errors(system.source),
+            _attempt(f"{command} {point.name}", system),
+            end_if_longer(system.time_limit),
+        ):
             with _end_worker():
                 simulator = _kept.at(scenario)
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
@@ -174,6 +191,31 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
                 _check_names(scenario, result, system)
         results.append(result)
     return _runs_of(results, system, point.allowed_impact_speed)
+
+
+@contextmanager
+def _attempt(what: str, system: System) -> Iterator[None]:
+    """Note that a setting is simulated, for a study that skips those that fail.
+
+    Raises
+    ------
+    UserCodeError
+        If two workers have died of it.
+    """
+    if this_process.attempts is None or not system.skips_failed:
+        yield
+        return
+    this_process.attempts.mkdir(exist_ok=True)
+    attempts = this_process.attempts / sha256(what.encode()).hexdigest()
+    if attempts.exists() and attempts.stat().st_size > MAX_DEATHS:
+        problem = "two workers died, or exceeded the time limit, in simulate"
+        raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{what}")
+    with attempts.open("a") as file:
+        file.write("x")
+    try:
+        yield
+    finally:
+        attempts.unlink()
 
 
 @contextmanager

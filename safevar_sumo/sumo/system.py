@@ -83,6 +83,7 @@ class System:
     - `allowed_impact_speed` [m/s], `phase` and `overtime` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `criterion` is the study's own.
+    - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
     - `command` simulates the original vehicle of the study.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
@@ -108,6 +109,7 @@ class System:
     overtime: float = 0.0
     repeats: int = 1
     command: str = ""
+    skips_failed: bool = False
     criterion: Unsafe = field(default_factory=Unsafe)
 
     @property
@@ -393,6 +395,7 @@ def _assemble(study: Study) -> System:
         repeats=study.scenario.repeats,
         command=simulate_command(study),
         criterion=own_criterion(study),
+        skips_failed=study.search.failed == "skip",
     )
     if not study.scenario.search:
         return system

@@ -4,9 +4,12 @@ and what it cannot do is refused.
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.records import Evaluations
+from safevar_sumo.results import manifest_differences
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
@@ -629,6 +633,112 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, oft
         "to reproduce it: python -m safevar_sumo simulate wall.toml --set decel=3",
     )
     refused("study", "wall.toml", "--out", "results", message=told)
+
+
+FAILS = """
+import os
+import subprocess
+import time
+
+from models import Wall
+
+
+class Fails(Wall):
+    version = "1"
+
+    def simulate(self, setting):
+        open("count", "a").write("x")
+        if setting["decel"] < LIMIT:
+            subprocess.Popen(["sleep", "SECONDS"], start_new_session=True)
+            FAILURE
+        return super().simulate(setting)
+"""
+
+
+SECONDS = f"1234.{os.getpid()}"
+"""Time that a child process sleeps, as no other test's."""
+
+
+def with_failures(wall: Path, failure: str, limit: float = 3.2, failed: str = "skip") -> None:
+    text = (
+        FAILS.replace("SECONDS", SECONDS).replace("FAILURE", failure).replace("LIMIT", str(limit))
+    )
+    (wall.parent / "fails.py").write_text(text)
+    study = STUDY.replace("models:Wall", "fails:Fails")
+    wall.write_text(f'{study}time_limit = 2.0\nfailed = "{failed}"\n')
+
+
+def children() -> int:
+    simulators.close_simulator()  # of this process
+    return sum(
+        path.read_bytes() == f"sleep\x00{SECONDS}\x00".encode()
+        for path in Path("/proc").glob("[0-9]*/cmdline")
+        if path.exists()
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize("failure", ["1 / 0", "os._exit(7)", "time.sleep(60)"])
+def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: str) -> None:
+    """They are infeasible and counted; `check` names them; children end with their simulator."""
+    with_failures(wall, failure)
+    options = ("study", "wall.toml", "--out", "results", "--jobs", "1")
+    printed = run(*options).stdout
+    number = int(re.search(r"(\d+) settings? could not be simulated", printed)[1])
+    journals = "".join(path.read_text() for path in Path("results/runs").glob("*.jsonl"))
+    assert journals.count('"simulator-error"') == number > 0
+    assert "--set decel=3" in journals or failure == "1 / 0"
+    assert children() == 0
+    printed = run("check", "wall.toml", expect=None)
+    assert {"1 / 0": "division", "os._exit(7)": "code 7"}.get(failure, "time limit") in (
+        printed.stdout + printed.stderr
+    )
+    assert children() == 0
+    before = Path("count").stat().st_size
+    run(*options, "--retry-failed")
+    assert Path("count").stat().st_size > before
+
+
+def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
+    with_failures(wall, "1 / 0", limit=5)
+    told = ("settings failed, more than 10 %", "division by zero")
+    refused("study", "wall.toml", "--out", "results", message=(*told, "--retry-failed"))
+    printed = run("risk", "wall.toml", "--simulations", "1000", expect=2).stderr
+    assert all(part in printed for part in told)
+    with_failures(wall, "1 / 0", failed="stop")
+    refused("study", "wall.toml", "--out", "other", message=("division by zero",))
+    with pytest.raises(InputError, match="failed = 'skip' without a simulator"):
+        assemble(sv.load_study("rain", search={"failed": "skip"}))
+
+
+def test_a_pack_states_the_number_that_followed_from_time(
+    wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that `verify` asks the same on another machine; so does the command of each answer."""
+    run("study", "wall.toml", "--out", "results")
+    with monkeypatch.context() as patch:
+        patch.setattr("safevar_sumo.questions.price.LONGEST", 0.03)
+        run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 4000")
+        first = sv.risk("results")
+    assert re.search(r"risk results --simulations \d+$", first.command)
+    number = first.command.split()[-1]
+    again = sv.risk("results", simulations=int(number))
+    assert again.to_dict() == first.to_dict()
+    with ZipFile("pack.zip") as pack:
+        assert b" --simulations " in pack.read("1-wall/answers.json")
+    assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+
+
+def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
+    run("study", "wall.toml", "--out", "results")
+    manifest = Path("results/manifest.json")
+    manifest.write_text(manifest.read_text().replace(np.__version__, "1.0"))
+    refused("study", "wall.toml", "--out", "results", message=("version of numpy was '1.0'",))
+    stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
+    for libraries, matters in ([], False), (["numpy"], True):
+        (change,) = manifest_differences(stored, {**now, "libraries": libraries})
+        assert change[2] is matters
 
 
 @pytest.mark.slow
