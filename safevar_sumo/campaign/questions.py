@@ -8,6 +8,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
@@ -31,8 +32,9 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.share import MAX_SKIPPED
-from safevar_sumo.errors import UserCodeError
+from safevar_sumo.errors import UserCodeError, warn
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
+from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.records import Evaluations, FloatArray, differences
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names, without_skipping
@@ -40,7 +42,7 @@ from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.terminal import Progress
-from safevar_sumo.vehicles import VEHICLES, Vehicle
+from safevar_sumo.vehicles import VEHICLES, Vehicle, region_of
 
 if TYPE_CHECKING:
     from safevar_sumo.check import Finding
@@ -57,6 +59,8 @@ SMALL_PORTION = 256
 """That number where vehicles take turns or SUMO itself simulates, so that each costs time."""
 COMPILING = "compiling the vehicle model, for the first time"
 """The phase of progress in which one worker compiles, and no simulation has begun."""
+SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
+"""What is expected of a simulator in another process."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
@@ -85,7 +89,7 @@ def evaluate_all(
     use = _use_of(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
-        pool.inputs[packed_study] = manifest_now(study, system, use.modules)
+        pool.inputs[packed_study] = manifest_now(study, system, use.names)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -123,6 +127,20 @@ def evaluate_all(
             problem = f"search.failed = 'skip': {numbers}{reason}"
             raise UserCodeError(study.source, problem, "a simulator that fails less often")
     return evaluations.take(row_of.ravel())
+
+
+def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
+    """Forget what an interrupted command has simulated if the original vehicle, which has just been
+    simulated again, does otherwise than then.
+    """
+    use = _use_of(study, pool)
+    if cache := cache_of(study, use):
+        key = hashlib.sha256(b"original" + cache.key_of(study, use)).digest()
+        kept = evaluations_in(cache.get(key))
+        if kept is not None and [*differences(kept.results, original.results)]:
+            warn("does not continue: the simulator drives the original vehicle otherwise now")
+            cache.forget()
+        cache.put(key, content_of(original))
 
 
 def repeat_first_batches(study: Study, pool: Pool) -> None:
@@ -282,6 +300,45 @@ def check_code(study: Study, pool: Pool) -> Use:
     return use
 
 
+def repeat_elsewhere(study: Study, pool: Pool) -> None:
+    """Simulate three settings in two processes, in one of them with the points in another order.
+
+    Raises
+    ------
+    UserCodeError
+        If a result differs.
+    """
+    system = system_of(study)
+    rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
+    backwards = Selection(points=tuple(range(len(system.matrix)))[::-1])
+    jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
+    if pool.workers > 1:  # the second one has simulated nothing yet
+        here, there = carry_out(evaluate_settings, jobs, pool)
+    else:
+        (here,) = carry_out(evaluate_settings, jobs[:1], pool)
+        pool.close()  # its worker starts again
+        (there,) = carry_out(evaluate_settings, jobs[1:], pool)
+    for row, difference in differences(there.results, here.results):
+        command = reproduction_command(study, rows[row])
+        problem = f"{difference} in another process, or with points in another order"
+        raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
+
+
+def random_settings(study: Study, *shape: int) -> FloatArray:
+    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
+    region = region_of(study)
+    characteristics = region.characteristics
+    rng = np.random.default_rng(study.search.seed)
+
+    def draw(count: int) -> FloatArray:
+        return rng.uniform(
+            characteristics.lower, characteristics.upper, (count, len(characteristics))
+        )
+
+    drawn = region.draw_feasible(draw, math.prod(shape))
+    return np.resize(drawn, (*shape, len(characteristics)))
+
+
 def find_in_new_process(study: Study) -> list[Finding]:
     """What a simulator of the user's own returns otherwise in a new process, for the original and
     for both ends of the domains; nothing if the study says that it is not deterministic.
@@ -294,14 +351,13 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
     with open_pool(1) as pool:  # first, as a simulator may end its process
         (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(system, settings)
+    here = drive_and_score(replace(system, matrix=system.matrix[::-1]), settings)
     for row, difference in differences(here.results, there.results):
         from safevar_sumo.check import Finding  # slow to import, and rarely needed
 
         words = f"{difference} in a new process"
-        expected = "the same, to the bit; or repeats = N in [scenario]"
         command = reproduction_command(study, settings[row])
-        return [Finding("repetition", words, study.source, command, expected)]
+        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
     return []
 
 

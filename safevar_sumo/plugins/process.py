@@ -20,7 +20,7 @@ from uuid import uuid4
 import platformdirs
 
 from safevar_sumo.errors import INTERRUPTS
-from safevar_sumo.plugins.files import Files, digests, is_user_file, name_of_file
+from safevar_sumo.plugins.files import CACHE, Files, digests, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
 SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
@@ -155,6 +155,11 @@ class Use(NamedTuple):
     modules: Files
     opened: list[str]
 
+    @property
+    def names(self) -> list[str]:
+        """Names of all files."""
+        return [*self.modules, *self.opened]
+
 
 @contextmanager
 def record_use(folders: Sequence[str]) -> Iterator[Use]:
@@ -168,6 +173,7 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
         this_process.is_listening = True
 
     # What is loaded and opened in the block.
+    start = time.time()
     use = Use({}, [])
     before = set(sys.modules)
     opened = this_process.opened = set[str]()
@@ -195,6 +201,8 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
             name_of_file(Path(path), folders)
             for path in data
             if is_user_file(path)
+            and f"{os.sep}{CACHE}{os.sep}" not in path
+            and os.path.getmtime(path) < start  # else the code has written it
             and (path.startswith(tuple(own_folders)) or not path.startswith(not_the_users))
         )
     )
@@ -209,10 +217,10 @@ def file_of_module(name: str) -> str:
 
 
 def _listen(event: str, arguments: tuple[Any, ...]) -> None:
-    """Note a file that user code opens to read."""
-    if event != "open" or this_process.opened is None:
+    """Note a file or database that user code opens to read."""
+    if event not in ("open", "sqlite3.connect") or this_process.opened is None:
         return
-    path, mode, flags = arguments
+    path, mode, flags = arguments if event == "open" else (*arguments, "", 0)
     is_read = not (set(mode or "") & set("wax+") or (flags or 0) & WRITING)
     if is_read and isinstance(path, str | bytes) and _is_from_user_code():
         this_process.opened.add(os.path.abspath(os.fsdecode(path)))

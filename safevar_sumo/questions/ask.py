@@ -274,6 +274,7 @@ class Question:
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
         how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
+        how["as_it_is_now"] = as_it_is_now
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
@@ -304,12 +305,14 @@ class Question:
         simulations: int | None = None,
         progress: bool | Progress = False,
         called: str = "",
+        as_it_is_now: bool = False,
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
         options. The command that comes next is about the first subject as it is `called`. The
         answer's own command is the end of its command line: how many simulations it may do.
         """
         from safevar_sumo.questions.answer import Answer
+        from safevar_sumo.questions.case import Case
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
         from safevar_sumo.questions.measure import subject_by
 
@@ -319,6 +322,9 @@ class Question:
             account = evaluator.account
             account.asked = account.most = simulations
             account.is_question = True
+            for subject in subjects:
+                if isinstance(subject, Case) and not as_it_is_now:
+                    evaluator.for_study(subject.study).refuse_other_original(subject)
             option = next((one.name for one in self.options if one.metavar == CRITERION), "")
             criterion = values.get(option)
             cites = ""

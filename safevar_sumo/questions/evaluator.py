@@ -8,11 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+    system_of,
+)
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import (
     ask_why_no_verdict,
@@ -33,6 +42,7 @@ from safevar_sumo.questions.price import (
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
+from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.measuring import criterion_of
 from safevar_sumo.sumo.system import System, assemble
@@ -318,6 +328,19 @@ class Evaluator:
                 f" {evaluations.outcome[0]}"
             )
         return evaluations
+
+    def refuse_other_original(self, case: Case) -> None:
+        """Refuse results whose simulator drives the original vehicle otherwise now; one that is not
+        deterministic, and results of a single point, tell nothing.
+        """
+        study = case.study
+        if not case.has_runs or study.scenario.repeats > 1 or study.origin.point:
+            return
+        if self.system.has_simulator:
+            jobs = [(Task(study=study), self.characteristics.original_settings)]
+            self.account.spend(self._each)
+            now = record(carry_out(evaluate_settings, jobs, self._pool)[0], 0)  # nothing kept
+            refuse_other_original(Path(case.name), case.original, now)
 
     @cached_property
     def no_verdict(self) -> str:

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.questions import forget_other
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.study import Study
@@ -118,15 +119,19 @@ def round_down(number: float) -> int:
 
 def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
     """How long a simulation takes, by all workers together [s], from the original vehicle, which is
-    simulated `MEASURED` times; None where it takes milliseconds, as in SUMO.
+    simulated `MEASURED` times, and must do what it did when an interrupted command began; None
+    where it takes milliseconds, as in SUMO.
     """
     if not system.has_simulator:
         return None
     jobs = [(Task(study=study), CharacteristicSet.of(study).original_settings)]
     carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
     start = time.perf_counter()
-    carry_out(evaluate_settings, jobs, pool)
-    return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(system))
+    (original,) = carry_out(evaluate_settings, jobs, pool)
+    seconds = time.perf_counter() - start
+    if system.repeats == 1 and not original.failed[0]:
+        forget_other(study, pool, original)
+    return seconds / (pool.workers * simulations_of_setting(system))
 
 
 def simulations_of_setting(system: System) -> int:

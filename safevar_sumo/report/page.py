@@ -149,7 +149,8 @@ def report(
             name = f"question {next(numbers)} of {len(texts)}, {question.split()[0]}"
             show_part = parts.begin(name)
             answer = answer_to if is_asked else answer_or_reason
-            return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
+            about = subjects[chosen], paths[chosen], point
+            return answer(question, *about, jobs, show_part, as_it_is_now)
 
         # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
@@ -218,6 +219,7 @@ def answer_to(
     point: str | None,
     jobs: int | None,
     progress: Progress,
+    as_it_is_now: bool = False,
 ) -> Answer:
     """The answer to a question about results.
 
@@ -232,7 +234,8 @@ def answer_to(
         raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
     simulations = values.pop(SIMULATIONS.name, None)
     command = question.command_line([str(directory) for directory in directories], point, values)
-    answer = question.answer(cases, values, simulations=simulations, jobs=jobs, progress=progress)
+    how: JsonObject = {"simulations": simulations, "jobs": jobs, "as_it_is_now": as_it_is_now}
+    answer = question.answer(cases, values, **how, progress=progress)
     return replace(answer, command=command + answer.command)
 
 

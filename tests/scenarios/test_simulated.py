@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import os
 import re
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from zipfile import ZipFile
@@ -15,16 +17,19 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.campaign.cache import Cache, keep_simulations
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.plugins import Use
+from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import manifest_differences
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import json_of, refused, run
+from tests.in_process import InlinePool, json_of, refused, run
 
 MODELS = """
 from dataclasses import dataclass
@@ -728,6 +733,122 @@ def test_a_pack_states_the_number_that_followed_from_time(
     with ZipFile("pack.zip") as pack:
         assert b" --simulations " in pack.read("1-wall/answers.json")
     assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+
+
+READS = """
+import importlib
+import os
+import sqlite3
+import sys
+
+from models import Wall
+
+
+class Reads(Wall):
+    def simulate(self, setting):
+        factor = READ
+        result = super().simulate(setting)
+        log = open("own.log", "w").write("written") and open("own.log").read()
+        return {**result, "separation": result["separation"] * factor}
+"""
+"""Files that Python opens, and one that it does not."""
+BY = {
+    "opened": "float(open('data.txt').read())",
+    "sqlite3": "sqlite3.connect('data.db').execute('select x from t').fetchone()[0]",
+    "elsewhere": "float(os.popen('cat data.txt').read())",
+}
+
+
+def with_data(wall: Path, how: str, value: float) -> None:
+    (wall.parent / "reads.py").write_text(READS.replace("READ", BY[how], 1))
+    wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+    (wall.parent / "data.txt").write_text(f"{value}")
+    (wall.parent / "data.db").unlink(missing_ok=True)
+    with closing(sqlite3.connect(wall.parent / "data.db")) as database:
+        database.execute("create table t (x)")
+        database.execute("insert into t values (?)", (value,))
+        database.commit()
+
+
+@pytest.mark.parametrize("how", BY)
+def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
+    """Neither by `study`, nor by a question; what the simulator has written itself is no input."""
+    with_data(wall, how, 1.0)
+    run("study", "wall.toml", "--out", "results", "--runs", "1")
+    files = sv.load("results").directory / "manifest.json"
+    named = {"opened": "data.txt", "sqlite3": "data.db", "elsewhere": ""}[how]
+    assert named in files.read_text()
+    assert "own.log" not in files.read_text()
+    run("study", "wall.toml", "--out", "results")
+    run("risk", "results", "--simulations", "50")
+    with_data(wall, how, 1.1)
+    told = f"{named} has changed since" if named else "the original vehicle had"
+    refused("study", "wall.toml", "--out", "results", message=(told,))
+    refused("risk", "results", "--simulations", "50", message=(told,))
+    run("risk", "results", "--simulations", "50", "--as-it-is-now")
+    study = sv.load_study(str(wall))
+    keys = set()
+    for value in (1.0, 1.1):
+        with_data(wall, how, value)
+        use = Use({}, [named] if named else [])
+        keys.add(Cache(wall.parent / f"{value}").key_of(study, use))
+    assert len(keys) == (2 if named else 1)
+
+
+def test_an_interrupted_question_of_another_simulator_begins_anew(
+    wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here a file that Python does not open."""
+    monkeypatch.setenv("SAFEVAR_CACHE", str(wall.parent / "cache"))
+
+    def ask() -> float:
+        with keep_simulations("risk"), open_evaluator(sv.load_study(str(wall)), InlinePool()) as it:
+            it.account.is_question = True
+            it.plan({"all": 1})
+            found = it.evaluate(np.array([[8.0, 0.0], [4.0, 0.0]]), "all")
+            if stops:
+                raise KeyboardInterrupt
+            return float(found.f_safe[0])
+
+    with_data(wall, "elsewhere", 1.0)
+    stops = True
+    with pytest.raises(KeyboardInterrupt):
+        ask()
+    with_data(wall, "elsewhere", 1.1)
+    stops = False
+    with pytest.warns(UserWarning, match="does not continue: the simulator"):
+        changed = ask()
+    with_data(wall, "elsewhere", 1.0)
+    assert changed == pytest.approx(1.1 * ask())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int) -> None:
+    """A hash of a text is the same in all workers, a process's number is not."""
+    options = ("study", "wall.toml", "--out", f"results-{jobs}", "--jobs", f"{jobs}")
+    for value in ("1 + hash('a') % 7", "1 + os.getpid() % 997"):
+        (wall.parent / "reads.py").write_text(READS.replace("READ", value, 1))
+        wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+        if "pid" in value:
+            refused(*options[:3], "other", *options[4:], message=("in another process",))
+        else:
+            run(*options)
+            assert "in a new process" in run("check", "wall.toml", expect=1).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
+    """Here an object that is put into the simulator in its first run."""
+    lazy = "getattr(self, 'road', None) or type('Road', (), {'length': self.gap})()"
+    text = READS.replace("READ", f"(self.__dict__.setdefault('road', {lazy})).length / 40", 1)
+    (wall.parent / "reads.py").write_text(text)
+    tests = '\n[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
+    wall.write_text(STUDY.replace("models:Wall", "reads:Reads") + tests)
+    assert "in a new process" in run("check", "wall.toml", expect=1).stdout
+    refused("study", "wall.toml", "--out", "results", message=("points in another order",))
 
 
 def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
