@@ -68,6 +68,9 @@ class Pool:
         Names of the vehicle models that workers find compiled.
     simulated, failed
         Number of settings that questions have had, of studies that skip those that fail.
+    checked, most
+        Number of simulations of the last check of user code; the largest number of a question in a
+        simulator of the user's own, as far as it is stated.
     attempts
         The folder in which workers note the settings that may be skipped while they simulate them.
     """
@@ -81,7 +84,8 @@ class Pool:
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
         self.attempts: Path | None = None
-        self.simulated = self.failed = 0
+        self.simulated = self.failed = self.checked = 0
+        self.most: int | None = None
 
     def map(
         self,
@@ -145,9 +149,12 @@ class Pool:
         files = self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
         return sum(file.stat().st_size > MAX_DEATHS for file in files)
 
-    def everywhere(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Carry out a function in each worker that has started and lives."""
-        futures = [self._begin(place, function, arguments) for place in [*self._started]]
+    def everywhere(
+        self, function: Callable[..., Any], *arguments: Any, most: int | None = None
+    ) -> None:
+        """Carry out a function in each worker that has started and lives, or in so many of them."""
+        places = [*self._started][:most]
+        futures = [self._begin(place, function, arguments) for place in places]
         for future in futures:
             future.result()
 

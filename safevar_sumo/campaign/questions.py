@@ -41,6 +41,7 @@ from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo import is_recorded, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.simulators import number_simulated, simulations_of_setting
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle, region_of
 
@@ -66,6 +67,16 @@ ECONOMICAL_FRACTION = 1 / 4
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
 twice. Where each vehicle takes a turn of its own, they make one for each worker.
 """
+
+
+def of_check(most: int) -> int:
+    """How many of the allowed simulations the check of a simulator's class may take."""
+    return most // 10
+
+
+def of_repeats(most: int) -> int:
+    """How many of them may repeat the first batches of workers."""
+    return min(most // 10, 5)
 
 
 def evaluate_all(
@@ -148,7 +159,16 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     of `repeat_first_batch`.
     """
     if user_code_names(study):
-        pool.everywhere(repeat_first_batch, study)
+        each = simulations_of_setting(system_of(study))
+        most = None if pool.most is None else of_repeats(pool.most) // each
+        pool.everywhere(repeat_first_batch, study, most=most)
+
+
+def check_simulator(study: Study, pool: Pool) -> None:
+    """Check the class of a simulator of the user's own, as `check_code` does, unless the pool has
+    checked it.
+    """
+    _use_of(study, pool)
 
 
 def _use_of(study: Study, pool: Pool) -> Use:
@@ -278,7 +298,8 @@ def _why_no_verdict(task: Task) -> str:
 
 def check_code(study: Study, pool: Pool) -> Use:
     """Check the user code of a study in a worker, unless it has passed before with the same files;
-    returns what it used there.
+    returns what it used there. Where the number of simulations is limited, the check takes at most
+    a tenth of them.
 
     Raises
     ------
@@ -293,7 +314,11 @@ def check_code(study: Study, pool: Pool) -> Use:
         known = msgspec.json.decode(marker.read_bytes(), type=Use)
         if known.modules == digests_by_name(known.modules, study.origin.places):
             return known
-    use: Use = carry_out(_refuse_defects, [(Task(study=study),)], pool)[0]
+    job = Task(study=study), None if pool.most is None else of_check(pool.most)
+    use: Use
+    ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
+    if pool.most is not None:
+        return use
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_bytes(msgspec.json.encode(use))
@@ -361,10 +386,12 @@ def find_in_new_process(study: Study) -> list[Finding]:
     return []
 
 
-def _refuse_defects(task: Task) -> Use:
+def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
+    """What user code uses in its check, and the number of simulations in a simulator."""
     from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
 
     unload_user_modules()
+    before = number_simulated()
     with record_use(task.study.origin.places) as use:
-        refuse_defects(task.study)
-    return use
+        refuse_defects(task.study, most)
+    return use, number_simulated() - before

@@ -124,15 +124,15 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     return [Finding("original", words, where, point, "an original vehicle that is safe")]
 
 
-def refuse_defects(study: Study) -> None:
-    """Check the user code that a study names.
+def refuse_defects(study: Study, most: int | None = None) -> None:
+    """Check the user code that a study names, with at most so many simulations.
 
     Raises
     ------
     UserCodeError
         With the first defect, the input that shows it, file and line, and advice.
     """
-    for finding in find_defects(study):
+    for finding in find_defects(study, most=most):
         command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
         problem = f"{finding}; to reproduce it: {command}"
         raise UserCodeError(
@@ -148,7 +148,7 @@ def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
     yield from _first_defect(study, simulated, try_simulations(study, **how))
-    for key, name in names:
+    for key, name in names if how.get("most") is None else []:
         if key == "search.algorithms":
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 

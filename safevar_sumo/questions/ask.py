@@ -320,8 +320,7 @@ class Question:
         study = study_in(subjects[0])
         with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
             account = evaluator.account
-            account.asked = account.most = simulations
-            account.is_question = True
+            evaluator.limit(simulations)
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)

@@ -25,6 +25,7 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.questions import (
     ask_why_no_verdict,
+    check_simulator,
     compile_vehicle,
     evaluate_all,
     repeat_first_batches,
@@ -33,18 +34,14 @@ from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.price import (
-    MEASURED,
-    Account,
-    seconds_of_simulation,
-    simulations_of_setting,
-)
+from safevar_sumo.questions.price import MEASURED, Account, seconds_of_simulation
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.measuring import criterion_of
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
@@ -133,9 +130,12 @@ class Evaluator:
         """
         expected = sum(settings.values())
         if self.account.is_question:
-            self.account.require((least + MEASURED * self.system.has_simulator) * self._each)
+            has_simulator = self.system.has_simulator
+            self.account.require((least + MEASURED * has_simulator) * self._each, has_simulator)
+            if has_simulator:
+                check_simulator(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
-            self.account.open(expected * self._each, seconds)
+            self.account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:
                 self.account.spend(MEASURED * self._each)
         share = 1.0 if self.left is None else self.left / expected
@@ -147,6 +147,13 @@ class Evaluator:
         """The number of settings that may follow; None without a limit."""
         account = self.account
         return None if account.most is None else int(account.left) // self._each
+
+    def limit(self, simulations: int | None) -> None:
+        """Let the question do so many simulations, with those that check a simulator's class."""
+        self.account.asked = self.account.most = simulations
+        self.account.is_question = True
+        self._pool.most = simulations if self.system.has_simulator else None
+        self._pool.checked = 0
 
     def at_most(self, number: int, part: int = 1) -> int:
         """A number of settings; where few simulations are allowed, at most this part of those that

@@ -91,6 +91,7 @@ class _Kept:
     def __init__(self) -> None:
         self._last = dict[str, Simulator]()
         self._handles = dict[str, tuple[int, type[Simulator], Any]]()
+        self.simulated = 0
 
     def at(self, scenario: Simulator) -> Simulator:
         """An object as `scenario` was when it was created with its fields, with the handle of its
@@ -153,6 +154,11 @@ _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
 
 
+def number_simulated() -> int:
+    """How often this process has simulated in simulators of the user's own."""
+    return _kept.simulated
+
+
 @atexit.register
 def close_simulator() -> None:
     """End the simulators of this process, also where one fails to end."""
@@ -184,6 +190,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
         ):
             with _end_worker():
                 simulator = _kept.at(scenario)
+                _kept.simulated += 1
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
             if TIME in result:
                 _check_step(simulator, result[TIME], point.name)
@@ -191,6 +198,14 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
                 _check_names(scenario, result, system)
         results.append(result)
     return _runs_of(results, system, point.allowed_impact_speed)
+
+
+def simulations_of_setting(system: System) -> int:
+    """How many simulations a setting takes: at each point, as often as it is repeated, and beside
+    the original vehicle in a study that searches its scenario.
+    """
+    has_pairs = len(system.characteristics.scenario) > 0
+    return len(system.points) * system.repeats * (1 + has_pairs)
 
 
 @contextmanager

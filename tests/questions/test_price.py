@@ -147,8 +147,57 @@ def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
 
 
 def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
-    with pytest.raises(InputError, match="few simulations"):
-        sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=InlinePool())
+    """They are the limits of the others, or a vehicle within them is unsafe."""
+    pool = InlinePool()
+    answer = sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=pool)
+    limits = answer.tables["limits"].set_index("characteristic")
+    assert limits.loc["decel", ["together_low", "together_high"]].tolist() == [5, 9]
+    assert keeps(5, limits.loc["delay", "together_high"], 0.3)
+    assert not keeps(5, limits.loc["delay", "together_high"] + 0.1, 0.3)
+    assert answer.numbers["kept"] is None
+    assert answer.failures == ("few simulations call no limit kept",)
+    answer = sv.tolerance(rig, limits=["decel >= 3.2"], simulations=500, pool=pool)
+    assert answer.numbers["kept"] is False
+    assert answer.failures == ("limit of decel",)
+    assert "The specified limits do not hold" in answer.verdict
+
+
+COUNTED = """
+from models import Rig
+
+
+class Counted(Rig):
+    def simulate(self, setting):
+        open("count", "a").write("x")
+        return super().simulate(setting)
+"""
+
+
+@pytest.mark.parametrize("number", [10, 40, 300])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("question", ["risk", "rules", "tolerance --limits decel>=5", "explain"])
+def test_a_number_is_that_of_all_simulations_of_an_edited_class(
+    rig: str, question: str, number: int, jobs: int, request: pytest.FixtureRequest
+) -> None:
+    """With the check of the class, which is shorter, and what is repeated."""
+    if jobs > 1:
+        request.getfixturevalue("worker_processes")
+    Path("counted.py").write_text(f"{COUNTED}# {question} {number} {jobs}")
+    Path(rig).write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    name, *options = question.split()
+    command = (name, rig, *options, "--simulations", f"{number}", "--jobs", f"{jobs}", "--fresh")
+    output = run(*command, expect=None)
+    if "do not suffice: an answer takes at least" in output.stderr:
+        assert number < 100
+        assert not Path("count").exists()
+        return
+    assert number / 3 <= Path("count").stat().st_size <= number, output.stderr
+    if number == 300:
+        assert "30 for a check of the class, which is shorter" in output.stderr or (
+            re.search(r"with 2\d for a check of the class, which is shorter", output.stderr)
+        )
+        first = output.stdout
+        assert run(*command, expect=None).stdout == first
 
 
 def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig: str) -> None:

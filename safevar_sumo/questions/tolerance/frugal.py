@@ -4,6 +4,7 @@ for counterexamples in it with what is left. The answer is rough.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,8 +23,10 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.limits import OF_BOX
 from safevar_sumo.questions.tolerance.rows import LIMITS, LIMITS_TITLE, NOWHERE
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import change_texts, join_phrases, number_of
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
+from safevar_sumo.study import Limit
+from safevar_sumo.vehicles.characteristics import Characteristic
 
 STAGE = "limits with few simulations"
 PARTS = (4, 4)
@@ -44,21 +47,36 @@ class _Search:
         The ends of its sides, shape (n,).
     corners, tried
         Numbers of corners, and of other vehicles, that were safe in the box as it is now.
+    broken
+        A vehicle within the specified limits that is unsafe by what they allow alone, shape (n,);
+        None as long as none is known.
     """
 
     model: Model
     columns: list[int]
+    limits: Mapping[str, Limit]
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
     corners: int = 0
     tried: int = 0
+    broken: FloatArray | None = None
 
     def __post_init__(self) -> None:
         members = self.model.characteristics
+        self.is_fixed = np.isin(members.names, [*self.limits])
         varies = ~members.of_vehicle
         varies[self.columns] = True
         self.low = np.where(varies, members.lower, members.original)
         self.high = np.where(varies, members.upper, members.original)
+        for column, item in enumerate(members):
+            if item.name in self.limits:
+                self.low[column], self.high[column] = self.interval(item)
+
+    def interval(self, item: Characteristic) -> tuple[float, float]:
+        """The values that a specified limit allows."""
+        limit = self.limits[item.name]
+        low = item.lower if limit.at_least is None else limit.at_least
+        return low, item.upper if limit.at_most is None else limit.at_most
 
     @property
     def box(self) -> Box:
@@ -66,8 +84,8 @@ class _Search:
 
     @property
     def left(self) -> int:
-        """Settings that may still be simulated."""
-        return self.model.evaluator.left or 0
+        """Settings that may still be simulated, none once a specified limit is broken."""
+        return 0 if self.broken is not None else self.model.evaluator.left or 0
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         return self.model.are_unsafe(settings, STAGE)
@@ -113,7 +131,9 @@ class _Search:
         if not len(failures):
             return
         found = find_boundaries(starts, failures, self.are_unsafe, PARTS)
-        changes = (failures != starts) & members.of_vehicle
+        changes = (failures != starts) & members.of_vehicle & ~self.is_fixed
+        if (broken := failures[~changes.any(axis=1)]).size:
+            self.broken = broken[0]
         for safe, start, is_changed in zip(found.safe, starts, changes, strict=True):
             for column in np.flatnonzero(is_changed):
                 lower, upper = sorted((safe[column], start[column]))
@@ -161,7 +181,7 @@ def answer_roughly(asked: Asked) -> Answer:
     """The answer with as many simulations as are allowed, in the study's own parameter set."""
     evaluator = asked.evaluator
     members = evaluator.characteristics
-    search = _Search(Model(0, evaluator, asked.unsafe), asked.columns)
+    search = _Search(Model(0, evaluator, asked.unsafe), asked.columns, asked.limits)
     seed = evaluator.seed
     search.limit_alone()
     alone = search.low.copy(), search.high.copy()
@@ -177,7 +197,11 @@ def answer_roughly(asked: Asked) -> Answer:
         if column in asked.columns:
             ends = NOWHERE if together is None else tuple(float(one[column]) for one in together)
             limit = NOWHERE if has_encounters else tuple(float(one[column]) for one in alone)
-            known = (item.name, item.unit, item.original, *limit, *ends)
+            specified, kept = NOWHERE, None
+            if item.name in asked.limits:
+                specified = search.interval(item)
+                kept = False if search.broken is not None else None
+            known = (item.name, item.unit, item.original, *limit, *ends, *specified, kept)
             rows.append((*known, *[None] * (len(LIMITS) - len(known))))
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
@@ -190,7 +214,8 @@ def answer_roughly(asked: Asked) -> Answer:
             f"{number_of(search.corners, 'corner')} and {search.tried:,} vehicles in search of a"
             f" counterexample. {AT_ONE_PHASE}"
         ),
-        numbers={**_numbers(asked), "scope": scope_of(evaluator.study, between=False)},
+        failures=_failures(search),
+        numbers={**_numbers(asked, search), "scope": scope_of(evaluator.study, between=False)},
         tables={"limits": limits},
         draw=draw_bars,
     )
@@ -200,7 +225,10 @@ def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: b
     """What was found, and which characteristics can make the vehicle unsafe on their own."""
     members = search.model.characteristics
     words = "No vehicle that was tried within the joint limits is unsafe."
-    if not is_tested:
+    if search.broken is not None:
+        named = ", ".join(change_texts(members.vehicle, members.named(search.broken)))
+        words = f"The specified limits do not hold: a vehicle within them is unsafe ({named})."
+    elif not is_tested:
         words = "The simulations did not suffice to try vehicles within the joint limits."
     is_closer = (alone[0] > members.lower) | (alone[1] < members.upper)
     names = [item.name for item, fails in zip(members, is_closer, strict=True) if fails]
@@ -208,7 +236,16 @@ def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: b
     return f"{words} {join_phrases(names)} can make it unsafe alone." if names else words
 
 
-def _numbers(asked: Asked) -> JsonObject:
+def _failures(search: _Search) -> tuple[str, ...]:
+    """Why specified limits are not called kept."""
+    if search.broken is not None:
+        return tuple(f"limit of {name}" for name in search.limits)
+    return ("few simulations call no limit kept",) if search.limits else ()
+
+
+def _numbers(asked: Asked, search: _Search) -> JsonObject:
     numbers: dict[str, Any] = {"unsafe": str(asked.unsafe), "margin": asked.unsafe.keep}
-    numbers |= {"kept": None, "rough": True, "up_to": None, "boxes": 0}
+    up_to = None if asked.up_to is None else float(asked.up_to.partition("=")[2])
+    kept = None if search.broken is None else False
+    numbers |= {"kept": kept, "rough": True, "up_to": up_to, "boxes": 0}
     return {**dict.fromkeys(OF_BOX), **numbers}
