@@ -338,6 +338,12 @@ def _digest(key: bytes, content: bytes) -> bytes:
     return sha256(key + content).digest()
 
 
+def package_digest() -> str:
+    """A digest of the version of Python and of this package's files."""
+    python, _, files = _environment()
+    return sha256(msgspec.json.encode([python, files])).hexdigest()
+
+
 @lru_cache(maxsize=1)
 def _environment() -> Any:
     """The versions of Python and of all installed distributions, and the digests of this package's

@@ -71,6 +71,8 @@ class Pool:
     checked, most
         Number of simulations of the last check of user code; the largest number of a question in a
         simulator of the user's own, as far as it is stated.
+    on_cluster
+        Carries out a function in each worker of a cluster; None for processes of this machine.
     attempts
         The folder in which workers note the settings that may be skipped while they simulate them.
     """
@@ -86,6 +88,7 @@ class Pool:
         self.attempts: Path | None = None
         self.simulated = self.failed = self.checked = 0
         self.most: int | None = None
+        self.on_cluster: Callable[..., None] | None = None
 
     def map(
         self,
@@ -203,5 +206,6 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
         else:
             client = stack.enter_context(dask.connect(cluster))
             pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))
+            pool.on_cluster = lambda *job: dask.everywhere(client, *job)
         stack.callback(pool.close)
         yield pool

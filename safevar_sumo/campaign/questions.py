@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+import platform
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +17,13 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.cache import cache_of, content_of, evaluations_in, key_of_settings
+from safevar_sumo.campaign.cache import (
+    cache_of,
+    content_of,
+    evaluations_in,
+    key_of_settings,
+    package_digest,
+)
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -32,10 +39,10 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.campaign.share import MAX_SKIPPED
-from safevar_sumo.errors import UserCodeError, warn
+from safevar_sumo.errors import InputError, UserCodeError, warn
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
 from safevar_sumo.plugins.process import REPRODUCED_BY
-from safevar_sumo.records import Evaluations, FloatArray, differences
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo import is_recorded, settings_per_batch
@@ -67,6 +74,22 @@ ECONOMICAL_FRACTION = 1 / 4
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
 twice. Where each vehicle takes a turn of its own, they make one for each worker.
 """
+
+
+def refuse_other_worker(study: Study, manifest: JsonObject, package: str) -> None:
+    """Refuse a worker of a cluster that has other versions, files of the study, or code of this
+    package.
+    """
+    refuse_changed_inputs(study, system_of(study), manifest)
+    if package != package_digest():
+        problem = f"a worker on {platform.node()} has other code of safevar_sumo, or another Python"
+        raise InputError("cluster", problem, "the same installation everywhere")
+
+
+def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None:
+    if pool.on_cluster is not None:
+        manifest = manifest_now(study, system_of(study), used)
+        pool.on_cluster(refuse_other_worker, study, manifest, package_digest())
 
 
 def of_check(most: int) -> int:
@@ -101,6 +124,7 @@ def evaluate_all(
     system = system_of(study)
     if packed_study not in pool.inputs:
         pool.inputs[packed_study] = manifest_now(study, system, use.names)
+        _refuse_other_workers(study, use.names, pool)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -179,6 +203,7 @@ def _use_of(study: Study, pool: Pool) -> Use:
     for (known, folders), use in pool.uses.items():
         if names <= known and folders == places:
             return use
+    _refuse_other_workers(study, [], pool)
     pool.uses[names, places] = use = check_code(study, pool)
     return use
 

@@ -88,6 +88,8 @@ PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
+Cluster = Annotated[str | None, "ADDRESS"]
+"""The address of a Dask scheduler."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
@@ -100,6 +102,7 @@ Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
+    ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
     (
         *("simulations", Simulations, None),
         (
@@ -244,6 +247,7 @@ class Question:
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
+        cluster: str | None = None,
         simulations: int | None = None,
         pool: Pool | None = None,
         progress: bool | Progress = False,
@@ -274,7 +278,7 @@ class Question:
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
         how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
-        how["as_it_is_now"] = as_it_is_now
+        how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
@@ -302,6 +306,7 @@ class Question:
         *,
         pool: Pool | None = None,
         jobs: int | None = None,
+        cluster: str | None = None,
         simulations: int | None = None,
         progress: bool | Progress = False,
         called: str = "",
@@ -318,7 +323,10 @@ class Question:
 
         # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])
-        with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
+        with (
+            open_progress(progress) as show,
+            open_evaluator(study, pool, jobs, show, cluster) as evaluator,
+        ):
             account = evaluator.account
             evaluator.limit(simulations)
             for subject in subjects:

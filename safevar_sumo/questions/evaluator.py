@@ -426,9 +426,10 @@ def open_evaluator(
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: Progress = show_no_progress,
+    cluster: str | None = None,
 ) -> Iterator[Evaluator]:
     """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by
-    default one for each core.
+    default one for each core, or on the workers of a cluster at an address.
 
     Raises
     ------
@@ -439,5 +440,5 @@ def open_evaluator(
         yield Evaluator(study, pool, progress)
         return
     assemble(study)  # before workers start
-    with open_pool(jobs) as new_pool, open_evaluator(study, new_pool, None, progress) as evaluator:
-        yield evaluator
+    with open_pool(jobs, cluster) as new_pool:
+        yield Evaluator(study, new_pool, progress)

@@ -104,12 +104,14 @@ class Packed:
         places: Sequence[str],
         jobs: int | None,
         progress: Progress,
+        cluster: str | None = None,
     ) -> None:
         # The study as its manifest says, and its claims.
         self.packed = packed
         self.files = files
         self._places = places
         self._jobs = jobs
+        self._cluster = cluster
         self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
@@ -182,7 +184,8 @@ class Packed:
         """
         if self.case.scoring != assemble(self.case.study).measuring.scoring:
             raise InputError(MANIFEST, "scoring is not that of the study", PACK)
-        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
+        how = self._jobs, self._progress, self._cluster
+        (case,) = cases_by([self.case], self.packed.unsafe, *how)
         return case
 
     def answer(self, text: str) -> Answer:
@@ -202,7 +205,9 @@ class Packed:
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
                 if most := self.packed.simulations.get(text):
                     placed = f"{placed} {SIMULATIONS.flag} {most}"
-                answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
+                asked = partial(ask, cluster=self._cluster)
+                where = [self._directory], None, self._jobs, self._progress
+                answer = asked(placed, [case], *where)
             command = answer.command.replace(f"{folder}/", "")
             self._answers[text] = replace(answer, command=command)
         return self._answers[text]

@@ -17,13 +17,14 @@ from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion, Jobs, parse_question, with_criterion
+from safevar_sumo.questions.ask import Cluster, Criterion, Jobs, parse_question, with_criterion
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import number_of
+from safevar_sumo.records import JsonObject
 from safevar_sumo.report.claims import (
     ANSWERS,
     CANNOT,
@@ -73,6 +74,7 @@ def evidence(
     ask: tuple[str, ...] = (),
     unsafe: Criterion = None,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     progress: bool | Progress = False,
     fresh: bool = False,
 ) -> str:
@@ -96,6 +98,8 @@ def evidence(
         metric such as "drac > 6".
     jobs
         Number of worker processes, by default one for each core.
+    cluster
+        Compute on the workers of this Dask scheduler instead.
     progress
         True for a bar on the terminal, or a function of a phase, the number of simulations done,
         and their total.
@@ -122,7 +126,8 @@ def evidence(
     files = dict[str, bytes]()
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
+            how: JsonObject = {"jobs": jobs, "cluster": cluster}
+            described, own_files = _pack_study(number, directory, ask, unsafe, how, show)
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -134,7 +139,7 @@ def _pack_study(
     directory: Path,
     ask: Sequence[str],
     unsafe: str | None,
-    jobs: int | None,
+    how: JsonObject,
     progress: Progress,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
@@ -150,7 +155,7 @@ def _pack_study(
     manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
 
     # The questions, by the criterion that the user gave.
-    (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
+    (shown,) = cases_by([case], unsafe, progress=show_no_progress, **how)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
     questions, lists = _with_lists(list(dict.fromkeys(asked)))
     folder = f"{number}-{study.name}"
@@ -163,7 +168,7 @@ def _pack_study(
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
     show_part = Parts(progress).begin(study.name)
-    packed = Packed(described, files, study.origin.places, jobs, show_part)
+    packed = Packed(described, files, study.origin.places, how["jobs"], show_part, how["cluster"])
     answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
     files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
     return msgspec.structs.replace(described, simulations=packed.simulations()), files

@@ -23,6 +23,7 @@ from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import (
     SIMULATIONS,
+    Cluster,
     Criterion,
     Jobs,
     has_criterion,
@@ -67,6 +68,7 @@ def report(
     unsafe: Criterion = None,
     point: str | None = None,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
     fresh: bool = False,
@@ -93,6 +95,8 @@ def report(
         Only this point of the study's matrix.
     jobs
         Number of worker processes, by default one for each core.
+    cluster
+        Compute on the workers of this Dask scheduler instead.
     progress
         True for a bar on the terminal, or a function of a phase, the number of simulations done,
         and their total.
@@ -134,7 +138,7 @@ def report(
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     command = f"report {paths} {point} {ask} {unsafe} {quick}"
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
-        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
+        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
         texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
@@ -150,7 +154,7 @@ def report(
             show_part = parts.begin(name)
             answer = answer_to if is_asked else answer_or_reason
             about = subjects[chosen], paths[chosen], point
-            return answer(question, *about, jobs, show_part, as_it_is_now)
+            return answer(question, *about, jobs, show_part, as_it_is_now, cluster)
 
         # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
@@ -220,6 +224,7 @@ def answer_to(
     jobs: int | None,
     progress: Progress,
     as_it_is_now: bool = False,
+    cluster: str | None = None,
 ) -> Answer:
     """The answer to a question about results.
 
@@ -235,14 +240,15 @@ def answer_to(
     simulations = values.pop(SIMULATIONS.name, None)
     command = question.command_line([str(directory) for directory in directories], point, values)
     how: JsonObject = {"simulations": simulations, "jobs": jobs, "as_it_is_now": as_it_is_now}
+    how["cluster"] = cluster
     answer = question.answer(cases, values, **how, progress=progress)
     return replace(answer, command=command + answer.command)
 
 
-def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any) -> Answer:
+def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any, **how: Any) -> Answer:
     """As `answer_to`, but if a question that nobody asked for has no answer, the reason."""
     try:
-        return answer_to(text, cases, *arguments)
+        return answer_to(text, cases, *arguments, **how)
     except InputError as error:
         name, study = text.partition(" ")[0], cases[0].study
         verdict = f"No answer: {error.problem}; expected: {error.legal}."
