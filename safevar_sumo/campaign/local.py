@@ -53,6 +53,7 @@ class ProcessWorker:
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
+        _close_simulators()  # of this process, which have the number of a worker, too
         context = multiprocessing.get_context("spawn")
         self._mark = uuid4().hex  # of its child processes, too
         arguments = (ImportPath.here(), last_words, self._mark)
@@ -125,9 +126,13 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
 
 def _end_in_order(*_: object) -> None:
     """End the simulator of this process, and the process."""
+    _close_simulators()
+    os._exit(1)
+
+
+def _close_simulators() -> None:
     if simulators := sys.modules.get("safevar_sumo.sumo.simulators"):
         simulators.close_simulator()
-    os._exit(1)
 
 
 def _end_with_caller() -> None:

@@ -22,7 +22,7 @@ from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import Use
 from safevar_sumo.plugins.process import MAX_DEATHS
-from safevar_sumo.records import JsonObject
+from safevar_sumo.records import Evaluations, JsonObject
 
 Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
@@ -71,6 +71,9 @@ class Pool:
     checked, most
         Number of simulations of the last check of user code; the largest number of a question in a
         simulator of the user's own, as far as it is stated.
+    shared
+        What the questions of a page have simulated: evaluations by setting, of each study and
+        selection; None if questions do not share it.
     on_cluster
         Carries out a function in each worker of a cluster; None for processes of this machine.
     attempts
@@ -88,6 +91,7 @@ class Pool:
         self.attempts: Path | None = None
         self.simulated = self.failed = self.checked = 0
         self.most: int | None = None
+        self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
         self.on_cluster: Callable[..., None] | None = None
 
     def map(

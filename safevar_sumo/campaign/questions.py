@@ -112,7 +112,7 @@ def evaluate_all(
     begin: Callable[[], None] = lambda: None,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated
-    once, and those that the cache of simulations has are not.
+    once, and those that another question of a page or the cache of simulations has are not.
 
     User code is checked first (`check_code`), and `begin` is called before anything is simulated. A
     sample of the settings in a recorded scene is also simulated in SUMO, until `verified` ones of
@@ -120,6 +120,8 @@ def evaluate_all(
     `selection`, nothing is verified in SUMO.
     """
     packed_study = msgspec.msgpack.encode(study)
+    if pool.shared is not None:
+        return _evaluate_shared(study, settings, pool, done, verified, selection, begin)
     use = _use_of(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
@@ -162,6 +164,33 @@ def evaluate_all(
             problem = f"search.failed = 'skip': {numbers}{reason}"
             raise UserCodeError(study.source, problem, "a simulator that fails less often")
     return evaluations.take(row_of.ravel())
+
+
+def _evaluate_shared(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool,
+    done: Callable[[int], None],
+    verified: int,
+    selection: Selection,
+    begin: Callable[[], None],
+) -> Evaluations:
+    """As `evaluate_all`, with what other questions of a page have simulated."""
+    shared, pool.shared = pool.shared, None
+    assert shared is not None
+    try:
+        key = msgspec.msgpack.encode((study, selection))
+        known = shared.setdefault(key, {})
+        rows = np.unique(settings, axis=0)
+        missing = rows[[row.tobytes() not in known for row in rows]]
+        done(len(rows) - len(missing))
+        if len(missing):
+            found = evaluate_all(study, missing, pool, done, verified, selection, begin)
+            for number, row in enumerate(missing):
+                known[row.tobytes()] = found.take([number])
+    finally:
+        pool.shared = shared
+    return Evaluations.concatenate([known[row.tobytes()] for row in settings])
 
 
 def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:

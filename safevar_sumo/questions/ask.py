@@ -311,10 +311,12 @@ class Question:
         progress: bool | Progress = False,
         called: str = "",
         as_it_is_now: bool = False,
+        questions: int = 1,
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
         options. The command that comes next is about the first subject as it is `called`. The
-        answer's own command is the end of its command line: how many simulations it may do.
+        answer's own command is the end of its command line: how many simulations it may do. It is
+        one of so many `questions` that share the time.
         """
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.case import Case
@@ -329,6 +331,7 @@ class Question:
         ):
             account = evaluator.account
             evaluator.limit(simulations)
+            account.questions = questions
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)

@@ -41,6 +41,8 @@ class Account:
         Their progress.
     asked
         The largest number that the user allows; None if he says nothing.
+    questions
+        Number of questions of a page, which share the time.
     is_question
         Whether a question asks, which says first what it costs.
     most
@@ -54,6 +56,7 @@ class Account:
 
     phases: Phases
     asked: int | None = None
+    questions: int = 1
     is_question: bool = False
     most: int | None = None
     spent: int = 0
@@ -113,8 +116,9 @@ class Account:
             self.most = None
         if seconds is None:
             return
-        if self.asked is None and expected * seconds > LONGEST:
-            self.most = round_down(LONGEST / seconds)
+        longest = LONGEST / self.questions
+        if self.asked is None and expected * seconds > longest:
+            self.most = round_down(longest / seconds)
             parts = of_check(self.most) + of_repeats(self.most)
         if self.most is not None:
             self.spent += parts

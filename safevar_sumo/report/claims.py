@@ -22,6 +22,7 @@ from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.campaign.identity import PLATFORM
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.output import temporary_folder
@@ -33,6 +34,7 @@ from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.report.budget import REPLAYS, with_part
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
 from safevar_sumo.report.page import answer_or_reason, answer_to, make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
@@ -104,14 +106,14 @@ class Packed:
         places: Sequence[str],
         jobs: int | None,
         progress: Progress,
-        cluster: str | None = None,
+        pool: Pool | None = None,
     ) -> None:
         # The study as its manifest says, and its claims.
         self.packed = packed
         self.files = files
         self._places = places
         self._jobs = jobs
-        self._cluster = cluster
+        self.pool = pool
         self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
@@ -184,8 +186,7 @@ class Packed:
         """
         if self.case.scoring != assemble(self.case.study).measuring.scoring:
             raise InputError(MANIFEST, "scoring is not that of the study", PACK)
-        how = self._jobs, self._progress, self._cluster
-        (case,) = cases_by([self.case], self.packed.unsafe, *how)
+        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
         return case
 
     def answer(self, text: str) -> Answer:
@@ -203,11 +204,11 @@ class Packed:
                     placed = with_list(text, str(path))
                 usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
-                if most := self.packed.simulations.get(text):
-                    placed = f"{placed} {SIMULATIONS.flag} {most}"
-                asked = partial(ask, cluster=self._cluster)
+                part = with_part(text, self.packed.simulations).removeprefix(text)
+                number = len(self.packed.questions) + 1
+                asked = partial(ask, pool=self.pool, questions=number)
                 where = [self._directory], None, self._jobs, self._progress
-                answer = asked(placed, [case], *where)
+                answer = asked(f"{placed}{part}", [case], *where)
             command = answer.command.replace(f"{folder}/", "")
             self._answers[text] = replace(answer, command=command)
         return self._answers[text]
@@ -215,7 +216,7 @@ class Packed:
     def simulations(self) -> dict[str, int]:
         """The largest number of simulations of each question whose text does not state it."""
         flag = f" {SIMULATIONS.flag} "
-        return {
+        return self.packed.simulations | {
             text: int(answer.command.rpartition(flag)[2])
             for text, answer in self._answers.items()
             if flag in answer.command and flag not in f" {text} "
@@ -224,15 +225,19 @@ class Packed:
     def _answer_json(self, text: str) -> bytes:
         return json_bytes(packed_answer(self.answer(text)))
 
-    def page(self) -> bytes:
-        answers = [self.answer(text) for text in self.packed.questions]
-        versions = self.manifest["versions"]
+    def ask_speed(self) -> ReportedStudy:
+        """What the page is about, with the answer about the speed of its sheet."""
         study = ReportedStudy(
-            directory=self._directory, case=self.shown, versions=versions, answers=answers
+            directory=self._directory,
+            case=self.shown,
+            versions=self.manifest["versions"],
+            answers=[self.answer(text) for text in self.packed.questions],
+            simulations=self.packed.simulations.get(REPLAYS),
         )
-        study = with_speed(
-            study, lambda text: self.answer(with_criterion(text, self.packed.unsafe))
-        )
+        return with_speed(study, lambda text: self.answer(with_criterion(text, self.packed.unsafe)))
+
+    def page(self) -> bytes:
+        study = self.ask_speed()
         return make_page([study], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:

@@ -13,11 +13,19 @@ from pathlib import Path
 import msgspec
 
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
+from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Cluster, Criterion, Jobs, parse_question, with_criterion
+from safevar_sumo.questions.ask import (
+    Cluster,
+    Criterion,
+    Jobs,
+    Simulations,
+    parse_question,
+    with_criterion,
+)
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.permit.fleet import list_without_names
@@ -25,6 +33,7 @@ from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject
+from safevar_sumo.report.budget import divided
 from safevar_sumo.report.claims import (
     ANSWERS,
     CANNOT,
@@ -61,10 +70,12 @@ from safevar_sumo.report.pack import (
     versions_here,
     write_pack,
 )
-from safevar_sumo.report.page import usual_questions
+from safevar_sumo.report.page import speed_part, usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
+from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 
@@ -77,6 +88,7 @@ def evidence(
     cluster: Cluster = None,
     progress: bool | Progress = False,
     fresh: bool = False,
+    simulations: Simulations = None,
 ) -> str:
     """Pack results with their study, page and answers, so that anybody can compute every number
     again.
@@ -105,6 +117,8 @@ def evidence(
         and their total.
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
+    simulations
+        At most so many simulations for all answers and replays, which share them.
 
     Returns
     -------
@@ -127,7 +141,8 @@ def evidence(
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
             how: JsonObject = {"jobs": jobs, "cluster": cluster}
-            described, own_files = _pack_study(number, directory, ask, unsafe, how, show)
+            part = None if simulations is None else simulations // len({*map(Path, results)})
+            described, own_files = _pack_study(number, directory, ask, unsafe, how, show, part)
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -141,6 +156,7 @@ def _pack_study(
     unsafe: str | None,
     how: JsonObject,
     progress: Progress,
+    simulations: int | None,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
     # The results, with what `verify` compares or names of their manifest.
@@ -160,16 +176,24 @@ def _pack_study(
     questions, lists = _with_lists(list(dict.fromkeys(asked)))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
-    described = PackedStudy(
-        folder, questions, runs, count_outcomes(case), count_solutions(case.solutions, runs), unsafe
-    )
+    parts = dict[str, int]()
+    if simulations is not None:
+        system = assemble(shown.study)
+        again = len(case.settings) * (shown.study != case.study) * simulations_of_setting(system)
+        parts = divided([*questions, *speed_part(questions, case)], simulations - again, system)
+    outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
+    described = PackedStudy(folder, questions, runs, outcomes, solutions, unsafe, parts)
 
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
     show_part = Parts(progress).begin(study.name)
-    packed = Packed(described, files, study.origin.places, how["jobs"], show_part, how["cluster"])
-    answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
+    with open_pool(**how) as pool:
+        pool.shared = {} if assemble(study).has_simulator else None
+        packed = Packed(described, files, study.origin.places, how["jobs"], show_part, pool)
+        answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
+        packed.ask_speed()
+    packed.pool = None
     files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
     return msgspec.structs.replace(described, simulations=packed.simulations()), files
 

@@ -15,7 +15,7 @@ from safevar_sumo.questions import price
 from safevar_sumo.questions.price import Account, round_down
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import show_no_progress
-from tests.in_process import InlinePool, run
+from tests.in_process import InlinePool, json_of, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 CLEARANCE = 40 - 15 * 0.5
@@ -230,3 +230,27 @@ def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.Monk
     output = run("rules", rig)
     assert "at most 500 simulations" in output.stderr
     assert output.stdout.startswith("Rough answer (--simulations 500)")
+
+
+@pytest.mark.parametrize("cache", ["off", "folder"])
+@pytest.mark.parametrize("number", [400, 2000])
+def test_a_page_and_a_pack_share_one_number(
+    rig: str, number: int, cache: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What one question has simulated serves the others: rules has the sample of risk."""
+    monkeypatch.setenv("SAFEVAR_CACHE", cache)
+    Path(rig).write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    for command, out in (("report", "page.html"), ("evidence", "pack.zip")):
+        Path("counted.py").write_text(f"{COUNTED}# {command}")
+        run("study", rig, "--out", command)
+        Path("count").unlink()
+        run(command, command, "--simulations", f"{number}", "--out", out, "--jobs", "1")
+        assert number / 3 <= Path("count").stat().st_size <= number
+    page = Path("page.html").read_text()
+    stated = re.findall(r"(\w+) report (?:--samples 4000 )?--simulations (\d+)", page)
+    assert {name for name, _ in stated} == {"tolerance", "explain", "risk", "rules"}
+    assert {3 * int(part) > 0.7 * number for _, part in stated} == {True}
+    assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+    refused(
+        "evidence", "evidence", "--simulations", "3", "--out", "3.zip", message=("not suffice",)
+    )
