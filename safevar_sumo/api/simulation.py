@@ -20,6 +20,7 @@ from safevar_sumo.metrics import (
     impact_in_words,
     time_to_collision,
 )
+from safevar_sumo.metrics.unsafe import runs_in_words
 from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
@@ -244,7 +245,15 @@ class Simulation:
 
     @property
     def verdict(self) -> str:
-        """How the simulation ended, in words."""
+        """How the simulation ended, in words; with repeats, in how many of them it is unsafe."""
+        runs = runs_in_words(self.pair.system.criterion.runs(self.evaluation)[:, 0])
+        is_breach = (
+            self.pair.system.criterion.of(self.evaluation)[0] and self.evaluation.collided[0]
+        )
+        return f"{self._ending}{', unsafe' if runs and not is_breach else ''}{runs}"
+
+    @property
+    def _ending(self) -> str:
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
             impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))

@@ -342,7 +342,9 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
         f" of them {case.unsafe.number_in_words(number)}."
     )
     remarks = filter(None, [case.unsafe.remark])
-    counts = " ".join([counts, *demanded_in_words(results.study), *remarks])
+    failed = len(case.failures)
+    skipped = [f"{number_of(failed, 'setting')} could not be simulated."] if failed else []
+    counts = " ".join([counts, *skipped, *demanded_in_words(results.study), *remarks])
     found = fewest_changes(case, jobs)
     if found is None:
         return counts, []

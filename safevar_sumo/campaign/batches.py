@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+import platform
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
@@ -15,7 +17,13 @@ import numpy as np
 import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.cache import cache_of, content_of, evaluations_in, key_of_settings
+from safevar_sumo.campaign.cache import (
+    cache_of,
+    content_of,
+    evaluations_in,
+    key_of_settings,
+    package_digest,
+)
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
     VERIFIED_SETTINGS,
@@ -30,15 +38,19 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.share import MAX_SKIPPED
+from safevar_sumo.errors import InputError, UserCodeError, warn
 from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
-from safevar_sumo.records import Evaluations, FloatArray, differences
+from safevar_sumo.plugins.process import REPRODUCED_BY
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.results import identity_digest
-from safevar_sumo.study import Study, user_code_names
+from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo import needs_no_sumo, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.simulators import number_simulated, simulations_of_setting
 from safevar_sumo.terminal import Progress
-from safevar_sumo.vehicles import VEHICLES, Vehicle
+from safevar_sumo.vehicles import VEHICLES, Vehicle, region_of
 
 if TYPE_CHECKING:
     from safevar_sumo.check import Finding
@@ -47,17 +59,47 @@ BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
 time left is known.
 """
+FEW_SKIPPED = 100
+"""Number of settings up to which a question skips as many as of these."""
 PORTION = 4096
 """Number of settings whose results are kept together."""
 SMALL_PORTION = 256
 """That number where vehicles take turns or SUMO itself simulates, so that each costs time."""
 COMPILING = "compiling the vehicle model, for the first time"
 """The phase of progress in which one worker compiles, and no simulation has begun."""
+SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
+"""What is expected of a simulator in another process."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
 twice. Where each vehicle takes a turn of its own, they make one for each worker.
 """
+
+
+def refuse_other_worker(study: Study, manifest: JsonObject, package: str) -> None:
+    """Refuse a worker of a cluster that has other versions, files of the study, or code of this
+    package.
+    """
+    refuse_changed_inputs(study, system_of(study), manifest)
+    if package != package_digest():
+        problem = f"a worker on {platform.node()} has other code of safevar_sumo, or another Python"
+        raise InputError("cluster", problem, "the same installation everywhere")
+
+
+def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None:
+    if pool.on_cluster is not None:
+        manifest = manifest_now(study, system_of(study), used)
+        pool.on_cluster(refuse_other_worker, study, manifest, package_digest())
+
+
+def of_check(most: int) -> int:
+    """How many of the allowed simulations the check of a simulator's class may take."""
+    return most // 10
+
+
+def of_repeats(most: int) -> int:
+    """How many of them may repeat the first batches of workers."""
+    return min(most // 10, 5)
 
 
 def evaluate_all(
@@ -70,7 +112,7 @@ def evaluate_all(
     begin: Callable[[], None] = lambda: None,
 ) -> Evaluations:
     """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated
-    once, and those that the cache of simulations has are not.
+    once, and those that another question of a page or the cache of simulations has are not.
 
     User code is checked first (`check_code`), and `begin` is called before anything is simulated. A
     sample of the settings in a recorded scene is also simulated in SUMO, until `verified` ones of
@@ -78,10 +120,13 @@ def evaluate_all(
     `selection`, nothing is verified in SUMO.
     """
     packed_study = msgspec.msgpack.encode(study)
+    if pool.shared is not None:
+        return _evaluate_shared(study, settings, pool, done, verified, selection, begin)
     use = _use_of(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
-        pool.inputs[packed_study] = manifest_now(study, system, use.modules)
+        pool.inputs[packed_study] = manifest_now(study, system, use.names)
+        _refuse_other_workers(study, use.names, pool)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
@@ -108,7 +153,58 @@ def evaluate_all(
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations), len(portion))
         found.append(evaluations)
-    return Evaluations.concatenate(found).take(row_of.ravel())
+    evaluations = Evaluations.concatenate(found)
+    if study.search.failed == "skip":
+        pool.simulated += len(evaluations)
+        pool.failed += int(evaluations.failed.sum())
+        if pool.failed > MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
+            failures = evaluations.take(evaluations.failed)
+            numbers = f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
+            reason = f": {failures.reason(0)}" if len(failures) else ""
+            problem = f"search.failed = 'skip': {numbers}{reason}"
+            raise UserCodeError(study.source, problem, "a simulator that fails less often")
+    return evaluations.take(row_of.ravel())
+
+
+def _evaluate_shared(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool,
+    done: Callable[[int], None],
+    verified: int,
+    selection: Selection,
+    begin: Callable[[], None],
+) -> Evaluations:
+    """As `evaluate_all`, with what other questions of a page have simulated."""
+    shared, pool.shared = pool.shared, None
+    assert shared is not None
+    try:
+        key = msgspec.msgpack.encode((study, selection))
+        known = shared.setdefault(key, {})
+        rows = np.unique(settings, axis=0)
+        missing = rows[[row.tobytes() not in known for row in rows]]
+        done(len(rows) - len(missing))
+        if len(missing):
+            found = evaluate_all(study, missing, pool, done, verified, selection, begin)
+            for number, row in enumerate(missing):
+                known[row.tobytes()] = found.take([number])
+    finally:
+        pool.shared = shared
+    return Evaluations.concatenate([known[row.tobytes()] for row in settings])
+
+
+def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
+    """Forget what an interrupted command has simulated if the original vehicle, which has just been
+    simulated again, does otherwise than then.
+    """
+    use = _use_of(study, pool)
+    if cache := cache_of(study, use):
+        key = hashlib.sha256(b"original" + cache.key_of(study, use)).digest()
+        kept = evaluations_in(cache.get(key))
+        if kept is not None and [*differences(kept.results, original.results)]:
+            warn("does not continue: the simulator drives the original vehicle otherwise now")
+            cache.forget()
+        cache.put(key, content_of(original))
 
 
 def repeat_first_batches(study: Study, pool: Pool) -> None:
@@ -116,7 +212,16 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     of `repeat_first_batch`.
     """
     if user_code_names(study):
-        pool.everywhere(repeat_first_batch, study)
+        each = simulations_of_setting(system_of(study))
+        most = None if pool.most is None else of_repeats(pool.most) // each
+        pool.everywhere(repeat_first_batch, study, most=most)
+
+
+def check_simulator(study: Study, pool: Pool) -> None:
+    """Check the class of a simulator of the user's own, as `check_code` does, unless the pool has
+    checked it.
+    """
+    _use_of(study, pool)
 
 
 def _use_of(study: Study, pool: Pool) -> Use:
@@ -127,6 +232,7 @@ def _use_of(study: Study, pool: Pool) -> Use:
     for (known, folders), use in pool.uses.items():
         if names <= known and folders == places:
             return use
+    _refuse_other_workers(study, [], pool)
     pool.uses[names, places] = use = check_code(study, pool)
     return use
 
@@ -246,7 +352,8 @@ def _why_no_verdict(task: Task) -> str:
 
 def check_code(study: Study, pool: Pool) -> Use:
     """Check the user code of a study in a worker, unless it has passed before with the same files;
-    returns what it used there.
+    returns what it used there. Where the number of simulations is limited, the check takes at most
+    a tenth of them.
 
     Raises
     ------
@@ -261,17 +368,61 @@ def check_code(study: Study, pool: Pool) -> Use:
         known = msgspec.json.decode(marker.read_bytes(), type=Use)
         if known.modules == digests_by_name(known.modules, study.origin.places):
             return known
-    use: Use = carry_out(_refuse_defects, [(Task(study=study),)], pool)[0]
+    job = Task(study=study), None if pool.most is None else of_check(pool.most)
+    use: Use
+    ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
+    if pool.most is not None:
+        return use
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_bytes(msgspec.json.encode(use))
     return use
 
 
+def repeat_elsewhere(study: Study, pool: Pool) -> None:
+    """Simulate three settings in two processes, in one of them with the points in another order.
+
+    Raises
+    ------
+    UserCodeError
+        If a result differs.
+    """
+    system = system_of(study)
+    rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
+    backwards = Selection(points=tuple(range(len(system.matrix)))[::-1])
+    jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
+    if pool.workers > 1:  # the second one has simulated nothing yet
+        here, there = carry_out(evaluate_settings, jobs, pool)
+    else:
+        (here,) = carry_out(evaluate_settings, jobs[:1], pool)
+        pool.close()  # its worker starts again
+        (there,) = carry_out(evaluate_settings, jobs[1:], pool)
+    for row, difference in differences(there.results, here.results):
+        command = reproduction_command(study, rows[row])
+        problem = f"{difference} in another process, or with points in another order"
+        raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
+
+
+def random_settings(study: Study, *shape: int) -> FloatArray:
+    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
+    region = region_of(study)
+    characteristics = region.characteristics
+    rng = np.random.default_rng(study.search.seed)
+
+    def draw(count: int) -> FloatArray:
+        return rng.uniform(
+            characteristics.lower, characteristics.upper, (count, len(characteristics))
+        )
+
+    drawn = region.draw_feasible(draw, math.prod(shape))
+    return np.resize(drawn, (*shape, len(characteristics)))
+
+
 def find_in_new_process(study: Study) -> list[Finding]:
     """What a simulator of the user's own returns otherwise in a new process, for the original and
     for both ends of the domains; nothing if the study says that it is not deterministic.
     """
+    study = without_skipping(study)
     system = system_of(study)
     if not system.has_simulator or system.repeats > 1:
         return []
@@ -279,20 +430,22 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
     with open_pool(1) as pool:  # first, as a simulator may end its process
         (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    for row, difference in differences(drive_and_score(system, settings).results, there.results):
+    here = drive_and_score(replace(system, matrix=system.matrix[::-1]), settings)
+    for row, difference in differences(here.results, there.results):
         from safevar_sumo.check import Finding  # slow to import, and rarely needed
 
         words = f"{difference} in a new process"
-        expected = "the same, to the bit; or repeats = N in [scenario]"
         command = reproduction_command(study, settings[row])
-        return [Finding("repetition", words, study.source, command, expected)]
+        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
     return []
 
 
-def _refuse_defects(task: Task) -> Use:
+def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
+    """What user code uses in its check, and the number of simulations in a simulator."""
     from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
 
     unload_user_modules()
+    before = number_simulated()
     with record_use(task.study.origin.places) as use:
-        refuse_defects(task.study)
-    return use
+        refuse_defects(task.study, most)
+    return use, number_simulated() - before

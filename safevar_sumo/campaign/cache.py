@@ -102,7 +102,7 @@ class Cache:
             # The study and its files count as in the identity of results, and besides that where
             # the files are, this package's own files, and the versions of Python and of all that
             # is installed.
-            manifest = manifest_now(study, system_of(study), use.modules)
+            manifest = manifest_now(study, system_of(study), use.names)
             paths = [
                 os.path.abspath(file_by_name(name, study.origin.places))
                 for name in manifest["files"]
@@ -129,6 +129,11 @@ class Cache:
             self._guarded(entries.set, None, key, _digest(key, content) + content)
         if settings and self._is_counted:
             self.put(NUMBER, str(self.number_kept() + settings).encode())
+
+    def forget(self) -> None:
+        """Remove all entries."""
+        if self._entries is not None:
+            self._guarded(self._entries.clear, None)
 
     def number_kept(self) -> int:
         """Number of settings whose results a counted cache has."""
@@ -331,6 +336,12 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
 
 def _digest(key: bytes, content: bytes) -> bytes:
     return sha256(key + content).digest()
+
+
+def package_digest() -> str:
+    """A digest of the version of Python and of this package's files."""
+    python, _, files = _environment()
+    return sha256(msgspec.json.encode([python, files])).hexdigest()
 
 
 @lru_cache(maxsize=1)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,13 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.batches import ask_why_no_verdict, check_code, compile_vehicle
+from safevar_sumo.campaign.batches import (
+    ask_why_no_verdict,
+    check_code,
+    compile_vehicle,
+    random_settings,
+    repeat_elsewhere,
+)
 from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
@@ -37,13 +43,18 @@ from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.protocol.rater import is_rated
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
-from safevar_sumo.results import JournalReader, ResultsDirectory, journal_file
+from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.results import (
+    MANIFEST,
+    JournalReader,
+    ResultsDirectory,
+    journal_file,
+    read_manifest,
+)
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress, show_no_progress
-from safevar_sumo.vehicles import region_of
 
 BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of all runs of a share fill, at most."""
@@ -107,8 +118,13 @@ def run_campaign(
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
     # The directory, with the inputs of its results as they are now.
+    pool.most = None
     use = check_code(study, pool)
-    manifest = manifest_now(study, system, use.modules)
+    is_new = not (directory / MANIFEST).exists()
+    read: Iterable[str] = ()
+    if system.has_simulator:
+        read = use.opened if is_new else read_manifest(directory).get("files", ())
+    manifest = manifest_now(study, system, [*use.modules, *read])
     wanted = [*map(str, keys)]
     results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, wanted)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
@@ -136,6 +152,8 @@ def run_campaign(
     for remark in _remarks(study, undeclared, no_verdict, original):
         warn(f"study {study.name!r}: {remark}")
     results.begin(original)
+    if is_new and system.has_simulator and system.repeats == 1:
+        repeat_elsewhere(study, pool)
 
     # Each worker carries out a share of the runs.
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
@@ -300,7 +318,7 @@ def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
     workers = min(pool.workers, runs or pool.workers)
     system = system_of(task.study)
     size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
-    settings = _random_settings(task.study, workers, size)
+    settings = random_settings(task.study, workers, size)
 
     def simulate(number: int) -> None:
         carry_out(evaluate_settings, [(task, rows[:number]) for rows in settings], pool)
@@ -322,22 +340,8 @@ def measure_verification(task: Task, pool: Pool, runs: int) -> float:
     [s].
     """
     number = min(math.ceil(runs * task.study.search.evaluations / REPEATED), MAX_REPEATED)
-    settings = _random_settings(task.study, number)
+    settings = random_settings(task.study, number)
     (evaluations,) = carry_out(evaluate_settings, [(task, settings)], pool)
     start = time.monotonic()
     repeat_in_sumo(task, evaluations, pool, show_no_progress)
     return time.monotonic() - start
-
-
-def _random_settings(study: Study, *shape: int) -> FloatArray:
-    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
-    region = region_of(study)
-    characteristics = region.characteristics
-    rng = default_rng(study.search.seed)
-
-    def draw(count: int) -> FloatArray:
-        return rng.uniform(
-            characteristics.lower, characteristics.upper, (count, len(characteristics))
-        )
-
-    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))

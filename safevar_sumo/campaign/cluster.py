@@ -8,10 +8,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
-from safevar_sumo.errors import InputError, SafevarError, describe_error, missing_extra
+import portalocker
+
+from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError, describe_error, missing_extra
 from safevar_sumo.plugins.process import this_process
 
 CLUSTER = (
@@ -20,6 +24,8 @@ CLUSTER = (
 )
 CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
+_locks = list[portalocker.Lock]()
+"""The locks of the numbers that this process has."""
 _libsumo_lock = threading.Lock()  # a process has one libsumo
 
 
@@ -48,6 +54,15 @@ def connect(address: str) -> Iterator[Any]:
         yield client
 
 
+def everywhere(client: Any, function: Callable[..., Any], *arguments: Any) -> None:
+    """Carry out a function in each worker of a cluster; raises its error."""
+    try:
+        client.run(_carry_out, pickle.dumps((function, arguments)), "")
+    except (AttributeError, ImportError, TypeError) as error:  # it knows no such function
+        problem = f"a worker has another version of safevar_sumo: {describe_error(error)}"
+        raise InputError("cluster", problem, "the same installation everywhere") from None
+
+
 class ClusterWorker:
     """Any worker of a cluster. Dask itself gives the job of a dead worker to others, as often as
     its configuration says (`distributed.scheduler.allowed-failures`).
@@ -55,10 +70,12 @@ class ClusterWorker:
 
     def __init__(self, client: Any) -> None:
         self._executor = client.get_executor(pure=False)
+        self._command = client.id
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         # Dask's own serialization turns records into lists
-        return self._executor.submit(_carry_out, pickle.dumps((function, arguments)))
+        job = pickle.dumps((function, arguments))
+        return self._executor.submit(_carry_out, job, self._command)
 
     def cause_of_death(self, error: BaseException) -> str:
         from distributed import KilledWorker
@@ -71,12 +88,27 @@ class ClusterWorker:
         self._executor.shutdown(wait=False)  # cancels the jobs
 
 
-def _carry_out(packed_job: bytes) -> Any:
-    """Carry out a job in a worker of the cluster."""
+def _carry_out(packed_job: bytes, command: str) -> Any:
+    """Carry out a job of a command, which a client has, in a worker of the cluster."""
     function, arguments = pickle.loads(packed_job)
     with _libsumo_lock:
+        if this_process.last_words is None:
+            this_process.worker = _own_number()
         this_process.last_words = sys.__stderr__
+        this_process.attempts = Path(gettempdir(), f"safevar-{command}") if command else None
         return function(*arguments)
+
+
+def _own_number() -> int:
+    """The least number that no other worker on this machine has; this process keeps it."""
+    for number in range(MAX_JOBS):
+        path = Path(gettempdir(), f"safevar-worker-{number}.lock")
+        lock = portalocker.Lock(path, "a", timeout=0, fail_when_locked=True)
+        with suppress(OSError, portalocker.LockException):
+            lock.acquire()
+            _locks.append(lock)
+            return number
+    return MAX_JOBS
 
 
 def has_caller() -> bool:

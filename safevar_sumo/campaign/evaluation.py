@@ -122,14 +122,12 @@ def carry_out(
         first = arguments[0] if arguments else ""
         work = f"{len(first)} settings" if isinstance(first, np.ndarray) else str(first)
         names = user_code_names(task.study)
-        problem = (
-            f"two workers were lost at the same work, {work or function.__name__.strip('_')}:"
-            f" {error}"
-        )
+        work = work or "the check of user code"
+        problem = f"two workers were lost at the same work, {work}: {error}"
         if names:
-            raise UserCodeError(
-                f"study {task.study.name!r}", f"{problem}, probably in {' and '.join(names)}"
-            ) from None
+            method = "simulate of " if system_of(task.study).has_simulator else ""
+            where = f", probably in {method}{' and '.join(names)}"
+            raise UserCodeError(f"study {task.study.name!r}", f"{problem}{where}") from None
         raise SafevarError(f"study {task.study.name!r}: {problem}") from None
 
 

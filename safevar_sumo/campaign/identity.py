@@ -34,6 +34,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     identity = {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
     # Versions of the user's simulators, and of the distributions that they name.
     versions = {}
+    libraries = set[str]()
     for scenario in (point.scenario for point in system.points):
         if not isinstance(scenario, Simulator):
             continue
@@ -42,12 +43,14 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
         for name in scenario.LIBRARIES:
             try:
                 versions[name] = version(name)
+                libraries.add(name)
             except PackageNotFoundError:
                 problem = f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}"
                 raise InputError(
                     study.source, problem, "names of installed distributions"
                 ) from None
-    return manifest_of(study, {**identity, "versions": versions})
+    used_by = {"libraries": sorted(libraries)} if libraries else {}
+    return manifest_of(study, {**identity, "versions": versions, **used_by})
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:

@@ -17,16 +17,25 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from uuid import uuid4
 
 from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import REPRODUCED_BY, this_process
+from safevar_sumo.plugins.process import (
+    MARK,
+    REPRODUCED_BY,
+    end_children,
+    set_variables,
+    this_process,
+)
 from safevar_sumo.plugins.time_limit import TIMEOUT_MARK
 from safevar_sumo.shipped import PACKAGE
 
 CLOSING_SIGNAL = getattr(signal, "SIGUSR1", None)
 """The signal upon which a worker ends its simulator, and itself; None on Windows."""
+ATTEMPTS = "attempts"
+"""Name of the folder in which workers note what they simulate."""
 CLOSING_TIME = 5.0
 """Time that it has for this [s]; then it is killed."""
 
@@ -38,15 +47,19 @@ class ProcessWorker:
     Parameters
     ----------
     last_words
-        The file in which the process says where it was when it crashed or exceeded a time limit.
+        The file in which the process says where it was when it crashed or exceeded a time limit;
+        its name is the worker's number.
     """
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
+        _close_simulators()  # of this process, which have the number of a worker, too
         context = multiprocessing.get_context("spawn")
-        arguments = (ImportPath.here(), last_words)
+        self._mark = uuid4().hex  # of its child processes, too
+        arguments = (ImportPath.here(), last_words, self._mark)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
-        with _hide_main(), _show_package(), _block_interrupts():
+        variables = {MARK: self._mark, "PYTHONHASHSEED": "0"}
+        with _hide_main(), _show_package(), _block_interrupts(), set_variables(variables):
             self._executor.submit(os.getpid)  # starts the process
         (self._process,) = self._executor._processes.values()
         # Otherwise the result of a process that dies while it sends it is waited for until the end
@@ -91,10 +104,11 @@ class ProcessWorker:
                 os.kill(self._process.pid, CLOSING_SIGNAL)
                 self._process.join(CLOSING_TIME)
         self._process.kill()
+        end_children(self._mark)
         self._executor.shutdown(cancel_futures=True)
 
 
-def _begin_work(path: ImportPath, last_words: Path) -> None:
+def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
     path.inherit()
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)
@@ -104,14 +118,21 @@ def _begin_work(path: ImportPath, last_words: Path) -> None:
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     this_process.last_words = file
+    this_process.worker = int(last_words.stem)
+    this_process.attempts = last_words.parent / ATTEMPTS
+    this_process.mark = mark
     threading.Thread(target=_end_with_caller, daemon=True).start()
 
 
 def _end_in_order(*_: object) -> None:
     """End the simulator of this process, and the process."""
+    _close_simulators()
+    os._exit(1)
+
+
+def _close_simulators() -> None:
     if simulators := sys.modules.get("safevar_sumo.sumo.simulators"):
         simulators.close_simulator()
-    os._exit(1)
 
 
 def _end_with_caller() -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager, suppress
 from numbers import Integral
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, TypeVar
 
@@ -20,13 +21,12 @@ from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import Use
-from safevar_sumo.records import JsonObject
+from safevar_sumo.plugins.process import MAX_DEATHS
+from safevar_sumo.records import Evaluations, JsonObject
 
 Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
-MAX_DEATHS = 1
-"""Number of workers that may die of a job: another process may have killed one."""
 
 
 class WorkerLostError(SafevarError):
@@ -66,6 +66,18 @@ class Pool:
         Number of settings whose results were verified, by packed study.
     compiled
         Names of the vehicle models that workers find compiled.
+    simulated, failed
+        Number of settings that questions have had, of studies that skip those that fail.
+    checked, most
+        Number of simulations of the last check of user code; the largest number of a question in a
+        simulator of the user's own, as far as it is stated.
+    shared
+        What the questions of a page have simulated: evaluations by setting, of each study and
+        selection; None if questions do not share it.
+    on_cluster
+        Carries out a function in each worker of a cluster; None for processes of this machine.
+    attempts
+        The folder in which workers note the settings that may be skipped while they simulate them.
     """
 
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
@@ -76,6 +88,11 @@ class Pool:
         self.inputs = dict[bytes, JsonObject]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
+        self.attempts: Path | None = None
+        self.simulated = self.failed = self.checked = 0
+        self.most: int | None = None
+        self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
+        self.on_cluster: Callable[..., None] | None = None
 
     def map(
         self,
@@ -127,16 +144,24 @@ class Pool:
             elif cause := self._started[place].cause_of_death(error):
                 self._started.pop(place).end()
                 deaths[number] += 1
-                if deaths[number] > MAX_DEATHS:
+                if deaths[number] > MAX_DEATHS + (MAX_DEATHS + 1) * self._skipped():
                     raise WorkerLostError(number, cause)
                 waiting.appendleft(number)
             else:
                 raise error
         return [results[number] for number in range(len(jobs))]
 
-    def everywhere(self, function: Callable[..., Any], *arguments: Any) -> None:
-        """Carry out a function in each worker that has started and lives."""
-        futures = [self._begin(place, function, arguments) for place in [*self._started]]
+    def _skipped(self) -> int:
+        """Number of settings of which so many workers have died that they are skipped."""
+        files = self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
+        return sum(file.stat().st_size > MAX_DEATHS for file in files)
+
+    def everywhere(
+        self, function: Callable[..., Any], *arguments: Any, most: int | None = None
+    ) -> None:
+        """Carry out a function in each worker that has started and lives, or in so many of them."""
+        places = [*self._started][:most]
+        futures = [self._begin(place, function, arguments) for place in places]
         for future in futures:
             future.result()
 
@@ -181,8 +206,10 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
                 jobs or available_cores(),
                 lambda place: local.ProcessWorker(folder / f"{place}.txt"),
             )
+            pool.attempts = folder / local.ATTEMPTS
         else:
             client = stack.enter_context(dask.connect(cluster))
             pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))
+            pool.on_cluster = lambda *job: dask.everywhere(client, *job)
         stack.callback(pool.close)
         yield pool

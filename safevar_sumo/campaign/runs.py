@@ -257,6 +257,11 @@ class Run:
         sample = requested.take(rng.permutation(simulated)[:number])
         return RunResult(self.key, self.solutions, sample, self._discarded)
 
+    @property
+    def failures(self) -> Evaluations:
+        """The evaluations that failed."""
+        return self._content.evaluations.take(self._content.evaluations.failed)
+
     def close(self) -> None:
         """Leave the run to another process."""
         self._journal.close()

@@ -28,7 +28,10 @@ from safevar_sumo.errors import InputError, SafevarError, UserCodeError, about
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import MANIFEST, Journal, identity_digest, journal_file, journal_head
+from safevar_sumo.study import Study
 
+MAX_SKIPPED = 0.1
+"""Largest share of settings that a study skips because they fail."""
 MAX_NAMES = 6
 """Largest number of runs that the name of a share lists."""
 
@@ -94,6 +97,8 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
                 evaluations = evaluate_settings(task, np.stack([missing[row][1] for row in rows]))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
                     run.receive(evaluations.take([*rows_of_run]))
+                if task.study.search.failed == "skip":
+                    _refuse_failures(task.study, runs)
         refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
         try:
             repeat_first_batch(task.study)
@@ -103,6 +108,18 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
             raise
         # SUMO repeats the same settings whether a run was searched now or read from its journal.
         return [run.finish(random_generator_of(task.study, run.key)) for run in runs]
+
+
+def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
+    """Refuse to skip more than `MAX_SKIPPED` of the settings of runs."""
+    number = sum(len(run.failures) for run in runs)
+    total = len(runs) * study.search.evaluations
+    if number > MAX_SKIPPED * total:
+        failures = next(run.failures for run in reversed(runs) if len(run.failures))
+        problem = f"search.failed = 'skip': {number} settings failed, more than 10 % of {total}"
+        last = failures.reason(len(failures) - 1)
+        legal = "a simulator that fails less often; `study --retry-failed` tries them again"
+        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {last}", legal)
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:

@@ -18,7 +18,7 @@ from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WHOLE, Study, keys_with, user_code
+from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.measuring import own_criterion
@@ -96,7 +96,10 @@ def study_to_check(name: str) -> Study:
 
 
 def check_study(study: Study, **how: Any) -> list[Finding]:
-    """Check the user code of a study; for `how` see `try_simulations`."""
+    """Check the user code of a study, in which no failure is skipped; for `how` see
+    `try_simulations`.
+    """
+    study = without_skipping(study)
     findings = list(find_defects(study, **how))
     if findings:
         return findings
@@ -121,15 +124,15 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     return [Finding("original", words, where, point, "an original vehicle that is safe")]
 
 
-def refuse_defects(study: Study) -> None:
-    """Check the user code that a study names.
+def refuse_defects(study: Study, most: int | None = None) -> None:
+    """Check the user code that a study names, with at most so many simulations.
 
     Raises
     ------
     UserCodeError
         With the first defect, the input that shows it, file and line, and advice.
     """
-    for finding in find_defects(study):
+    for finding in find_defects(study, most=most):
         command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
         problem = f"{finding}; to reproduce it: {command}"
         raise UserCodeError(
@@ -145,7 +148,7 @@ def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
     yield from _first_defect(study, simulated, try_simulations(study, **how))
-    for key, name in names:
+    for key, name in names if how.get("most") is None else []:
         if key == "search.algorithms":
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 

@@ -16,10 +16,13 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
+from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import needs_no_sumo
+from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import Progress, show_no_progress
@@ -68,17 +71,32 @@ def try_simulations(
     vehicles: int | None = None,
     progress: Progress = show_no_progress,
     tell: Callable[[Extent], None] = lambda extent: None,
+    most: int | None = None,
 ) -> Iterator[FailedCheck]:
     """Simulate a study with the original vehicle, the corners of the domains and random settings:
-    so many `vehicles`, by default as many as the time allows. `tell` is called with their number.
+    so many `vehicles`, by default as many as the time allows, in a simulator of the user's own with
+    at most so many simulations. `tell` is called with their number.
     """
     # The settings that are tried.
     region = region_of(study)
     many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(many))
     system = _system(study)
-    number, seconds = _affordable(system, settings)
+    if system.has_simulator and most is not None:
+        # Each vehicle in four runs, and both ends of the list alone.
+        each = simulations_of_setting(system)
+        left = most - system.repeats - 2 * each
+        vehicles = left // (each * (1 if system.repeats > 1 else 4))
+        if vehicles < 1:
+            return
+    if system.has_simulator:
+        runs = drive_all(system.at(system.points[0]), settings[:1])
+        if contradiction := unit_contradiction(runs.trace):
+            expected = "speeds in m/s, and distances in m"
+            yield FailedCheck("contract", contradiction, expected, "the original vehicle")
+    number, seconds = (1, 0.0) if most is not None else _affordable(system, settings)
     if vehicles is not None:
+        vehicles = min(vehicles, len(settings))
         number, seconds = vehicles, seconds * vehicles / number
     settings = settings[:number]
     all_points = len(assemble(study).points)
@@ -94,7 +112,7 @@ def try_simulations(
 
     expected = "the same, to the bit"
     if system.has_simulator:
-        expected += "; or repeats = N in [scenario], where the mean of N runs counts"
+        expected += "; or repeats = N in [scenario], where the share of unsafe runs counts"
     yield from _try(load, region.characteristics, settings, progress, expected)
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
@@ -114,8 +132,9 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     """
     timed = settings[: 1 if system.has_simulator else TIMED]
     # The first simulation loads what any does, and ends a driving system that does not end.
-    longest = system.time_limit if system.has_simulator else min(system.time_limit, LONGEST)
-    drive_and_score(replace(system, time_limit=longest), timed[:1])
+    if not system.has_simulator:  # which has simulated once
+        short = replace(system, time_limit=min(system.time_limit, LONGEST))
+        drive_and_score(short, timed[:1])
     start = time.perf_counter()
     drive_and_score(system, timed)
     seconds = RUNS_OF_ALL * (time.perf_counter() - start) / len(timed)

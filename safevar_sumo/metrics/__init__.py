@@ -28,6 +28,7 @@ from safevar_sumo.metrics.measures import (
     TET,
     TIT,
     TTC_MIN,
+    UNSAFE_SHARE as UNSAFE_SHARE,
     time_to_collision as time_to_collision,
 )
 from safevar_sumo.metrics.unsafe import (

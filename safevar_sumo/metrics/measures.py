@@ -257,12 +257,20 @@ AVE_DECE = Measure(
 
 
 def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """NaN, shape (N,): a single cell has no points; the rater computes them from all cells of the
-    matrix.
+    """NaN, shape (N,): a single cell has no points, which the rater computes from all cells of the
+    matrix, and a single run no share.
     """
     return np.full(len(runs.outcome), np.nan)
 
 
+UNSAFE_SHARE = Measure(
+    name="unsafe_share",
+    title="share of unsafe runs",
+    unit="-",
+    more_is_unsafe=True,
+    function=_undefined_points,
+    description="Share of the repeats of a run that are unsafe by the study's own criterion.",
+)
 RATING_POINTS = Measure(
     name="rating_points",
     title="points kept",

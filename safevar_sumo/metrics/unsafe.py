@@ -16,7 +16,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
-from safevar_sumo.metrics.measures import RATING_POINTS
+from safevar_sumo.metrics.measures import RATING_POINTS, UNSAFE_SHARE
 from safevar_sumo.records import (
     KMH_PER_MS,
     BoolArray,
@@ -50,6 +50,8 @@ significant digits.
 """
 DEFAULT_MARGIN = 0.3
 """Distance to keep in a study that states no error of its model [m]."""
+SHARE_DECIMALS = 9
+"""Decimals of a sum of shares."""
 LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
 ALLOWED_ROUNDING = 0.01
@@ -126,7 +128,12 @@ class Unsafe:
     @property
     def _stands_alone(self) -> bool:
         """Whether a collision is not unsafe in itself."""
-        return self.is_of_points or self.is_of_impacts
+        return self.is_of_points or self.is_of_impacts or self._is_of_shares
+
+    @property
+    def _is_of_shares(self) -> bool:
+        """Whether a bound on the share of unsafe runs decides."""
+        return self.bound is not None and self.bound.measure == UNSAFE_SHARE.name
 
     @property
     def worst(self) -> Callable[..., float]:
@@ -151,11 +158,13 @@ class Unsafe:
         share = ", half of the original's" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
-    def number_in_words(self, number: int) -> str:
+    def number_in_words(self, number: float) -> str:
         """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
         collision)`.
         """
-        counted = f"{number:,}" if number else "none"
+        counted = (
+            (f"{number:,}" if number == int(number) else f"{number:,.1f}") if number else "none"
+        )
         if self.is_collision and not self.keep:
             return f"{counted} {'collide' if number > 1 else 'collides'}"
         return f"{counted} {'are' if number > 1 else 'is'} unsafe ({self.description})"
@@ -192,7 +201,21 @@ class Unsafe:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
         every bound.
         """
-        return self._holds(evaluations.outcome, evaluations.column)
+        return np.asarray(self.runs(evaluations).any(axis=0))
+
+    def runs(self, evaluations: Evaluations) -> BoolArray:
+        """Which of M evaluations are unsafe in which of their R repeats; shape (R, M), R is 1
+        without repeats.
+        """
+        rounds = [] if self._is_of_shares else evaluations.rounds
+        return np.stack(
+            [np.asarray(self._holds(one.outcome, one.column)) for one in rounds or [evaluations]]
+        )
+
+    def number(self, evaluations: Evaluations) -> float:
+        """How many evaluations are unsafe; each counts by the share of its repeats."""
+        total = round(float(self.runs(evaluations).mean(axis=0).sum()), SHARE_DECIMALS)
+        return int(total) if total == int(total) else total
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
         """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
@@ -219,6 +242,11 @@ class Unsafe:
         unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
         of the collision.
         """
+        if (rounds := evaluations.rounds) and not self._is_of_shares:  # the worst of them
+            return np.asarray(np.min([self._robustness(one) for one in rounds], axis=0))
+        return self._robustness(evaluations)
+
+    def _robustness(self, evaluations: Evaluations) -> FloatArray:
         if self.bound is None:
             limit = self.contact + self.keep if self.below is None else self.below
             robustness = evaluations.f_safe - limit
@@ -228,9 +256,8 @@ class Unsafe:
             if not self._stands_alone:
                 robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
-        return np.where(
-            self.of(evaluations), np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0)
-        )
+        is_unsafe = self._holds(evaluations.outcome, evaluations.column)
+        return np.where(is_unsafe, np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0))
 
     def value(self, robustness: float) -> float:
         """What has a robustness: a distance between bumpers [m], or the value that is
@@ -251,8 +278,11 @@ class Unsafe:
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
         """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
-        3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`.
+        3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`; with repeats, in how many runs.
         """
+        return f"{self._breach_in_words(vehicle)}{runs_in_words(self.runs(vehicle)[:, 0])}"
+
+    def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
 
         # In the unit of the criterion: points, a metric, or a safety degree.
@@ -371,6 +401,20 @@ class Unsafe:
                 CRITERIA,
             )
         return unsafe
+
+
+def runs_in_words(fails: BoolArray) -> str:
+    """In how many runs of a setting it is unsafe, shape (R,), with the exact interval (Clopper and
+    Pearson) of their share; "" if there is a single run.
+    """
+    import scipy  # takes a second
+
+    if len(fails) < 2:
+        return ""
+    count = int(fails.sum())
+    low, high = scipy.stats.binomtest(count, len(fails)).proportion_ci(method="exact")
+    interval = f"95 % confidence interval {100 * low:.0f} to {100 * high:.0f} %"
+    return f" in {count} of {len(fails)} runs ({interval})"
 
 
 def impact_in_words(speed: float, excess: float) -> str:

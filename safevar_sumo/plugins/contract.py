@@ -311,7 +311,9 @@ def checked_class(code: UserCode, base: type) -> type:
     cls = types.new_class(
         candidate.__name__,
         bases,
-        exec_body=lambda namespace: namespace.update(methods, is_user_code=True),
+        exec_body=lambda namespace: namespace.update(
+            methods, is_user_code=True, __module__=candidate.__module__
+        ),
     )
     return cls
 
@@ -331,7 +333,7 @@ def violation(candidate: Any, base: type) -> str:
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
         # A static or class method takes no `self`.
-        takes_self = inspect.isfunction(
+        takes_self = not isinstance(vars(base)[name], classmethod) and inspect.isfunction(
             inspect.getattr_static(candidate, name, getattr(base, name))
         )
         try:
@@ -366,7 +368,9 @@ def _methods(base: type) -> dict[str, list[str]]:
             if parameter.default is parameter.empty
         ]
         for name, method in vars(base).items()
-        if inspect.isfunction(method) and not name.startswith("_") and name not in helpers
+        if not name.startswith("_") and name not in helpers
+        for method in [method.__func__ if isinstance(method, classmethod) else method]
+        if inspect.isfunction(method)
     }
 
 

@@ -8,17 +8,19 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import IO, Any, NamedTuple
+from uuid import uuid4
 
 import platformdirs
 
 from safevar_sumo.errors import INTERRUPTS
-from safevar_sumo.plugins.files import Files, digests, is_user_file, name_of_file
+from safevar_sumo.plugins.files import CACHE, Files, digests, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
 SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
@@ -49,6 +51,13 @@ class _Process:
         a time limit.
     is_limited
         Whether a time limit is counting.
+    attempts
+        The folder in which this process, if it is a worker, notes what it simulates, in case that
+        workers die of it.
+    mark
+        Marks the child processes of simulators in this process.
+    worker
+        The number of this process among those that simulate on this machine.
     """
 
     added_folders: list[str] = field(default_factory=list)
@@ -58,9 +67,16 @@ class _Process:
     is_listening: bool = False
     last_words: IO[str] | None = None
     is_limited: bool = False
+    worker: int = 0
+    attempts: Path | None = None
+    mark: str = field(default_factory=lambda: uuid4().hex)
 
 
 this_process = _Process()
+MARK = "SAFEVAR_WORKER"
+"""The environment variable that child processes of a simulator inherit."""
+MAX_DEATHS = 1
+"""Number of workers that may die of a job: another process may have killed one."""
 REPRODUCED_BY = "; to reproduce it: "
 """What stands before a command that simulates a setting again."""
 
@@ -72,6 +88,33 @@ def note_work(text: str) -> None:
         words.truncate()
         words.write(f"{text}\n")
         words.flush()
+
+
+@contextmanager
+def set_variables(values: Mapping[str, str]) -> Iterator[None]:
+    """Within the block, environment variables have these values, also for child processes."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def end_children(mark: str) -> None:
+    """Kill the processes that have inherited a mark, on systems that tell."""
+    entry = f"{MARK}={mark}".encode()
+    for pause in (0.0, 0.02):  # what has just started tells nothing yet
+        time.sleep(pause)
+        for path in Path("/proc").glob("[0-9]*/environ"):
+            with suppress(OSError):
+                process = int(path.parent.name)
+                if entry in path.read_bytes().split(b"\0") and process != os.getpid():
+                    os.kill(process, signal.SIGKILL)
 
 
 class Interrupt(KeyboardInterrupt):
@@ -112,6 +155,11 @@ class Use(NamedTuple):
     modules: Files
     opened: list[str]
 
+    @property
+    def names(self) -> list[str]:
+        """Names of all files."""
+        return [*self.modules, *self.opened]
+
 
 @contextmanager
 def record_use(folders: Sequence[str]) -> Iterator[Use]:
@@ -125,6 +173,7 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
         this_process.is_listening = True
 
     # What is loaded and opened in the block.
+    start = time.time()
     use = Use({}, [])
     before = set(sys.modules)
     opened = this_process.opened = set[str]()
@@ -152,6 +201,8 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
             name_of_file(Path(path), folders)
             for path in data
             if is_user_file(path)
+            and f"{os.sep}{CACHE}{os.sep}" not in path
+            and os.path.getmtime(path) < start  # else the code has written it
             and (path.startswith(tuple(own_folders)) or not path.startswith(not_the_users))
         )
     )
@@ -166,10 +217,10 @@ def file_of_module(name: str) -> str:
 
 
 def _listen(event: str, arguments: tuple[Any, ...]) -> None:
-    """Note a file that user code opens to read."""
-    if event != "open" or this_process.opened is None:
+    """Note a file or database that user code opens to read."""
+    if event not in ("open", "sqlite3.connect") or this_process.opened is None:
         return
-    path, mode, flags = arguments
+    path, mode, flags = arguments if event == "open" else (*arguments, "", 0)
     is_read = not (set(mode or "") & set("wax+") or (flags or 0) & WRITING)
     if is_read and isinstance(path, str | bytes) and _is_from_user_code():
         this_process.opened.add(os.path.abspath(os.fsdecode(path)))

@@ -88,6 +88,8 @@ PointName = Annotated[str | None, "NAME"]
 """A point of a study's matrix."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
+Cluster = Annotated[str | None, "ADDRESS"]
+"""The address of a Dask scheduler."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
@@ -95,11 +97,14 @@ ROUGH = (
     " nothing):"
 )
 """The beginning of such an answer."""
+Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
+"""The largest number of simulations."""
 COMMON_OPTIONS = (
     ("point", PointName, None, "Only this point of the study's matrix."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
+    ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
     (
-        *("simulations", Annotated[int | None, Range(1, 1_000_000_000)], None),
+        *("simulations", Simulations, None),
         (
             "At most so many simulations: a rough answer where more are usual. By default, as many"
             " as take 15 minutes where a simulation takes long."
@@ -176,6 +181,12 @@ class Option(NamedTuple):
         return value
 
 
+SIMULATIONS = Option(
+    "simulations", int, get_args(Simulations)[1], (), None, False, None, "the largest number"
+)
+"""The option that questions on pages and in packs have, too."""
+
+
 class Question:
     """A question as a function of the library: `risk("rain", samples=1000)`."""
 
@@ -235,6 +246,7 @@ class Question:
         *others: StudyLike | Results,
         point: str | None = None,
         jobs: int | None = None,
+        cluster: str | None = None,
         simulations: int | None = None,
         pool: Pool | None = None,
         progress: bool | Progress = False,
@@ -264,8 +276,8 @@ class Question:
 
         # What it is about, as studies, results or files.
         command = self.command_line([_name(source), *map(_name, others)], point, values)
-        command += "" if simulations is None else f" --simulations {simulations}"
         how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
+        how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
         for other, is_file in zip(others, self.others.values(), strict=True):
             subjects.append(Path(str(other)) if is_file else subject_of(other))
@@ -282,7 +294,7 @@ class Question:
                     first = self.answer(subjects, {**values, "quick": True}, **how, progress=part)
                 print_text(Console(stderr=True), f"{first.verdict}\n")
             answer = self.answer(subjects, values, **how, progress=progress, called=_name(source))
-        return replace(answer, command=command)
+        return replace(answer, command=command + answer.command)
 
     def answer(
         self,
@@ -291,23 +303,35 @@ class Question:
         *,
         pool: Pool | None = None,
         jobs: int | None = None,
+        cluster: str | None = None,
         simulations: int | None = None,
         progress: bool | Progress = False,
         called: str = "",
+        as_it_is_now: bool = False,
+        questions: int = 1,
     ) -> Answer:
         """The answer about subjects that have been loaded, and files; `values` are those of
-        options. The command that comes next is about the first subject as it is `called`.
+        options. The command that comes next is about the first subject as it is `called`. The
+        answer's own command is the end of its command line: how many simulations it may do. It is
+        one of so many `questions` that share the time.
         """
         from safevar_sumo.questions.answer import Answer
+        from safevar_sumo.questions.case import Case
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
         from safevar_sumo.questions.measure import subject_by
 
         # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])
-        with open_progress(progress) as show, open_evaluator(study, pool, jobs, show) as evaluator:
+        with (
+            open_progress(progress) as show,
+            open_evaluator(study, pool, jobs, show, cluster) as evaluator,
+        ):
             account = evaluator.account
-            account.asked = account.most = simulations
-            account.is_question = True
+            evaluator.limit(simulations)
+            account.questions = questions
+            for subject in subjects:
+                if isinstance(subject, Case) and not as_it_is_now:
+                    evaluator.for_study(subject.study).refuse_other_original(subject)
             option = next((one.name for one in self.options if one.metavar == CRITERION), "")
             criterion = values.get(option)
             cites = ""
@@ -349,7 +373,9 @@ class Question:
         sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
         verdict = " ".join(filter(None, sentences))
         following = self._following(subjects[0], evaluator, called) or answer.next
-        return replace(answer, verdict=verdict, numbers=numbers, next=following)
+        most = account.asked if account.most is None else account.most
+        command = "" if most is None else f" --simulations {most}"
+        return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
 
     def _following(self, subject: Subject, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
@@ -467,7 +493,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     # Options, each with its value.
     values = dict[str, Any]()
     waiting = iter(words)
-    options = {option.flag: option for option in asked.options}
+    options = {option.flag: option for option in (*asked.options, SIMULATIONS)}
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]

@@ -8,33 +8,40 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.batches import (
     ask_why_no_verdict,
+    check_simulator,
     compile_vehicle,
     evaluate_all,
     repeat_first_batches,
 )
-from safevar_sumo.campaign.evaluation import EVERYTHING, VERIFIED_SETTINGS, Selection, system_of
+from safevar_sumo.campaign.evaluation import (
+    EVERYTHING,
+    VERIFIED_SETTINGS,
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+    system_of,
+)
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
-from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.price import (
-    MEASURED,
-    Account,
-    seconds_of_simulation,
-    simulations_of_setting,
-)
+from safevar_sumo.questions.price import MEASURED, Account, seconds_of_simulation
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
+from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.measuring import criterion_of
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import region_of
@@ -123,9 +130,12 @@ class Evaluator:
         """
         expected = sum(settings.values())
         if self.account.is_question:
-            self.account.require((least + MEASURED * self.system.has_simulator) * self._each)
+            has_simulator = self.system.has_simulator
+            self.account.require((least + MEASURED * has_simulator) * self._each, has_simulator)
+            if has_simulator:
+                check_simulator(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
-            self.account.open(expected * self._each, seconds)
+            self.account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:
                 self.account.spend(MEASURED * self._each)
         share = 1.0 if self.left is None else self.left / expected
@@ -137,6 +147,13 @@ class Evaluator:
         """The number of settings that may follow; None without a limit."""
         account = self.account
         return None if account.most is None else int(account.left) // self._each
+
+    def limit(self, simulations: int | None) -> None:
+        """Let the question do so many simulations, with those that check a simulator's class."""
+        self.account.asked = self.account.most = simulations
+        self.account.is_question = True
+        self._pool.most = simulations if self.system.has_simulator else None
+        self._pool.checked = 0
 
     def at_most(self, number: int, part: int = 1) -> int:
         """A number of settings; where few simulations are allowed, at most this part of those that
@@ -318,6 +335,19 @@ class Evaluator:
             )
         return evaluations
 
+    def refuse_other_original(self, case: Case) -> None:
+        """Refuse results whose simulator drives the original vehicle otherwise now; one that is not
+        deterministic, and results of a single point, tell nothing.
+        """
+        study = case.study
+        if not case.has_runs or study.scenario.repeats > 1 or study.origin.point:
+            return
+        if self.system.has_simulator:
+            jobs = [(Task(study=study), self.characteristics.original_settings)]
+            self.account.spend(self._each)
+            now = record(carry_out(evaluate_settings, jobs, self._pool)[0], 0)  # nothing kept
+            refuse_other_original(Path(case.name), case.original, now)
+
     @cached_property
     def no_verdict(self) -> str:
         """Why simulations tell nothing about the ADS, in a sentence with which every answer begins;
@@ -393,9 +423,10 @@ def open_evaluator(
     pool: Pool | None = None,
     jobs: int | None = None,
     progress: Progress = show_no_progress,
+    cluster: str | None = None,
 ) -> Iterator[Evaluator]:
     """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by
-    default one for each core.
+    default one for each core, or on the workers of a cluster at an address.
 
     Raises
     ------
@@ -406,5 +437,5 @@ def open_evaluator(
         yield Evaluator(study, pool, progress)
         return
     assemble(study)  # before workers start
-    with open_pool(jobs) as new_pool, open_evaluator(study, new_pool, None, progress) as evaluator:
-        yield evaluator
+    with open_pool(jobs, cluster) as new_pool:
+        yield Evaluator(study, new_pool, progress)

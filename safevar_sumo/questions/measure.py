@@ -69,7 +69,11 @@ def subject_by(subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator) ->
 
 
 def cases_by(
-    cases: Sequence[Case], text: str | None, jobs: int | None, progress: Progress
+    cases: Sequence[Case],
+    text: str | None,
+    jobs: int | None,
+    progress: Progress,
+    cluster: str | None = None,
 ) -> list[Case]:
     """Results by the criterion that a text states; as they are without one.
 
@@ -82,7 +86,7 @@ def cases_by(
         return [*cases]
     found = []
     for case in cases:
-        with open_evaluator(case.study, jobs=jobs, progress=progress) as evaluator:
+        with open_evaluator(case.study, None, jobs, progress, cluster) as evaluator:
             found.append(case_by(case, evaluator.parse_criterion(text), evaluator))
     return found
 

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
+from safevar_sumo.campaign.batches import forget_other, of_check, of_repeats
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
@@ -39,6 +41,8 @@ class Account:
         Their progress.
     asked
         The largest number that the user allows; None if he says nothing.
+    questions
+        Number of questions of a page, which share the time.
     is_question
         Whether a question asks, which says first what it costs.
     most
@@ -52,6 +56,7 @@ class Account:
 
     phases: Phases
     asked: int | None = None
+    questions: int = 1
     is_question: bool = False
     most: int | None = None
     spent: int = 0
@@ -85,28 +90,47 @@ class Account:
             problem = f"{bound:,} do not suffice: {self.spent:,} are needed to go on"
             raise InputError("simulations", problem, "a larger number")
 
-    def require(self, least: int) -> None:
-        """Refuse fewer simulations than the least number for an answer."""
-        if self.asked is not None and self.asked < least:
-            problem = f"{self.asked:,} do not suffice: an answer takes at least {least:,}"
-            raise InputError("simulations", problem, f"{least} or more")
-
-    def open(self, expected: float, seconds: float | None) -> None:
-        """Allow what the user allows, or all if that does not take too long; `expected` simulations
-        are planned, one of which takes so many seconds, None for an unknown time that is short.
+    def require(self, least: int, has_simulator: bool) -> None:
+        """Refuse fewer simulations than the least number for an answer, and for the check of a
+        simulator.
         """
+        if self.asked is None:
+            return
+        needed = least + has_simulator * (of_check(self.asked) + of_repeats(self.asked))
+        if self.asked < needed:
+            problem = f"{self.asked:,} do not suffice: an answer takes at least {needed:,}"
+            raise InputError("simulations", problem, f"{needed} or more")
+
+    def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
+        """Allow what the user allows, or all if that does not take too long; `expected` simulations
+        are planned, one of which takes so many seconds, None for an unknown time that is short. The
+        check of a simulator's class took `checked` simulations: whatever it took, its part of those
+        that are allowed counts, so that the answer does not depend on what was checked before.
+        """
+        # A number that is stated holds for all: the check, and what is repeated at the end.
+        parts = 0
+        if self.asked is not None and seconds is not None:
+            parts = of_check(self.asked) + of_repeats(self.asked)
         self.most = self.asked
-        if self.asked is not None and self.asked >= expected:
+        if self.asked is not None and self.asked >= expected + parts:
             self.most = None
         if seconds is None:
             return
-        if self.asked is None and expected * seconds > LONGEST:
-            self.most = round_down(LONGEST / seconds)
+        longest = LONGEST / self.questions
+        if self.asked is None and expected * seconds > longest:
+            self.most = round_down(longest / seconds)
+            parts = of_check(self.most) + of_repeats(self.most)
+        if self.most is not None:
+            self.spent += parts
         number = min(expected, float("inf") if self.most is None else self.most)
         words = f"about {number:,.0f} simulations, about {_duration(number * seconds)}"
         if self.most is not None:
             words = f"at most {words.removeprefix('about ')}, of about {expected:,.0f} in full"
-        print_text(Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s)")
+        how = "with" if self.asked is not None else "besides"
+        check = f", {how} {checked:,} for a check of the class" if checked else ""
+        if self.asked is not None and checked:
+            check += ", which is shorter than usual"
+        print_text(Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s{check})")
 
 
 def round_down(number: float) -> int:
@@ -118,23 +142,19 @@ def round_down(number: float) -> int:
 
 def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
     """How long a simulation takes, by all workers together [s], from the original vehicle, which is
-    simulated `MEASURED` times; None where it takes milliseconds, as in SUMO.
+    simulated `MEASURED` times, and must do what it did when an interrupted command began; None
+    where it takes milliseconds, as in SUMO.
     """
     if not system.has_simulator:
         return None
     jobs = [(Task(study=study), CharacteristicSet.of(study).original_settings)]
     carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
     start = time.perf_counter()
-    carry_out(evaluate_settings, jobs, pool)
-    return (time.perf_counter() - start) / (pool.workers * simulations_of_setting(system))
-
-
-def simulations_of_setting(system: System) -> int:
-    """How many simulations a setting takes: at each point, as often as it is repeated, and beside
-    the original vehicle in a study that searches its scenario.
-    """
-    has_pairs = len(system.characteristics.scenario) > 0
-    return len(system.points) * system.repeats * (1 + has_pairs)
+    (original,) = carry_out(evaluate_settings, jobs, pool)
+    seconds = time.perf_counter() - start
+    if system.repeats == 1 and not original.failed[0]:
+        forget_other(study, pool, original)
+    return seconds / (pool.workers * simulations_of_setting(system))
 
 
 def _duration(seconds: float) -> str:

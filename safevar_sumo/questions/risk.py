@@ -138,7 +138,7 @@ def risk(
 
     # How many are unsafe.
     simulated = drawn.take(np.flatnonzero(drawn.valid))
-    failures = int(criterion.of(simulated).sum())
+    failures = criterion.number(simulated)
     total = len(simulated)
     if not total:
         raise SimulationError(
@@ -199,7 +199,7 @@ def _bound_in_words(high: float, total: int, confidence: float) -> str:
     return f"{words}{further if total < needed else ''}"
 
 
-def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
+def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
     """Which characteristic decides the table's measure, as the interval of its share of the
     variance is above those of all others, or which may.
     """
@@ -244,7 +244,7 @@ def deciding_in_words(table: pd.DataFrame, failures: int) -> str:
     return words
 
 
-def _probability_in_words(study: Study, criterion: Unsafe, failures: int, total: int) -> str:
+def _probability_in_words(study: Study, criterion: Unsafe, failures: float, total: int) -> str:
     """The share of unsafe vehicles, and how vehicles vary."""
     share = f"{percentage(failures / total)} %"
     if not study.variation:
@@ -415,13 +415,13 @@ def _table(
         output_names["degree"] = criterion.measure
 
     # Outputs that vary enough have indices.
-    is_unsafe = criterion.of(evaluations)
-    failures = int(is_unsafe.sum())
+    is_unsafe = criterion.runs(evaluations).mean(axis=0)
+    failures = is_unsafe.sum()
     found = dict[str, Indices]()
     if len(degree) >= FEWEST * len(names) and np.ptp(degree) > 0:
         found["degree"] = indices_of(degree)
     if MIN_OUTCOMES <= failures <= len(degree) - MIN_OUTCOMES:
-        found["unsafe"] = indices_of(is_unsafe.astype(float))
+        found["unsafe"] = indices_of(is_unsafe)
 
     # An index of each output, with its interval.
     columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}

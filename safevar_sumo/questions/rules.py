@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import SimulationError
+from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.case import Subject
@@ -101,22 +102,23 @@ def rules(
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
     training = evaluations.take(evaluations.valid & is_first_half)
     testing = evaluations.take(evaluations.valid & ~is_first_half)
-    is_unsafe = criterion.of(training)
-    is_unsafe_in_test = criterion.of(testing)
+    of_runs = criterion.runs(training)
+    unsafe_in_test = criterion.runs(testing).mean(axis=0)
     total = len(training) + len(testing)
-    failures = int(is_unsafe.sum() + is_unsafe_in_test.sum())
+    failures = criterion.number(evaluations.take(evaluations.valid))
     if not total:
         raise SimulationError(
             f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated"
         )
 
     # Rules are boxes in which unsafe vehicles are dense.
-    boxes, remark = _boxes(training.settings, is_unsafe, characteristics)
+    trained = np.tile(training.settings, (len(of_runs), 1))  # with repeats, each run is one
+    boxes, remark = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, testing.settings) for box in boxes]
     over_sets = SharesOverSets.of(evaluator, criterion, testing.settings, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
-        own = shares(box, testing.settings, is_unsafe_in_test)
+        own = shares(box, testing.settings, unsafe_in_test)
         rows.append((conditions(box, characteristics), *own, *over_sets.ends(number, own[0])))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
@@ -181,14 +183,14 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
     return join_phrases(texts) if texts else "everywhere"
 
 
-def shares(box: FloatArray, settings: FloatArray, is_unsafe: BoolArray) -> list[float]:
+def shares(box: FloatArray, settings: FloatArray, unsafe: FloatArray | BoolArray) -> list[float]:
     """The unsafe share within a box, and the share of the unsafe settings within it, each with its
-    interval.
+    interval; `unsafe` is the share of each setting's runs.
     """
     is_inside = is_within(box, settings)
-    count = int(np.count_nonzero(is_inside & is_unsafe))
+    count = round(float(unsafe[is_inside].sum()), SHARE_DECIMALS)
     values = []
-    for total in (int(is_inside.sum()), int(is_unsafe.sum())):
+    for total in (int(is_inside.sum()), round(float(unsafe.sum()), SHARE_DECIMALS)):
         values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
     return values
 

@@ -60,9 +60,17 @@ def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 
     return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
 
 
-def clopper_pearson(count: int, total: int, confidence: float = CONFIDENCE) -> Interval:
-    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`."""
+def clopper_pearson(count: float, total: float, confidence: float = CONFIDENCE) -> Interval:
+    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`; its ends are
+    quantiles of beta distributions, also between whole numbers.
+    """
     import scipy
 
-    interval = scipy.stats.binomtest(count, total).proportion_ci(confidence, method="exact")
+    if count != int(count) or total != int(total):
+        beta, tail = scipy.stats.beta, 0.5 - confidence / 2
+        low = beta.ppf(tail, count, total - count + 1) if count else 0.0
+        return float(low), float(beta.isf(tail, count + 1, total - count)) if count < total else 1.0
+    interval = scipy.stats.binomtest(int(count), int(total)).proportion_ci(
+        confidence, method="exact"
+    )
     return float(interval.low), float(interval.high)

@@ -120,6 +120,23 @@ class Evaluations:
         """Why a setting that is not valid could not be scored."""
         return self.reasons.get(self.settings[row].tobytes(), "no reason was recorded")
 
+    @property
+    def rounds(self) -> list[Evaluations]:
+        """The evaluations of each repeat, where settings are repeated: their outcomes as far as
+        they collide, and the metrics that are kept of each.
+        """
+        found = list[Evaluations]()
+        while (end := f"_{len(found) + 1}") and f"{SAFETY_DEGREE}{end}" in self.metrics:
+            own = {
+                name: self.metrics[f"{name}{end}"]
+                for name in self.metrics
+                if f"{name}{end}" in self.metrics
+            }
+            others = np.where(self.collided, "", self.outcome)
+            outcome = np.where(own[SAFETY_DEGREE] < 0, Outcome.COLLISION.value, others)
+            found.append(replace(self, outcome=outcome, metrics={**self.metrics, **own}))
+        return found
+
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
         return replace(

@@ -22,17 +22,19 @@ from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
 from safevar_sumo.campaign.identity import PLATFORM
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import has_criterion, with_criterion
+from safevar_sumo.questions.ask import SIMULATIONS, has_criterion, with_criterion
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.report.budget import REPLAYS, with_part
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
 from safevar_sumo.report.page import answer_or_reason, answer_to, make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
@@ -104,12 +106,14 @@ class Packed:
         places: Sequence[str],
         jobs: int | None,
         progress: Progress,
+        pool: Pool | None = None,
     ) -> None:
         # The study as its manifest says, and its claims.
         self.packed = packed
         self.files = files
         self._places = places
         self._jobs = jobs
+        self.pool = pool
         self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
@@ -200,22 +204,40 @@ class Packed:
                     placed = with_list(text, str(path))
                 usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
-                answer = ask(placed, [case], [self._directory], None, self._jobs, self._progress)
-            self._answers[text] = replace(answer, command=answer.command.replace(f"{folder}/", ""))
+                part = with_part(text, self.packed.simulations).removeprefix(text)
+                number = len(self.packed.questions) + 1
+                asked = partial(ask, pool=self.pool, questions=number)
+                where = [self._directory], None, self._jobs, self._progress
+                answer = asked(f"{placed}{part}", [case], *where)
+            command = answer.command.replace(f"{folder}/", "")
+            self._answers[text] = replace(answer, command=command)
         return self._answers[text]
+
+    def simulations(self) -> dict[str, int]:
+        """The largest number of simulations of each question whose text does not state it."""
+        flag = f" {SIMULATIONS.flag} "
+        return self.packed.simulations | {
+            text: int(answer.command.rpartition(flag)[2])
+            for text, answer in self._answers.items()
+            if flag in answer.command and flag not in f" {text} "
+        }
 
     def _answer_json(self, text: str) -> bytes:
         return json_bytes(packed_answer(self.answer(text)))
 
-    def page(self) -> bytes:
-        answers = [self.answer(text) for text in self.packed.questions]
-        versions = self.manifest["versions"]
+    def ask_speed(self) -> ReportedStudy:
+        """What the page is about, with the answer about the speed of its sheet."""
         study = ReportedStudy(
-            directory=self._directory, case=self.shown, versions=versions, answers=answers
+            directory=self._directory,
+            case=self.shown,
+            versions=self.manifest["versions"],
+            answers=[self.answer(text) for text in self.packed.questions],
+            simulations=self.packed.simulations.get(REPLAYS),
         )
-        study = with_speed(
-            study, lambda text: self.answer(with_criterion(text, self.packed.unsafe))
-        )
+        return with_speed(study, lambda text: self.answer(with_criterion(text, self.packed.unsafe)))
+
+    def page(self) -> bytes:
+        study = self.ask_speed()
         return make_page([study], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:

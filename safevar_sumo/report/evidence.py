@@ -10,18 +10,30 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
+
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
+from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion, Jobs, parse_question, with_criterion
+from safevar_sumo.questions.ask import (
+    Cluster,
+    Criterion,
+    Jobs,
+    Simulations,
+    parse_question,
+    with_criterion,
+)
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import number_of
+from safevar_sumo.records import JsonObject
+from safevar_sumo.report.budget import divided
 from safevar_sumo.report.claims import (
     ANSWERS,
     CANNOT,
@@ -58,10 +70,12 @@ from safevar_sumo.report.pack import (
     versions_here,
     write_pack,
 )
-from safevar_sumo.report.page import usual_questions
+from safevar_sumo.report.page import speed_part, usual_questions
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
+from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 
@@ -71,8 +85,10 @@ def evidence(
     ask: tuple[str, ...] = (),
     unsafe: Criterion = None,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     progress: bool | Progress = False,
     fresh: bool = False,
+    simulations: Simulations = None,
 ) -> str:
     """Pack results with their study, page and answers, so that anybody can compute every number
     again.
@@ -94,11 +110,15 @@ def evidence(
         metric such as "drac > 6".
     jobs
         Number of worker processes, by default one for each core.
+    cluster
+        Compute on the workers of this Dask scheduler instead.
     progress
         True for a bar on the terminal, or a function of a phase, the number of simulations done,
         and their total.
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
+    simulations
+        At most so many simulations for all answers and replays, which share them.
 
     Returns
     -------
@@ -120,7 +140,9 @@ def evidence(
     files = dict[str, bytes]()
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            described, own_files = _pack_study(number, directory, ask, unsafe, jobs, show)
+            how: JsonObject = {"jobs": jobs, "cluster": cluster}
+            part = None if simulations is None else simulations // len({*map(Path, results)})
+            described, own_files = _pack_study(number, directory, ask, unsafe, how, show, part)
             studies.append(described)
             files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
     write_pack(out, studies, files)
@@ -132,8 +154,9 @@ def _pack_study(
     directory: Path,
     ask: Sequence[str],
     unsafe: str | None,
-    jobs: int | None,
+    how: JsonObject,
     progress: Progress,
+    simulations: int | None,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
     # The results, with what `verify` compares or names of their manifest.
@@ -148,21 +171,31 @@ def _pack_study(
     manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
 
     # The questions, by the criterion that the user gave.
-    (shown,) = cases_by([case], unsafe, jobs, show_no_progress)
+    (shown,) = cases_by([case], unsafe, progress=show_no_progress, **how)
     asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
     questions, lists = _with_lists(list(dict.fromkeys(asked)))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
-    described = PackedStudy(
-        folder, questions, runs, count_outcomes(case), count_solutions(case.solutions, runs), unsafe
-    )
+    parts = dict[str, int]()
+    if simulations is not None:
+        system = assemble(shown.study)
+        again = len(case.settings) * (shown.study != case.study) * simulations_of_setting(system)
+        parts = divided([*questions, *speed_part(questions, case)], simulations - again, system)
+    outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
+    described = PackedStudy(folder, questions, runs, outcomes, solutions, unsafe, parts)
 
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
-    packed = Packed(described, files, study.origin.places, jobs, Parts(progress).begin(study.name))
-    answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
-    return described, {**files, STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
+    show_part = Parts(progress).begin(study.name)
+    with open_pool(**how) as pool:
+        pool.shared = {} if assemble(study).has_simulator else None
+        packed = Packed(described, files, study.origin.places, how["jobs"], show_part, pool)
+        answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
+        packed.ask_speed()
+    packed.pool = None
+    files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
+    return msgspec.structs.replace(described, simulations=packed.simulations()), files
 
 
 def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:

@@ -43,7 +43,8 @@ PACK = "a file that the command `evidence` has written, unchanged"
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     """One results directory in a pack: its folder there, the questions that its answers answer, as
     typed, its finished runs, the number of their evaluations by outcome, the numbers of solutions
-    of each run, of all and of different ones, and what is unsafe, if it was stated.
+    of each run, of all and of different ones, what is unsafe, if it was stated, and the largest
+    numbers of simulations of questions that followed from their time.
     """
 
     folder: str
@@ -52,6 +53,7 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
     solutions: list[int]
     unsafe: str | None = None
+    simulations: dict[str, int] = {}
 
 
 class PackedPlatform(Struct, frozen=True, forbid_unknown_fields=True):

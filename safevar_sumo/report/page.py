@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
@@ -17,13 +18,17 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from safevar_sumo.campaign.cache import keep_simulations
+from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.output import check_writable
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import (
+    SIMULATIONS,
+    Cluster,
     Criterion,
     Jobs,
+    Simulations,
     has_criterion,
     parse_question,
     quick_questions,
@@ -34,9 +39,12 @@ from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
+from safevar_sumo.report.budget import REPLAYS, divided, with_part
 from safevar_sumo.report.sections import ReportedStudy, page_commands, replays, tested, trust
 from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
+from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 if TYPE_CHECKING:
@@ -66,10 +74,12 @@ def report(
     unsafe: Criterion = None,
     point: str | None = None,
     jobs: Jobs = None,
+    cluster: Cluster = None,
     progress: bool | Progress = False,
     as_it_is_now: bool = False,
     fresh: bool = False,
     quick: bool = False,
+    simulations: Simulations = None,
 ) -> Path:
     """Write one page about results that opens offline: what decides, replays, answers, trust, and
     commands.
@@ -92,6 +102,8 @@ def report(
         Only this point of the study's matrix.
     jobs
         Number of worker processes, by default one for each core.
+    cluster
+        Compute on the workers of this Dask scheduler instead.
     progress
         True for a bar on the terminal, or a function of a phase, the number of simulations done,
         and their total.
@@ -102,6 +114,8 @@ def report(
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
         Rough answers: the study's own parameter set alone, and a short search. No line to sign.
+    simulations
+        At most so many simulations for all answers and replays, which share them.
 
     Returns
     -------
@@ -132,23 +146,38 @@ def report(
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     command = f"report {paths} {point} {ask} {unsafe} {quick}"
-    with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
-        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress)
+    with (
+        open_progress(progress) as show,
+        keep_simulations(command, fresh=fresh),
+        ExitStack() as stack,
+    ):
+        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
         texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
+        pool, budgets = None, list[dict[str, int]]()
+        has_simulator = any(assemble(case.study).has_simulator for case in cases)
+        if has_simulator or cluster or simulations:
+            pool = stack.enter_context(open_pool(jobs, cluster))
+        if pool is not None and has_simulator:
+            pool.shared = {}
+        if simulations:
+            budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
         parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(text: str, chosen: slice, *, is_asked: bool = bool(ask)) -> Answer:
             """The next answer, about these of the results."""
-            question = with_criterion(text, unsafe)
+            stated = with_part(text, budgets[chosen.start or 0]) if budgets else text
+            question = with_criterion(stated, unsafe)
             subjects = by_criterion if has_criterion(question, unsafe) else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.split()[0]}"
             show_part = parts.begin(name)
             answer = answer_to if is_asked else answer_or_reason
-            return answer(question, subjects[chosen], paths[chosen], point, jobs, show_part)
+            about = subjects[chosen], paths[chosen], point
+            how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool}
+            return answer(question, *about, jobs, show_part, questions=len(texts), **how)
 
         # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
@@ -161,18 +190,48 @@ def report(
                 answers=[next_answer(text, chosen) for text in asked[number]],
                 point=point or "",
                 later_changes=later_changes[number],
+                simulations=budgets[number][REPLAYS] if budgets else None,
             )
             studies.append(with_speed(study, partial(next_answer, chosen=chosen, is_asked=False)))
         shared = [next_answer(text, slice(None)) for text in joint]
+        stack.close()  # this process simulates the replays
         page = make_page(studies, shared, parts)
     write_whole(out, page)
     return out
 
 
+def _budgets(
+    cases: Sequence[Case],
+    at_point: Sequence[Case],
+    by_criterion: Sequence[Case],
+    asked: Sequence[Sequence[str]],
+    joint: Sequence[str],
+    simulations: int,
+) -> list[dict[str, int]]:
+    """The simulations of the questions about each of the results, which have equal parts; those of
+    joint questions are the first one's. Solutions that were simulated again count.
+    """
+    found = []
+    for number, case in enumerate(cases):
+        system = assemble(by_criterion[number].study)
+        again = (at_point[number] is not case) + (
+            by_criterion[number].study != at_point[number].study
+        )
+        spent = again * len(case.settings) * simulations_of_setting(system)
+        texts = [*_with_speed_part(asked[number], case), *(joint if number == 0 else [])]
+        found.append(divided(texts, simulations // len(cases) - spent, system))
+    return found
+
+
 def _with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
     """The questions about results, with that of the greatest speed that their sheet has."""
+    return [*asked, *speed_part(asked, case)]
+
+
+def speed_part(asked: Sequence[str], case: Case) -> list[str]:
+    """The question of the greatest speed that the sheet of a page has, without its options."""
     has_sheet = any(text.startswith("tolerance") for text in asked)
-    return [*asked, *(["permit"] if has_sheet and speeds_of(case) else [])]
+    return ["permit"] if has_sheet and speeds_of(case) else []
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
@@ -217,6 +276,10 @@ def answer_to(
     point: str | None,
     jobs: int | None,
     progress: Progress,
+    *,
+    as_it_is_now: bool = False,
+    pool: Pool | None = None,
+    questions: int = 1,
 ) -> Answer:
     """The answer to a question about results.
 
@@ -229,14 +292,18 @@ def answer_to(
     if len(question.others) + 1 != len(cases):
         expected = f"{len(question.others) + 1} results directories"
         raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
+    simulations = values.pop(SIMULATIONS.name, None)
     command = question.command_line([str(directory) for directory in directories], point, values)
-    return replace(question.answer(cases, values, jobs=jobs, progress=progress), command=command)
+    how: JsonObject = {"simulations": simulations, "jobs": jobs, "as_it_is_now": as_it_is_now}
+    how |= {"pool": pool, "questions": questions}
+    answer = question.answer(cases, values, **how, progress=progress)
+    return replace(answer, command=command + answer.command)
 
 
-def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any) -> Answer:
+def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any, **how: Any) -> Answer:
     """As `answer_to`, but if a question that nobody asked for has no answer, the reason."""
     try:
-        return answer_to(text, cases, *arguments)
+        return answer_to(text, cases, *arguments, **how)
     except InputError as error:
         name, study = text.partition(" ")[0], cases[0].study
         verdict = f"No answer: {error.problem}; expected: {error.legal}."

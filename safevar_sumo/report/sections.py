@@ -36,6 +36,7 @@ from safevar_sumo.results import choose_handle, handles_of
 from safevar_sumo.scenarios import SCENARIOS, equals_clear, pre_crash_sentence
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import vehicle_remarks
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES
@@ -130,6 +131,8 @@ class ReportedStudy:
         The files and versions that have changed since.
     speed
         The answer to `speed_question`, which is among the answers, too.
+    simulations
+        The largest number of simulations of its replays in a simulator of the user's own.
     """
 
     directory: Path
@@ -139,6 +142,7 @@ class ReportedStudy:
     point: str = ""
     later_changes: Sequence[str] = ()
     speed: Answer | None = None
+    simulations: int | None = None
 
     @cached_property
     def system(self) -> System:
@@ -335,7 +339,8 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     # The fewest changes, as `study` names them, and the chosen solutions.
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
-    fewest = fewest_changes(study.case, jobs=1)
+    most = study.simulations if study.system.has_simulator else None
+    fewest = fewest_changes(study.case, jobs=1) if most is None else None
     if fewest is not None:
         settings["Fewest changes"] = fewest.settings[0]
     for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
@@ -353,7 +358,11 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
         name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
 
-    # Each is simulated again, and compared with what was recorded.
+    # Each is simulated again, and compared with what was recorded: as many as there may be, each
+    # with the original vehicle, and at the points of a matrix to know the worst one.
+    if most is not None:
+        each = simulations_of_setting(study.system) + 2 * study.system.repeats
+        settings = dict([*settings.items()][: most // each])
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))

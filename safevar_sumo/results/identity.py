@@ -100,6 +100,7 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
     new keys of a study do not.
     """
     inputs_before = identity_in(stored)
+    searching = {*SEARCH_PACKAGES} - {*now.get("libraries", ())}  # a simulator may use them, too
     for layer, inputs in identity_in(now).items():
         for key, before, after in changed_values(inputs_before[layer], inputs):
             if key in PYMOO_PACKAGES and None in (before, after):
@@ -116,7 +117,7 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
                 text = f"{name} was {before!r} and is {after!r} now"
             is_harmless = (
                 layer == "platform"
-                or (layer == "versions" and key in SEARCH_PACKAGES)
+                or (layer == "versions" and key in searching)
                 or (layer == "study" and before is None)
             )
             yield layer, text, not is_harmless

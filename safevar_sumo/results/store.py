@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -44,6 +44,10 @@ if TYPE_CHECKING:
 
 RunKeyT = TypeVar("RunKeyT", bound=tuple[str, int])
 """The key of a run: its algorithm and number."""
+
+
+ROUNDING = 1e-6
+"""Largest difference of the original vehicle's results on another machine, relative or not."""
 
 
 class ResultsDirectory:
@@ -100,7 +104,10 @@ class ResultsDirectory:
         that covers other runs.
         """
         earlier_manifest = self._earlier_manifest()  # another study may have begun meanwhile
-        manifest = {**self.manifest, "original": record(original, row=0)}
+        now = record(original, row=0)
+        manifest = {**self.manifest, "original": now}
+        if self._study.scenario.repeats == 1:
+            refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
         write_manifest(self.path, manifest)
         if earlier_manifest and search_extent_of(earlier_manifest) != search_extent_of(manifest):
             with disk_errors(self.path / SOLUTIONS, "removed"):
@@ -237,6 +244,29 @@ def record(evaluations: Evaluations, row: int) -> JsonObject:
         **{name: finite_or_none(value) for name, value in numbers.items()},
         "f_num_diff": int(evaluations.f_num_diff[row]),
     }
+
+
+def refuse_other_original(
+    directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any]
+) -> None:
+    """Refuse to mix results with those of a simulator that drives the original vehicle otherwise.
+
+    Raises
+    ------
+    InputError
+        With the first of its results that differs by more than rounding.
+    """
+    for name, before in stored.items():
+        value = now.get(name, before)
+        if isinstance(before, str) or isinstance(value, str):
+            is_same = before == value
+        else:
+            first, second = (np.nan if one is None else float(one) for one in (before, value))
+            is_same = bool(np.isclose(first, second, ROUNDING, ROUNDING, equal_nan=True))
+        if not is_same:
+            problem = f"the original vehicle had {name} = {before}, and has {value} now"
+            legal = "what the simulator read and ran at that time; or another `out`"
+            raise InputError(directory, problem, legal)
 
 
 UNKNOWN = "unknown"

@@ -70,9 +70,21 @@ class LearnedDriver(Simulator):
         if find_spec("metadrive") is None:
             raise missing_extra("", "the learned driver needs MetaDrive", "metadrive")
 
+    @classmethod
+    def open_worker(cls, worker: int) -> Any:
+        """What returns MetaDrive's environment for a curve."""
+        return environment
+
+    @classmethod
+    def close_worker(cls, handle: Any) -> None:
+        """End MetaDrive's engine."""
+        from metadrive.engine.engine_utils import close_engine
+
+        close_engine()
+
     def simulate(self, setting: Mapping[str, float]) -> Mapping[str, Any]:
         """Drive one vehicle with a setting of the characteristics in `UNITS`."""
-        scene = environment(self.curve)
+        scene = self.worker(self.curve)
         from metadrive.examples.ppo_expert import numpy_expert
         from shapely.geometry import Polygon
 
@@ -123,6 +135,8 @@ class LearnedDriver(Simulator):
                 strict=True,
             )
         )
+        if is_hit and not info["crash"]:  # the edge of the road is a body, too
+            trace["separation"][-1] = 0.0
         outcome = Outcome.STOPPED if ego.speed < 0.3 else Outcome.TIMEOUT
         outcome = Outcome.COLLISION if is_hit else outcome
         return {**trace, "outcome": outcome, "impact_speed": trace["speed"][-1]}
@@ -131,8 +145,8 @@ class LearnedDriver(Simulator):
 def environment(curve: str) -> Any:
     """MetaDrive's environment on a road with a curve, without traffic.
 
-    MetaDrive's engine exists once in a process. It keeps its environment itself, as a copy of this
-    module may use it, too.
+    MetaDrive's engine exists once in a process. It keeps its environment itself, as another class
+    may use it, too.
     """
     from metadrive.engine.engine_utils import BaseEngine, close_engine
     from metadrive.envs import MetaDriveEnv

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import NamedValues, Outcome
+from safevar_sumo.records import FloatArray, NamedValues, Outcome, Trace
 from safevar_sumo.scenarios.base import Scenario
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -31,6 +31,14 @@ OF_COLLISION = {IMPACT_SPEED: SPEED, STRUCK_SPEED: Legal()}
 """What a collision has besides, and may have."""
 OUTCOMES = [outcome.value for outcome in [*Outcome][:6]]
 """How a run may end: all but failures of the simulator and settings that are not simulated."""
+ENDS_APART = (Outcome.PASSED, Outcome.STOPPED, Outcome.TIMEOUT)
+"""Outcomes of runs in which nothing was touched."""
+MOST_DECELERATION = 20.0
+"""Largest change of the speed in a second that every trace may have [m/s^2]."""
+SLACK, CREEPS = 0.1, 1.0
+"""Rounding of distances and speeds [m, m/s]; a speed up to which a vehicle has stopped [m/s]."""
+FACTOR = 1.5
+"""Least factor between speed and way that is no error of sampling."""
 STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
@@ -87,7 +95,54 @@ def _checked_trace(
         raise code.wrong(method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]")
     ends = OF_COLLISION if has_collided else {}
     numbers = {name: result.get(name, 0.0) for name in ends}
-    return {**columns, **_numbers(code, method, numbers, ends)}
+    numbers = _numbers(code, method, numbers, ends)
+    if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, steps[0]):
+        legal = "an end that the trace allows within one of its steps"
+        raise code.wrong(method, contradiction, legal)
+    return {**columns, **numbers}
+
+
+def _contradiction(
+    outcome: str, columns: Mapping[str, FloatArray], ends: Mapping[str, float], step: float
+) -> str:
+    """What a trace says of the end of its run that its samples exclude, by more than may happen
+    within one step [s]; "" if nothing.
+    """
+    speed, separation = columns["speed"], columns["separation"]
+    braked = max(float(np.abs(np.diff(speed)).max()), MOST_DECELERATION * step)
+    if outcome == Outcome.COLLISION:
+        # What it struck moves as fast as it is known to.
+        others = [ends[STRUCK_SPEED], *columns.get("obstacle_speed", ())]
+        finite = separation[np.isfinite(separation)]
+        near = (speed.max() + braked + np.abs(others).max()) * step
+        near += float(np.abs(np.diff(finite)).max(initial=0.0))
+        if finite.size and finite.min() > near + SLACK:
+            return f"a collision at a separation of {finite.min():.3g} m"
+        impact = ends[IMPACT_SPEED]
+        if np.abs(speed - impact).min() > braked + SLACK:
+            return f"{IMPACT_SPEED} = {impact:.3g} after a speed of {speed[-1]:.3g}"
+        return ""
+    if outcome in ENDS_APART and separation.min() <= 0:
+        return f"{outcome!r} with a separation of 0"
+    if outcome == Outcome.STOPPED and speed[-1] > max(braked, CREEPS):
+        return f"{outcome!r} at a speed of {speed[-1]:.3g}"
+    return ""
+
+
+def unit_contradiction(trace: Trace) -> str:
+    """Where the first run of a trace moves by another factor than its speed says, as with km/h for
+    m/s; "" if it does not, or has neither a position nor the gap to one standing body.
+    """
+    here = trace.active[:, 0]
+    speed, gap = trace.speed[here, 0], trace.gap[here, 0]
+    driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
+    stands = (trace.obstacle_speed[here, 0] == 0).all() and (np.diff(gap) <= 0).all()
+    ways = {"position": np.ptp(trace.position[here, 0]), "gap": np.ptp(gap) if stands else np.nan}
+    for name, way in ways.items():
+        is_apart = abs(way - driven) > max(speed.max() * trace.step, 1.0)
+        if is_apart and max(way, driven) > FACTOR * min(way, driven):
+            return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
+    return ""
 
 
 def _checked_metrics(
@@ -126,6 +181,8 @@ class Simulator(Scenario):
         Distributions on whose versions results depend, such as `metadrive-simulator`.
     version
         The simulator's own version, if no distribution has it.
+    worker
+        What `open_worker` returned in this process.
     """
 
     __slots__ = ()
@@ -134,6 +191,7 @@ class Simulator(Scenario):
     OPTIONAL: ClassVar[tuple[str, ...]] = ()
     LIBRARIES: ClassVar[tuple[str, ...]] = ()
     version: ClassVar[str] = ""
+    worker: ClassVar[Any] = None
     network: str = ""
     duration: float = 60.0
 
@@ -154,5 +212,17 @@ class Simulator(Scenario):
         Without a trace it has `outcome`, `safety_degree` and any of the study's metrics by name.
         """
 
+    @classmethod
+    def open_worker(cls, worker: int) -> Any:
+        """Open what is slow to start, once in a process: the objects of the class find it as
+        `self.worker`. Processes that simulate on one machine at the same time have different
+        numbers, from 0; one that replaces a dead one has its number.
+        """
+        return None
+
+    @classmethod
+    def close_worker(cls, handle: Any) -> None:
+        """End what `open_worker` returned; nothing by default."""
+
     def close(self) -> None:
-        """End the simulator; nothing by default."""
+        """End the simulator when its process ends; nothing by default."""

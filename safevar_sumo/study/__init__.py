@@ -20,6 +20,7 @@ from safevar_sumo.study.file import (
     user_code as user_code,
     user_code_names as user_code_names,
     user_modules as user_modules,
+    without_skipping as without_skipping,
     write_study as write_study,
 )
 from safevar_sumo.study.marks import (

@@ -31,6 +31,7 @@ from safevar_sumo.study.marks import (
 from safevar_sumo.study.scenario_file import MODEL, files_of_scenario, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
+    OBJECTIVES,
     PYMOO,
     Origin,
     Parameters,
@@ -133,6 +134,12 @@ def checked_study(raw: StudyTables) -> Study:
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
+
+    # With repeats the search maximises the share of unsafe runs.
+    scenario, search = tables.get("scenario"), tables.get("search")
+    has_repeats = isinstance(scenario, dict) and scenario.get("repeats", 1) != 1
+    if has_repeats and isinstance(search, dict):
+        tables["search"] = {"objectives": ["unsafe_share", *OBJECTIVES[1:]], **search}
 
     # Records, and what concerns several of them.
     study = convert_table(tables, Study)
@@ -374,6 +381,12 @@ def write_study(path: Path, study: Study, comment: str) -> None:
 def user_code_names(study: Study) -> list[str]:
     """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
     return [f"{key} = {name!r}" for key, name in (*user_code(study), *fmus_of(study))]
+
+
+def without_skipping(study: Study) -> Study:
+    """A study that stops where its simulator fails."""
+    search = msgspec.structs.replace(study.search, failed="stop")
+    return msgspec.structs.replace(study, search=search)
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:

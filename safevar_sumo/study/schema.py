@@ -105,7 +105,7 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     The original vehicle drives in the same encounter as each variant, and must keep at least
     `margin` [m] between bodies there: otherwise the encounter does not count, as it shows nothing
     of the variant. A simulator of the user's own that is not deterministic simulates each setting
-    `repeats` times: the mean of each metric counts, and the worst outcome.
+    `repeats` times: the share of unsafe runs, the worst run, and means of metrics count.
     """
 
     search: Annotated[dict[str, Domain], ORDERED] = {}
@@ -186,10 +186,12 @@ class SearchTable(Table, frozen=True, kw_only=True):
     """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in
     generations of `population`; `seed` is the seed of all random numbers.
 
-    A batch of simulations longer than `time_limit` [s] counts as hung. The search minimises
-    `objectives`, and drives metrics in their unsafe direction. `reference_point` is each coordinate
-    of the hypervolume's reference point, for objectives normalised to 0..1 [-]. `parameters` hold
-    the parameters of algorithms by name or label; a file has them in tables such as [search.nsga2].
+    A batch of simulations longer than `time_limit` [s] counts as hung. A setting on which a
+    simulator of the user's own fails stops the study, or with `failed` = "skip" is infeasible. The
+    search minimises `objectives`, and drives metrics in their unsafe direction. `reference_point`
+    is each coordinate of the hypervolume's reference point, for objectives normalised to 0..1 [-].
+    `parameters` hold the parameters of algorithms by name or label; a file has them in tables such
+    as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1), WITHOUT_EFFECT]
@@ -198,6 +200,7 @@ class SearchTable(Table, frozen=True, kw_only=True):
     runs: Annotated[int, Meta(ge=1, le=100_000), WITHOUT_EFFECT]
     seed: Seed
     time_limit: Annotated[float, Meta(gt=0, le=86400), WITHOUT_EFFECT] = 300.0
+    failed: Annotated[Literal["stop", "skip"], WITHOUT_EFFECT] = "stop"
     objectives: Annotated[list[str], Meta(min_length=2, max_length=6)] = msgspec.field(
         default_factory=lambda: list(OBJECTIVES)
     )

@@ -57,7 +57,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
         metrics=metrics,
         **system.characteristics.change_objectives(settings),
     )
-    return found if system.repeats == 1 else joined(found, system.repeats)
+    return found if system.repeats == 1 else joined(found, system.repeats, system.criterion)
 
 
 def reason_for_sumo(system: System) -> str:

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace as replace_in
 
-from safevar_sumo.errors import InputError, check_text
-from safevar_sumo.metrics import IMPACT_EXCESS, RATING_POINTS, STOPPING_DISTANCE
+from safevar_sumo.errors import InputError, UserCodeError, check_text
+from safevar_sumo.metrics import IMPACT_EXCESS, METRICS, RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import (
     Evaluations,
@@ -154,10 +154,21 @@ def drive_and_score(
         vehicles, variants, original_of = _beside(system, settings, originals)
 
     # At all points, or at the only one.
-    if system.matrix:
-        found = evaluate_matrix(system, vehicles, engine)
-    else:
-        found = score(system, vehicles, drive_all(system, vehicles, engine))
+    try:
+        if system.matrix:
+            found = evaluate_matrix(system, vehicles, engine)
+        else:
+            found = score(system, vehicles, drive_all(system, vehicles, engine))
+    except UserCodeError as error:
+        if not (system.skips_failed and system.has_simulator):
+            raise
+        reason = " ".join(f"{error.source}: {error.problem}".split())
+        metrics = dict.fromkeys((*METRICS, *system.measuring.measures))
+        changes = system.characteristics.change_objectives(vehicles)
+        reasons = {row.tobytes(): reason for row in vehicles}
+        found = Evaluations.undefined(
+            vehicles, Outcome.SIMULATOR_ERROR, metrics, reasons=reasons, **changes
+        )
     if not takes_pairs:
         return found
 

@@ -17,6 +17,7 @@ from safevar_sumo.metrics import (
     OPTIONAL_METRICS,
     RATING_POINTS,
     STOPPING_DISTANCE,
+    UNSAFE_SHARE,
     Measure,
     Scoring,
     Unsafe,
@@ -65,7 +66,11 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         If a measure does not exist, is invalid, or has a name that is taken.
     """
     # Metrics that the study has anyway.
-    further = ((RATING_POINTS, is_rated(study)), (STOPPING_DISTANCE, has_stops))
+    further = (
+        (RATING_POINTS, is_rated(study)),
+        (STOPPING_DISTANCE, has_stops),
+        (UNSAFE_SHARE, study.scenario.repeats > 1),
+    )
     computed = {
         **METRICS,
         **{metric.name: metric for metric, is_computed in further if is_computed},

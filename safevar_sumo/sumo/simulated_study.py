@@ -37,6 +37,9 @@ def check_tables(study: Study, scenario: type) -> None:
         if study.scenario.repeats > 1:
             problem = f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit"
             raise InputError("", problem, "no repeats, or a simulator of the user's own")
+        if study.search.failed != "stop":
+            problem = f"search.failed = {study.search.failed!r} without a simulator of one's own"
+            raise InputError("", problem, "'stop': settings on which SUMO fails are skipped anyway")
         for key in ("vehicle.model", "ads.model", "weather"):
             if not given[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key

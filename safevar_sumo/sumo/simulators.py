@@ -1,5 +1,5 @@
-"""Runs in a simulator of the user's own, which drives one vehicle after another; a process keeps
-it.
+"""Runs in a simulator of the user's own, which drives one vehicle after another; a process opens it
+once.
 """
 
 from __future__ import annotations
@@ -9,17 +9,30 @@ import inspect
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import replace
+from hashlib import sha256
+from inspect import getattr_static
+from pathlib import Path
+from random import Random
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import msgspec
 import numpy as np
 
-from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
 from safevar_sumo.plugins import UserCode, user_errors
-from safevar_sumo.plugins.process import REPRODUCED_BY, note_work, this_process
+from safevar_sumo.plugins.process import (
+    MARK,
+    MAX_DEATHS,
+    REPRODUCED_BY,
+    end_children,
+    note_work,
+    set_variables,
+    this_process,
+)
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
@@ -56,6 +69,7 @@ SEVERITY = [
     Outcome.STOPPED,
 ]
 """Outcomes of the rounds of a setting, the worst first."""
+COLLISION = Unsafe()
 NO_TRACE: Mapping[str, FloatArray] = {
     TIME: np.array([0.0, 1.0]),
     "speed": np.zeros(2),
@@ -64,42 +78,85 @@ NO_TRACE: Mapping[str, FloatArray] = {
 """What stands in place of the trace of a run that has none."""
 
 
+ARRAYS = (np.generic, np.ndarray, np.random.Generator, np.random.RandomState)
+PLAIN = (bool, int, float, complex, str, bytes, tuple, list, dict, set, Random, *ARRAYS)
+"""Types of attributes of a simulator that each run has for itself, unlike an open connection."""
+
+
 class _Kept:
-    """The simulators of this process, one of each class, kept between runs; their fields are set
-    for each run.
+    """What this process keeps of the simulators of the user's own: of each class the handle that
+    its `open_worker` returned, and the object that simulated last.
     """
 
     def __init__(self) -> None:
-        self._simulators = dict[str, Simulator]()
+        self._last = dict[str, Simulator]()
+        self._handles = dict[str, tuple[int, type[Simulator], Any]]()
+        self.simulated = 0
 
     def at(self, scenario: Simulator) -> Simulator:
-        """The simulator of a scenario's class, with its fields; a new one if the code was loaded
-        anew.
+        """An object as `scenario` was when it was created with its fields, with the handle of its
+        class; a new handle if the file of the class was edited.
         """
         kind = type(scenario)
         name = f"{kind.__module__}:{kind.__qualname__}"
-        if type(self._simulators.get(name)) is not kind:
+        has_worker = getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
+        file = inspect.getfile(kind.open_worker)
+        edited = Path(file).stat().st_mtime_ns if has_worker else id(kind)
+        if name in self._handles and self._handles[name][0] != edited:
             self._close(name)
-            self._simulators[name] = copy(scenario)
-        simulator = self._simulators[name]
-        is_struct = isinstance(simulator, msgspec.Struct)
+        if name not in self._handles:
+            handle = kind.open_worker(this_process.worker)
+            self._handles[name] = edited, kind, handle
+        handle = self._handles[name][2]
+
+        # Nothing that a run changes stays in the scenario. Without `open_worker`, what the run
+        # before opened and put into the object is handed on.
+        is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
-        for field in inspect.signature(kind).parameters:
-            if hasattr(scenario, field):
-                set_field(simulator, field, getattr(scenario, field))
+        simulator = _deep_copy(scenario) if has_worker or is_struct else copy(scenario)
+        if has_worker:
+            try:
+                set_field(simulator, "worker", handle)
+            except AttributeError:  # a Struct has its fields alone
+                kind.worker = property(lambda self: handle)
+        elif not is_struct:
+            for field, value in vars(simulator).items():
+                set_field(simulator, field, deepcopy(value) if isinstance(value, PLAIN) else value)
+            for field, value in vars(self._last.get(name, simulator)).items():
+                if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
+                    set_field(simulator, field, value)
+        self._last[name] = simulator
         return simulator
 
     def close(self) -> None:
         """End all simulators."""
-        for name in [*self._simulators]:
+        for name in [*self._handles]:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        if simulator := self._simulators.pop(name, None):
-            simulator.close()
+        last = self._last.pop(name, None)
+        _, kind, handle = self._handles.pop(name)
+        if last is not None:
+            last.close()
+        kind.close_worker(handle)
+
+
+def _deep_copy(scenario: Simulator) -> Simulator:
+    """A copy that shares nothing, where that can be copied."""
+    try:
+        return deepcopy(scenario)
+    except (TypeError, AttributeError, ValueError, RuntimeError):
+        return copy(scenario)
 
 
 _kept = _Kept()
+_steps = WeakKeyDictionary[type, dict[str, float]]()
+"""The time step of each class, as this process has loaded it, at each point [s]."""
+
+
+def number_simulated() -> int:
+    """How often this process has simulated in simulators of the user's own."""
+    return _kept.simulated
 
 
 @atexit.register
@@ -107,6 +164,7 @@ def close_simulator() -> None:
     """End the simulators of this process, also where one fails to end."""
     with suppress(Exception):
         _kept.close()
+    end_children(this_process.mark)
 
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
@@ -120,17 +178,59 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
     results = []
     for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), rows, strict=True):
-        note_work(f"{REPRODUCED_BY}{system.command} {system.characteristics.options(row)}")
+        command = f"{system.command} {system.characteristics.options(row)}"
+        note_work(f"{REPRODUCED_BY}{command}")
         scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
         assert isinstance(scenario, Simulator)
-        with user_errors(system.source), end_if_longer(system.time_limit):
-            simulator = _kept.at(scenario)
+        with (
+            set_variables({MARK: this_process.mark}),
+            user_errors(system.source),
+            _attempt(f"{command} {point.name}", system),
+            end_if_longer(system.time_limit),
+        ):
             with _end_worker():
+                simulator = _kept.at(scenario)
+                _kept.simulated += 1
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
-            if TIME not in result:
+            if TIME in result:
+                _check_step(simulator, result[TIME], point.name)
+            else:
                 _check_names(scenario, result, system)
         results.append(result)
     return _runs_of(results, system, point.allowed_impact_speed)
+
+
+def simulations_of_setting(system: System) -> int:
+    """How many simulations a setting takes: at each point, as often as it is repeated, and beside
+    the original vehicle in a study that searches its scenario.
+    """
+    has_pairs = len(system.characteristics.scenario) > 0
+    return len(system.points) * system.repeats * (1 + has_pairs)
+
+
+@contextmanager
+def _attempt(what: str, system: System) -> Iterator[None]:
+    """Note that a setting is simulated, for a study that skips those that fail.
+
+    Raises
+    ------
+    UserCodeError
+        If two workers have died of it.
+    """
+    if this_process.attempts is None or not system.skips_failed:
+        yield
+        return
+    this_process.attempts.mkdir(exist_ok=True)
+    attempts = this_process.attempts / sha256(what.encode()).hexdigest()
+    if attempts.exists() and attempts.stat().st_size > MAX_DEATHS:
+        problem = "two workers died, or exceeded the time limit, in simulate"
+        raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{what}")
+    with attempts.open("a") as file:
+        file.write("x")
+    try:
+        yield
+    finally:
+        attempts.unlink()
 
 
 @contextmanager
@@ -146,31 +246,58 @@ def _end_worker() -> Iterator[None]:
         raise
 
 
-def joined(evaluations: Evaluations, repeats: int) -> Evaluations:
-    """Of N settings that were simulated in several rounds, in their order, the mean of each metric,
-    where it is defined, and the worst outcome. The safety degree of each round is kept beside.
+def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION) -> Evaluations:
+    """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
+    safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
+    study's own criterion, and the mean of each other metric over the runs that define it. Metrics
+    by which a run is unsafe are kept of each round, too.
     """
+    n = len(evaluations) // repeats
+    columns = np.arange(n)
 
     def mean(values: FloatArray) -> FloatArray:
-        rounds = values.reshape(repeats, -1)
+        rounds = values.reshape(repeats, n)
         number = np.count_nonzero(~np.isnan(rounds), axis=0)
         total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
-    n = len(evaluations) // repeats
+    # The worst run.
     outcomes = evaluations.outcome.reshape(repeats, n)
     rank = {str(name): number for number, name in enumerate(SEVERITY)}
     severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
-    rounds = evaluations.f_safe.reshape(repeats, n)
+    degrees = evaluations.f_safe.reshape(repeats, n)
+    worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
+    metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
+    metrics[SAFETY_DEGREE] = degrees[worst, columns]
+
+    # The share of unsafe runs.
+    is_of_shares = criterion.measure == UNSAFE_SHARE.name
+    is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
+    metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
+    means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
+    rounds = {
+        f"{name}_{k + 1}": values
+        for name in evaluations.metrics
+        if name not in means_alone
+        for k, values in enumerate(evaluations.metrics[name].reshape(repeats, n))
+    }
     return replace(
-        evaluations.take(np.arange(n)),
-        outcome=outcomes[np.argmin(severity, axis=0), np.arange(n)],
-        collision_speed=mean(evaluations.collision_speed),
-        metrics={
-            **{name: mean(values) for name, values in evaluations.metrics.items()},
-            **{f"{SAFETY_DEGREE}_{k + 1}": values for k, values in enumerate(rounds)},
-        },
+        evaluations.take(columns),
+        outcome=outcomes[np.argmin(severity, axis=0), columns],
+        collision_speed=evaluations.collision_speed.reshape(repeats, n)[worst, columns],
+        metrics={**metrics, **rounds},
     )
+
+
+def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
+    """Refuse another time step than that of earlier runs of this process at a point."""
+    kind = type(simulator)
+    step = round(float(time[1] - time[0]), 6)
+    first = _steps.setdefault(kind, {}).setdefault(point, step)
+    if step != first:
+        steps = f"{min(step, first):g} and {max(step, first):g} s"
+        code = UserCode(f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind)
+        raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
 
 
 def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System) -> None:
@@ -186,6 +313,8 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
             raise code.wrong("simulate", f"a result without a trace, with {name!r}", legal)
     for objective in system.measuring.scoring.objectives:
         measure = measures.get(objective.name)
+        if objective.name == UNSAFE_SHARE.name:
+            continue
         if measure is not None and measure.of == "runs" and objective.name not in result:
             problem = f"a result without a trace and without {objective.name}"
             raise code.wrong("simulate", problem, "each metric that is an objective of the study")
@@ -197,10 +326,6 @@ def _runs_of(
     """The runs of N results, each with its own number of samples."""
     traces = [{**NO_TRACE, **result} if TIME not in result else result for result in results]
     logged = [result[TIME] for result in results if TIME in result] or [NO_TRACE[TIME]]
-    steps = {round(float(np.ptp(times[:2])), 6) for times in logged}
-    if len(steps) > 1:
-        problem = f"scenario.model: runs have time steps of {min(steps):g} and {max(steps):g} s"
-        raise InputError(system.source, problem, "one time step in all runs")
     step = float(np.diff(logged[0][:2])[0])
     lengths = np.array([len(trace[TIME]) for trace in traces])
     samples = np.arange(lengths.max())

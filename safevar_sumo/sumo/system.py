@@ -15,6 +15,7 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal, Quantity
@@ -33,7 +34,7 @@ from safevar_sumo.study import WORST, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter
 from safevar_sumo.sumo.engine import open_world
-from safevar_sumo.sumo.measuring import Measuring, measuring_of
+from safevar_sumo.sumo.measuring import Measuring, measuring_of, own_criterion
 from safevar_sumo.sumo.models import create_driven, create_scenario, matrix_points
 from safevar_sumo.sumo.network import copied_network, network_for
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
@@ -81,6 +82,8 @@ class System:
     - A simulation that takes longer than `time_limit` [s] counts as hung.
     - `allowed_impact_speed` [m/s], `phase` and `overtime` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
+    - `criterion` is the study's own.
+    - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
     - `command` simulates the original vehicle of the study.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
@@ -106,6 +109,8 @@ class System:
     overtime: float = 0.0
     repeats: int = 1
     command: str = ""
+    skips_failed: bool = False
+    criterion: Unsafe = field(default_factory=Unsafe)
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -389,6 +394,8 @@ def _assemble(study: Study) -> System:
         aggregate=WORST if study.matrix is None else study.matrix.aggregate,
         repeats=study.scenario.repeats,
         command=simulate_command(study),
+        criterion=own_criterion(study),
+        skips_failed=study.search.failed == "skip",
     )
     if not study.scenario.search:
         return system

@@ -12,15 +12,18 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 
+from safevar_sumo.campaign import questions
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
-from tests.in_process import run
+from tests.in_process import refused, run
+from tests.scenarios.test_simulated import MODELS, STUDY
 
 Process = subprocess.Popen[str]
 pytestmark = pytest.mark.usefixtures("small")
@@ -277,3 +280,85 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     killed(workers[0])
     assert_ends_with_the_results(process, whole)
     assert workers[1].poll() is None
+
+
+COUNTED = """
+import os
+import time
+
+from models import Wall
+
+
+class Counted(Wall):
+    @classmethod
+    def open_worker(cls, worker):
+        return open("numbers", "a").write(f"{worker}\\n")
+
+    def simulate(self, setting):
+        time.sleep(float(os.environ.get("SLOW", "0")))
+        return super().simulate(setting)
+"""
+
+
+@SLOW
+def test_questions_on_a_cluster_have_the_bytes_of_one_process(
+    scheduler: tuple[Process, str], start: Start
+) -> None:
+    """A worker that dies is replaced, with its number; one with another file ends the command."""
+    Path("models.py").write_text(MODELS)
+    Path("counted.py").write_text(COUNTED)
+    Path("wall.toml").write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    _, address = scheduler
+    workers = [worker(start, address, "--no-nanny") for _ in range(2)]
+    logs = [Path(f"worker-{number}.log") for number in (1, 2)]
+    until(lambda: all("Registered to" in log.read_text() for log in logs), workers[0])
+    for command in (
+        "risk rain --samples 300",
+        "explain rain --quick",
+        "tolerance native --quick",
+        "risk wall.toml --simulations 200",
+        "rules wall.toml --samples 500",
+        "tolerance wall.toml --simulations 300",
+    ):
+        alone = run(*command.split(), "--jobs", "1", "--fresh")
+        there = run(*command.split(), "--cluster", address, "--fresh")
+        assert there.stdout == alone.stdout, command
+    assert {*Path("numbers").read_text().split()} == {"0", "1"}
+    run("study", "wall.toml", "--out", "walls")
+    for command in ("report walls --out", "evidence walls --out"):
+        ending = "html" if "report" in command else "zip"
+        run(*command.split(), f"1.{ending}", "--jobs", "1", "--ask", "rules --samples 300")
+        run(*command.split(), f"2.{ending}", "--cluster", address, "--ask", "rules --samples 300")
+        assert Path(f"1.{ending}").read_bytes() == Path(f"2.{ending}").read_bytes()
+
+    # A worker dies at work.
+    process = started("rules", "wall.toml", "--samples", "900", "--cluster", address, "--json")
+    time.sleep(3)
+    killed(workers[0])
+    process.wait(60)
+    assert process.returncode == 0
+
+
+@SLOW
+def test_a_worker_with_another_file_ends_a_question(
+    scheduler: tuple[Process, str], start: Start
+) -> None:
+    _, address = scheduler
+    Path("models.py").write_text(MODELS)
+    Path("wall.toml").write_text(STUDY)
+    process = worker(start, address, "--no-nanny")
+    until(lambda: "Registered to" in Path("worker-1.log").read_text(), process)
+    wrong = "safevar_sumo.campaign.batches"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(f"{wrong}.package_digest", lambda: "other")
+        refused("risk", "wall.toml", "--cluster", address, message=("has other code",))
+    with pytest.MonkeyPatch.context() as patch:
+        now = questions.manifest_now
+
+        def edited(*arguments: Any) -> Any:
+            manifest = now(*arguments)
+            return {**manifest, "versions": {**manifest["versions"], "numpy": "1.0"}}
+
+        patch.setattr(f"{wrong}.manifest_now", edited)
+        told = ("version of numpy was '1.0'", "a worker has another one")
+        refused("risk", "wall.toml", "--cluster", address, message=told)

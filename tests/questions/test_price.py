@@ -15,7 +15,7 @@ from safevar_sumo.questions import price
 from safevar_sumo.questions.price import Account, round_down
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import show_no_progress
-from tests.in_process import InlinePool, run
+from tests.in_process import InlinePool, json_of, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 CLEARANCE = 40 - 15 * 0.5
@@ -147,8 +147,57 @@ def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
 
 
 def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
-    with pytest.raises(InputError, match="few simulations"):
-        sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=InlinePool())
+    """They are the limits of the others, or a vehicle within them is unsafe."""
+    pool = InlinePool()
+    answer = sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=pool)
+    limits = answer.tables["limits"].set_index("characteristic")
+    assert limits.loc["decel", ["together_low", "together_high"]].tolist() == [5, 9]
+    assert keeps(5, limits.loc["delay", "together_high"], 0.3)
+    assert not keeps(5, limits.loc["delay", "together_high"] + 0.1, 0.3)
+    assert answer.numbers["kept"] is None
+    assert answer.failures == ("few simulations call no limit kept",)
+    answer = sv.tolerance(rig, limits=["decel >= 3.2"], simulations=500, pool=pool)
+    assert answer.numbers["kept"] is False
+    assert answer.failures == ("limit of decel",)
+    assert "The specified limits do not hold" in answer.verdict
+
+
+COUNTED = """
+from models import Rig
+
+
+class Counted(Rig):
+    def simulate(self, setting):
+        open("count", "a").write("x")
+        return super().simulate(setting)
+"""
+
+
+@pytest.mark.parametrize("number", [10, 40, 300])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("question", ["risk", "rules", "tolerance --limits decel>=5", "explain"])
+def test_a_number_is_that_of_all_simulations_of_an_edited_class(
+    rig: str, question: str, number: int, jobs: int, request: pytest.FixtureRequest
+) -> None:
+    """With the check of the class, which is shorter, and what is repeated."""
+    if jobs > 1:
+        request.getfixturevalue("worker_processes")
+    Path("counted.py").write_text(f"{COUNTED}# {question} {number} {jobs}")
+    Path(rig).write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    name, *options = question.split()
+    command = (name, rig, *options, "--simulations", f"{number}", "--jobs", f"{jobs}", "--fresh")
+    output = run(*command, expect=None)
+    if "do not suffice: an answer takes at least" in output.stderr:
+        assert number < 100
+        assert not Path("count").exists()
+        return
+    assert number / 3 <= Path("count").stat().st_size <= number, output.stderr
+    if number == 300:
+        assert "30 for a check of the class, which is shorter" in output.stderr or (
+            re.search(r"with 2\d for a check of the class, which is shorter", output.stderr)
+        )
+        first = output.stdout
+        assert run(*command, expect=None).stdout == first
 
 
 def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig: str) -> None:
@@ -181,3 +230,27 @@ def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.Monk
     output = run("rules", rig)
     assert "at most 500 simulations" in output.stderr
     assert output.stdout.startswith("Rough answer (--simulations 500)")
+
+
+@pytest.mark.parametrize("cache", ["off", "folder"])
+@pytest.mark.parametrize("number", [400, 2000])
+def test_a_page_and_a_pack_share_one_number(
+    rig: str, number: int, cache: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What one question has simulated serves the others: rules has the sample of risk."""
+    monkeypatch.setenv("SAFEVAR_CACHE", cache)
+    Path(rig).write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    for command, out in (("report", "page.html"), ("evidence", "pack.zip")):
+        Path("counted.py").write_text(f"{COUNTED}# {command}")
+        run("study", rig, "--out", command)
+        Path("count").unlink()
+        run(command, command, "--simulations", f"{number}", "--out", out, "--jobs", "1")
+        assert number / 3 <= Path("count").stat().st_size <= number
+    page = Path("page.html").read_text()
+    stated = re.findall(r"(\w+) report (?:--samples 4000 )?--simulations (\d+)", page)
+    assert {name for name, _ in stated} == {"tolerance", "explain", "risk", "rules"}
+    assert {3 * int(part) > 0.7 * number for _, part in stated} == {True}
+    assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+    refused(
+        "evidence", "evidence", "--simulations", "3", "--out", "3.zip", message=("not suffice",)
+    )

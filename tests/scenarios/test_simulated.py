@@ -4,22 +4,32 @@ and what it cannot do is refused.
 
 from __future__ import annotations
 
+import os
+import re
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.campaign.cache import Cache, keep_simulations
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.metrics import METRICS
+from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.plugins import Use
+from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations
+from safevar_sumo.results import manifest_differences
 from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import simulators
-from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import json_of, refused, run
+from tests.in_process import InlinePool, json_of, refused, run
 
 MODELS = """
 from dataclasses import dataclass
@@ -117,10 +127,11 @@ seed = 1
 
 
 @pytest.fixture
-def wall(in_tmp: Path) -> Path:
+def wall(in_tmp: Path) -> Iterator[Path]:
     (in_tmp / "models.py").write_text(MODELS)
     (in_tmp / "wall.toml").write_text(STUDY)
-    return in_tmp / "wall.toml"
+    yield in_tmp / "wall.toml"
+    simulators.close_simulator()
 
 
 def system_of(study: Path, **changes: object) -> System:
@@ -205,6 +216,121 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(18, abs=0.5)
 
 
+ENDS = "lambda r: dict(r, "
+"""The beginning of a result that ends otherwise."""
+KEEPS = """
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+
+LOG = []
+
+
+@dataclass
+class Derives:
+    '''Stops after v^2 / 2a; values are derived at creation, and changed in a run.'''
+
+    UNITS = {"decel": "m/s^2", "delay": "s"}
+    OPTIONAL = ("delay",)
+    speed: float = 50.0
+    engine: Any = field(default=None, init=False)
+
+    def __post_init__(self):
+        self.v = self.speed / 3.6
+        self.rows = []
+        self.random = np.random.default_rng(1)
+
+    def simulate(self, setting):
+        if self.engine is None:
+            self.engine = LOG.append("engine") or object()
+        self.rows.append(self.v)
+        rest = 40 - self.v**2 / 2 / setting["decel"] + 1e-3 * self.random.random()
+        self.v = 0
+        if rest < 0:
+            impact = (-2 * setting["decel"] * rest) ** 0.5
+            return {"outcome": "collision", "safety_degree": -impact}
+        return {"outcome": "stopped", "safety_degree": rest / len(self.rows)}
+
+
+class Served(Derives):
+    @classmethod
+    def open_worker(cls, worker):
+        open("log", "a").write(f"{cls.__name__} open {worker}\\n")
+        return [worker]
+
+    @classmethod
+    def close_worker(cls, handle):
+        open("log", "a").write(f"{cls.__name__} close {handle[0]}\\n")
+
+    def simulate(self, setting):
+        assert self.worker and self.engine is None
+        return super().simulate(setting)
+
+
+class Struct(msgspec.Struct, frozen=True):
+    UNITS = Derives.UNITS
+    OPTIONAL = ("delay",)
+    speed: float = 50.0
+    open_worker = classmethod(Served.open_worker.__func__)
+    close_worker = classmethod(Served.close_worker.__func__)
+
+    def simulate(self, setting):
+        return {"outcome": "stopped", "safety_degree": float(len(self.worker))}
+
+
+class Dies(Served):
+    def simulate(self, setting):
+        if setting["decel"] < 8 and self.worker == [0] and open("dies", "a+").tell() == 0:
+            open("dies", "a").write("x")
+            __import__("os")._exit(7)
+        return super().simulate(setting)
+"""
+
+
+@pytest.mark.parametrize("name", ["Derives", "Served"])
+def test_each_setting_has_an_object_that_was_created_with_its_fields(wall: Path, name: str) -> None:
+    """What is derived at creation is that of the test point, and of no run before."""
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    tests = [{"name": "a", "over": {"speed": [20.0, 60.0, 90.0]}}]
+    system = system_of(wall, scenario={"model": f"keeps:{name}"}, matrix={"tests": tests})
+    for _ in range(2):
+        at_points = simulate_all_points(system, np.array([[8.0, 0.0], [8.0, 0.0]]))
+        degrees = [point.evaluations.f_safe.tolist() for point in at_points]
+        rests = [40 - (v / 3.6) ** 2 / 16 for v in (20, 60, 90)]
+        assert degrees == [pytest.approx([rest] * 2, abs=2e-3) for rest in rests]
+        assert len({*degrees[0]}) == 1
+    if name == "Derives":
+        assert __import__("sys").modules["keeps"].LOG == ["engine"]
+
+
+@pytest.mark.parametrize("name", ["Served", "Struct"])
+def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> None:
+    """Also where the code is loaded again, and with a number: 0 without worker processes."""
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    wall.write_text(STUDY.replace("models:Wall", f"keeps:{name}"))
+    assert json_of("check", "wall.toml")["numbers"]["passed"]
+    run("simulate", "wall.toml")
+    simulators.close_simulator()
+    assert Path("log").read_text().split("\n") == [f"{name} open 0", f"{name} close 0", ""]
+    wrong = KEEPS.replace("def open_worker(cls, worker)", "def open_worker(cls)")
+    (wall.parent / "keeps.py").write_text(wrong)
+    refused("check", "wall.toml", message=("open_worker that does not take (worker)",))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> None:
+    (wall.parent / "keeps.py").write_text(KEEPS)
+    wall.write_text(STUDY.replace("models:Wall", "keeps:Dies"))
+    run("study", "wall.toml", "--out", "results", "--jobs", "2")
+    lines = Path("log").read_text().splitlines()
+    assert {line for line in lines if "open" in line} == {"Dies open 0", "Dies open 1"}
+    assert lines.count("Dies open 0") == lines.count("Dies close 0") + 2  # one died
+    assert lines.count("Dies open 1") == lines.count("Dies close 1")
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -221,6 +347,14 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
         ("lambda r: {'outcome': 'stopped'}", "a result without safety_degree"),
         ("lambda r: {'outcome': 'stopped', 'safety_degree': -1.0}", "safety_degree = -1.0"),
         ("lambda r: {'outcome': 'stopped', 'safety_degree': 1.0, 'ttx': 1.0}", "'ttx'"),
+        (f"{ENDS}separation=0 * r['speed'])", "'stopped' with a separation of 0"),
+        (f"{ENDS}speed=r['speed'] * 0 + 9)", "'stopped' at a speed of 9"),
+        (f"{ENDS}outcome='passed', separation=0 * r['speed'])", "'passed' with a separation of 0"),
+        (f"{ENDS}outcome='collision', impact_speed=1.0)", "a collision at a separation of 18"),
+        (
+            f"{ENDS}outcome='collision', impact_speed=36.0, separation=0 * r['speed'])",
+            "impact_speed = 36 after a speed of 0",
+        ),
         ("lambda r: 1 / 0", "division by zero"),
         ("lambda r: __import__('time').sleep(9)", "time limit of 0.5 s"),
     ],
@@ -264,10 +398,37 @@ def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
         system_of(wall, matrix={"tests": tests})
 
 
-def test_runs_of_one_batch_have_one_time_step(wall: Path) -> None:
-    system = wrong_system(wall, "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}")
+def test_runs_have_one_time_step(wall: Path) -> None:
+    """In one batch or in several, and in `check`, too."""
+    change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
+    system = wrong_system(wall, change)
+    simulators.simulate_each(system, np.array([[9.0, 0.0]]))
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
-        simulators.simulate_each(system, np.array([[9.0, 0.0], [4.0, 0.5]]))
+        simulators.simulate_each(system, np.array([[4.0, 0.5]]))
+    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    refused("check", "wall.toml", message=("time steps of 0.05 and 0.1 s",))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (
+            "**{k: r[k] * 3.6 for k in ('speed', 'impact_speed') if k in r}",
+            "speed and position disagree",
+        ),
+        ("position=r['position'] * 3.6", "speed and position disagree"),
+        ("position=r['position'] * 0 + 1, gap=r['gap'] / 3.6", "speed and position disagree"),
+        ("gap=20 + (r['gap'] - 40) / 1.6", "speed and gap disagree"),
+        ("gap=40 + (r['gap'] - 40) / 1.4", ""),
+        ("gap=r['gap'] / 3.6, obstacle_speed=r['gap'] * 0 + 1", ""),
+    ],
+)
+def test_a_speed_that_disagrees_with_the_way_is_a_finding(
+    wall: Path, change: str, told: str
+) -> None:
+    wrong_system(wall, f"lambda r: {{**r, **dict({change})}}")
+    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    assert told in run("check", "wall.toml", expect=int(bool(told))).stdout
 
 
 @pytest.mark.parametrize("key", ["ads", "weather"])
@@ -344,7 +505,7 @@ class Ends(Wall):
 
 
 def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wall: Path) -> None:
-    """The mean counts, each run is in the journal, and without repeats the study is refused."""
+    """The worst run counts, each is in the journal, and without repeats the study is refused."""
     (wall.parent / "noisy.py").write_text(NOISY)
     wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
     assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
@@ -352,30 +513,95 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wal
     assert json_of("check", "wall.toml")["numbers"]["passed"]
     found = drive_and_score(system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
     rounds = np.stack([found.metrics[f"safety_degree_{k}"] for k in range(1, 5)])
-    assert found.f_safe == pytest.approx(rounds.mean(axis=0))
+    assert found.f_safe == pytest.approx(rounds.min(axis=0))
+    assert found.metrics["unsafe_share"].tolist() == [0, 1, 0]
     assert len({*rounds[:, 0]}) == 4
     assert found.outcome.tolist() == ["stopped", "collision", "stopped"]
     run("study", "wall.toml", "--out", "results")
     assert '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
 
 
-def test_the_worst_outcome_of_all_runs_counts() -> None:
-    names = np.array(["stopped", "passed", "passed", "collision", "stopped", "timeout"])
-    evaluations = Evaluations.undefined(np.zeros((6, 1)), "", METRICS, f_diff=0, f_num_diff=0)
-    nothing = np.zeros(6)
+def test_the_worst_run_and_the_share_of_unsafe_runs_count() -> None:
+    """Metres and metres per second have no mean."""
+    evaluations = Evaluations.undefined(np.zeros((8, 1)), "", METRICS, f_diff=0, f_num_diff=0)
+    nothing = np.zeros(8)
+    degrees = np.array([2.0, 9.0, 2.0, 5.0, 2.0, 6.0, -6.0, 7.0])
+    speeds = np.where(degrees < 0, 8.0, np.nan)
+    names = np.array(["stopped", "passed", "passed", "stopped", "stopped"] + 3 * ["timeout"])
     found = simulators.joined(
         replace(
             evaluations,
-            outcome=names,
-            collision_speed=np.array([np.nan, np.nan, np.nan, 4.0, np.nan, np.nan]),
+            outcome=np.where(degrees < 0, "collision", names),
+            collision_speed=speeds,
+            metrics={
+                **evaluations.metrics,
+                "safety_degree": degrees,
+                "tet": np.array([1.0, 1.0, np.nan, 2.0, 3.0, 3.0, np.nan, np.nan]),
+            },
             f_diff=nothing,
             f_num_diff=nothing,
         ),
-        3,
+        4,
     )
-    assert found.outcome.tolist() == ["passed", "collision"]
-    assert found.collision_speed[1] == 4
-    assert np.isnan(found.collision_speed[0])
+    assert found.outcome.tolist() == ["collision", "timeout"]
+    assert found.f_safe.tolist() == [-6, 5]
+    assert found.collision_speed[0] == 8
+    assert np.isnan(found.collision_speed[1])
+    assert found.metrics["unsafe_share"].tolist() == [0.25, 0]
+    assert found.metrics["tet"].tolist() == [2, 2]
+    assert Unsafe.parse("below=6").runs(found).mean(axis=0).tolist() == [1, 0.25]
+    assert Unsafe.parse("unsafe_share > 0.2").of(found).tolist() == [True, False]
+    assert Unsafe().number(found) == 0.25
+    words = "collides at 6.00 m/s in 1 of 4 runs (95 % confidence interval 1 to 81 %)"
+    assert Unsafe().breach_in_words(found.take([0])) == words
+
+
+RARE = """
+from models import Wall
+
+
+class Rare(Wall):
+    '''Collides at 8 m/s in one of so many runs as the delay says.'''
+
+    number = {}
+
+    def simulate(self, setting):
+        key = tuple(setting.values())
+        Rare.number[key] = n = Rare.number.get(key, 0) + 1
+        if n % 20 < round(20 * setting["delay"]):
+            return {"outcome": "collision", "safety_degree": -8.0}
+        return {"outcome": "stopped", "safety_degree": 2.0}
+"""
+
+
+def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
+    """A vehicle that fails in 3 of 20 runs counts 0.15; limits are of the worst run."""
+    (wall.parent / "rare.py").write_text(RARE)
+    wall.write_text(STUDY.replace('"models:Wall"', '"rare:Rare"\nrepeats = 20'))
+    system = system_of(wall)
+    names = [one.name for one in system.measuring.scoring.objectives]
+    assert names == ["unsafe_share", "f_diff", "f_num_diff"]
+    own = wall.read_text() + 'objectives = ["safety_degree", "f_diff"]\n'
+    (wall.parent / "own.toml").write_text(own)
+    names = [one.name for one in system_of(wall.parent / "own.toml").measuring.scoring.objectives]
+    assert names == ["f_safe", "f_diff"]
+    found = json_of("simulate", "wall.toml", "--set", "delay=0.15")
+    assert (
+        "collides at 8.00 m/s in 3 of 20 runs (95 % confidence interval 3 to 38 %)"
+        in (found["verdict"])
+    )
+    assert found["numbers"]["unsafe_share"] == 0.15
+    assert found["numbers"]["safety_degree"] == -8
+    for question in ("risk", "rules"):
+        numbers = json_of(question, "wall.toml", "--simulations", "2000")["numbers"]
+        share = numbers["failures"] / numbers["samples"]
+        assert share == pytest.approx(0.5, abs=0.06)
+        low, high = numbers["interval"]
+        assert low < share < high
+    limit = json_of("tolerance", "wall.toml", "--simulations", "2000")["tables"]["limits"]["rows"]
+    assert max(row["alone_high"] or 0 for row in limit if row["characteristic"] == "delay") < 0.05
+    run("study", "wall.toml", "--out", "results")
+    assert "unsafe_share" in Path("results/solutions.csv").read_text()
 
 
 def test_repeats_are_for_simulators_of_the_users_own() -> None:
@@ -412,6 +638,228 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, oft
         "to reproduce it: python -m safevar_sumo simulate wall.toml --set decel=3",
     )
     refused("study", "wall.toml", "--out", "results", message=told)
+
+
+FAILS = """
+import os
+import subprocess
+import time
+
+from models import Wall
+
+
+class Fails(Wall):
+    version = "1"
+
+    def simulate(self, setting):
+        open("count", "a").write("x")
+        if setting["decel"] < LIMIT:
+            subprocess.Popen(["sleep", "SECONDS"], start_new_session=True)
+            FAILURE
+        return super().simulate(setting)
+"""
+
+
+SECONDS = f"1234.{os.getpid()}"
+"""Time that a child process sleeps, as no other test's."""
+
+
+def with_failures(wall: Path, failure: str, limit: float = 3.2, failed: str = "skip") -> None:
+    text = (
+        FAILS.replace("SECONDS", SECONDS).replace("FAILURE", failure).replace("LIMIT", str(limit))
+    )
+    (wall.parent / "fails.py").write_text(text)
+    study = STUDY.replace("models:Wall", "fails:Fails")
+    wall.write_text(f'{study}time_limit = 2.0\nfailed = "{failed}"\n')
+
+
+def children() -> int:
+    simulators.close_simulator()  # of this process
+    return sum(
+        path.read_bytes() == f"sleep\x00{SECONDS}\x00".encode()
+        for path in Path("/proc").glob("[0-9]*/cmdline")
+        if path.exists()
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize("failure", ["1 / 0", "os._exit(7)", "time.sleep(60)"])
+def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: str) -> None:
+    """They are infeasible and counted; `check` names them; children end with their simulator."""
+    with_failures(wall, failure)
+    options = ("study", "wall.toml", "--out", "results", "--jobs", "1")
+    printed = run(*options).stdout
+    number = int(re.search(r"(\d+) settings? could not be simulated", printed)[1])
+    journals = "".join(path.read_text() for path in Path("results/runs").glob("*.jsonl"))
+    assert journals.count('"simulator-error"') == number > 0
+    assert "--set decel=3" in journals or failure == "1 / 0"
+    assert children() == 0
+    printed = run("check", "wall.toml", expect=None)
+    assert {"1 / 0": "division", "os._exit(7)": "code 7"}.get(failure, "time limit") in (
+        printed.stdout + printed.stderr
+    )
+    assert children() == 0
+    before = Path("count").stat().st_size
+    run(*options, "--retry-failed")
+    assert Path("count").stat().st_size > before
+
+
+def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
+    with_failures(wall, "1 / 0", limit=5)
+    told = ("settings failed, more than 10 %", "division by zero")
+    refused("study", "wall.toml", "--out", "results", message=(*told, "--retry-failed"))
+    printed = run("risk", "wall.toml", "--simulations", "1000", expect=2).stderr
+    assert all(part in printed for part in told)
+    with_failures(wall, "1 / 0", failed="stop")
+    refused("study", "wall.toml", "--out", "other", message=("division by zero",))
+    with pytest.raises(InputError, match="failed = 'skip' without a simulator"):
+        assemble(sv.load_study("rain", search={"failed": "skip"}))
+
+
+def test_a_pack_states_the_number_that_followed_from_time(
+    wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that `verify` asks the same on another machine; so does the command of each answer."""
+    run("study", "wall.toml", "--out", "results")
+    with monkeypatch.context() as patch:
+        patch.setattr("safevar_sumo.questions.price.LONGEST", 0.03)
+        run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 4000")
+        first = sv.risk("results")
+    assert re.search(r"risk results --simulations \d+$", first.command)
+    number = first.command.split()[-1]
+    again = sv.risk("results", simulations=int(number))
+    assert again.to_dict() == first.to_dict()
+    with ZipFile("pack.zip") as pack:
+        assert b" --simulations " in pack.read("1-wall/answers.json")
+    assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+
+
+READS = """
+import importlib
+import os
+import sqlite3
+import sys
+
+from models import Wall
+
+
+class Reads(Wall):
+    def simulate(self, setting):
+        factor = READ
+        result = super().simulate(setting)
+        log = open("own.log", "w").write("written") and open("own.log").read()
+        return {**result, "separation": result["separation"] * factor}
+"""
+"""Files that Python opens, and one that it does not."""
+BY = {
+    "opened": "float(open('data.txt').read())",
+    "sqlite3": "sqlite3.connect('data.db').execute('select x from t').fetchone()[0]",
+    "elsewhere": "float(os.popen('cat data.txt').read())",
+}
+
+
+def with_data(wall: Path, how: str, value: float) -> None:
+    (wall.parent / "reads.py").write_text(READS.replace("READ", BY[how], 1))
+    wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+    (wall.parent / "data.txt").write_text(f"{value}")
+    (wall.parent / "data.db").unlink(missing_ok=True)
+    with closing(sqlite3.connect(wall.parent / "data.db")) as database:
+        database.execute("create table t (x)")
+        database.execute("insert into t values (?)", (value,))
+        database.commit()
+
+
+@pytest.mark.parametrize("how", BY)
+def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
+    """Neither by `study`, nor by a question; what the simulator has written itself is no input."""
+    with_data(wall, how, 1.0)
+    run("study", "wall.toml", "--out", "results", "--runs", "1")
+    files = sv.load("results").directory / "manifest.json"
+    named = {"opened": "data.txt", "sqlite3": "data.db", "elsewhere": ""}[how]
+    assert named in files.read_text()
+    assert "own.log" not in files.read_text()
+    run("study", "wall.toml", "--out", "results")
+    run("risk", "results", "--simulations", "50")
+    with_data(wall, how, 1.1)
+    told = f"{named} has changed since" if named else "the original vehicle had"
+    refused("study", "wall.toml", "--out", "results", message=(told,))
+    refused("risk", "results", "--simulations", "50", message=(told,))
+    run("risk", "results", "--simulations", "50", "--as-it-is-now")
+    study = sv.load_study(str(wall))
+    keys = set()
+    for value in (1.0, 1.1):
+        with_data(wall, how, value)
+        use = Use({}, [named] if named else [])
+        keys.add(Cache(wall.parent / f"{value}").key_of(study, use))
+    assert len(keys) == (2 if named else 1)
+
+
+def test_an_interrupted_question_of_another_simulator_begins_anew(
+    wall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here a file that Python does not open."""
+    monkeypatch.setenv("SAFEVAR_CACHE", str(wall.parent / "cache"))
+
+    def ask() -> float:
+        with keep_simulations("risk"), open_evaluator(sv.load_study(str(wall)), InlinePool()) as it:
+            it.account.is_question = True
+            it.begin({"all": 1})
+            found = it.evaluate(np.array([[8.0, 0.0], [4.0, 0.0]]), "all")
+            if stops:
+                raise KeyboardInterrupt
+            return float(found.f_safe[0])
+
+    with_data(wall, "elsewhere", 1.0)
+    stops = True
+    with pytest.raises(KeyboardInterrupt):
+        ask()
+    with_data(wall, "elsewhere", 1.1)
+    stops = False
+    with pytest.warns(UserWarning, match="does not continue: the simulator"):
+        changed = ask()
+    with_data(wall, "elsewhere", 1.0)
+    assert changed == pytest.approx(1.1 * ask())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int) -> None:
+    """A hash of a text is the same in all workers, a process's number is not."""
+    options = ("study", "wall.toml", "--out", f"results-{jobs}", "--jobs", f"{jobs}")
+    for value in ("1 + hash('a') % 7", "1 + os.getpid() % 997"):
+        (wall.parent / "reads.py").write_text(READS.replace("READ", value, 1))
+        wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+        if "pid" in value:
+            refused(*options[:3], "other", *options[4:], message=("in another process",))
+        else:
+            run(*options)
+            assert "in a new process" in run("check", "wall.toml", expect=1).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
+    """Here an object that is put into the simulator in its first run."""
+    lazy = "getattr(self, 'road', None) or type('Road', (), {'length': self.gap})()"
+    text = READS.replace("READ", f"(self.__dict__.setdefault('road', {lazy})).length / 40", 1)
+    (wall.parent / "reads.py").write_text(text)
+    tests = '\n[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
+    wall.write_text(STUDY.replace("models:Wall", "reads:Reads") + tests)
+    assert "in a new process" in run("check", "wall.toml", expect=1).stdout
+    refused("study", "wall.toml", "--out", "results", message=("points in another order",))
+
+
+def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
+    run("study", "wall.toml", "--out", "results")
+    manifest = Path("results/manifest.json")
+    manifest.write_text(manifest.read_text().replace(np.__version__, "1.0"))
+    refused("study", "wall.toml", "--out", "results", message=("version of numpy was '1.0'",))
+    stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
+    for libraries, matters in ([], False), (["numpy"], True):
+        (change,) = manifest_differences(stored, {**now, "libraries": libraries})
+        assert change[2] is matters
 
 
 @pytest.mark.slow

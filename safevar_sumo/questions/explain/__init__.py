@@ -224,7 +224,7 @@ def _counts(population: Population, subject: Subject, analysed: int, explained: 
     return {
         "unsafe": str(population.unsafe),
         "settings": len(runs),
-        "failures": int(population.unsafe.of(runs).sum()),
+        "failures": population.unsafe.number(runs),
         "other_outcomes": population.otherwise,
         "left_out": left_out,
         "original_outcome": str(original.outcome[0]),

@@ -69,11 +69,12 @@ def robust_shares(
         for factor in factors:
             step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
-            is_unsafe, is_valid = (
+            unsafe_shares, is_valid = (
                 flags.reshape(len(settings), count)
-                for flags in (unsafe.of(evaluations), evaluations.valid)
+                for flags in (unsafe.runs(evaluations).mean(axis=0), evaluations.valid)
             )
-            shares.append((is_unsafe & is_valid).sum(axis=1) / np.maximum(is_valid.sum(axis=1), 1))
+            failing = (unsafe_shares * is_valid).sum(axis=1)
+            shares.append(failing / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)
 
 

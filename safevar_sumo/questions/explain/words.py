@@ -97,7 +97,7 @@ def _beyond_in_words(
     shares = np.random.default_rng(evaluator.seed).random((number, len(members)))
     vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
     runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
-    share = share_in_words(float(np.mean(unsafe.of(runs))))
+    share = share_in_words(unsafe.number(runs) / number)
     verbs = "collide" if str(unsafe) == Outcome.COLLISION else "are unsafe"
     whose = "these values" if len(cause) > 1 else "this value"
     return f"Of {number} vehicles beyond {whose}, all else as in the original, {share} {verbs}."
@@ -137,5 +137,5 @@ def _number_in_words(population: Population, kind: str) -> str:
     """How many settings are unsafe."""
     unsafe = population.unsafe
     runs = population.evaluations
-    number = int(np.count_nonzero(unsafe.of(runs)))
+    number = unsafe.number(runs)
     return f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()

@@ -131,7 +131,7 @@ def tolerance(
     is_safe = not asked.unsafe.of(original)[0]
     if evaluator.left is None or not is_safe:
         return answer_limits(asked)
-    if specified or up_to is not None or is_rated(study):
-        problem = "few simulations find limits, and keep none that is given, nor up to a value"
-        raise InputError("simulations", problem, "no --simulations, or no limits and no --up-to")
+    if is_rated(study):
+        problem = "few simulations find no limits of a rating"
+        raise InputError("simulations", problem, "no --simulations")
     return answer_roughly(asked)

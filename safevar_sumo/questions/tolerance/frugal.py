@@ -4,6 +4,7 @@ vehicles in it are unsafe, and tried with what is left. The answer is rough.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,8 +22,10 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.limits import OF_BOX
 from safevar_sumo.questions.tolerance.rows import LIMITS, LIMITS_TITLE, NOWHERE
-from safevar_sumo.questions.words import bound_in_words, join_phrases, number_of
+from safevar_sumo.questions.words import bound_in_words, change_texts, join_phrases, number_of
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
+from safevar_sumo.study import Limit
+from safevar_sumo.vehicles.characteristics import Characteristic
 
 STAGE = "limits with few simulations"
 PARTS = (4, 4)
@@ -47,24 +50,39 @@ class _Search:
     ----------
     low, high
         The ends of its sides, shape (n,).
+    broken
+        A vehicle within the specified limits that is unsafe by what they allow alone, shape (n,);
+        None as long as none is known.
     """
 
     model: Model
     columns: list[int]
+    limits: Mapping[str, Limit]
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
+    broken: FloatArray | None = None
 
     def __post_init__(self) -> None:
         members = self.model.characteristics
+        self.is_fixed = np.isin(members.names, [*self.limits])
         varies = ~members.of_vehicle
         varies[self.columns] = True
         self.low = np.where(varies, members.lower, members.original)
         self.high = np.where(varies, members.upper, members.original)
+        for column, item in enumerate(members):
+            if item.name in self.limits:
+                self.low[column], self.high[column] = self.interval(item)
         self._outer = self.low, self.high
         self._gap = FIRST_GAP
         self._failures = np.empty((0, len(members)))
         self._safe = np.empty((0, len(members)))
         self._budget = self.left
+
+    def interval(self, item: Characteristic) -> tuple[float, float]:
+        """The values that a specified limit allows."""
+        limit = self.limits[item.name]
+        low = item.lower if limit.at_least is None else limit.at_least
+        return low, item.upper if limit.at_most is None else limit.at_most
 
     @property
     def box(self) -> Box:
@@ -72,8 +90,8 @@ class _Search:
 
     @property
     def left(self) -> int:
-        """Settings that may still be simulated."""
-        return self.model.evaluator.left or 0
+        """Settings that may still be simulated, none once a specified limit is broken."""
+        return 0 if self.broken is not None else self.model.evaluator.left or 0
 
     @property
     def tried(self) -> int:
@@ -103,9 +121,11 @@ class _Search:
             starts = members.with_original_vehicle(unsafe)
             found = find_boundaries(starts, unsafe, self.are_unsafe, PARTS)
             for safe, failure in zip(found.safe, unsafe, strict=True):
-                (column,) = np.flatnonzero(
-                    (failure != members.original) & members.of_vehicle
-                ).tolist()
+                is_changed = (failure != members.original) & members.of_vehicle
+                (column,) = np.flatnonzero(is_changed).tolist()
+                if self.is_fixed[column]:
+                    self.broken = failure
+                    continue
                 is_high = bool(failure[column] > members.original[column])
                 self._move(column, safe[column], is_high=is_high)
         self._outer = self.low.copy(), self.high.copy()
@@ -125,7 +145,11 @@ class _Search:
         """Cut off a failure, shape (n,), and keep farther off all that are known: too little was
         simulated around them.
         """
-        self._failures = np.vstack([self._failures, self._needed(failure)])
+        needed = self._needed(failure)
+        if not self._choices(needed).any():
+            self.broken = needed
+            return
+        self._failures = np.vstack([self._failures, needed])
         self._gap *= WIDENING
         self.low, self.high = (end.copy() for end in self._outer)
         while (inside := self._failures[self._are_inside(self._failures)]).size:
@@ -156,11 +180,15 @@ class _Search:
         )
         lengths = np.maximum(self.high - self.low, 1e-300)
         kept = np.where(is_above, ends - self.low, self.high - ends) / lengths
-        is_choice = (failures != members.original) & members.of_vehicle
-        kept = np.where(is_choice, kept, -np.inf)
+        kept = np.where(self._choices(failures), kept, -np.inf)
         row = int(np.argmin(kept.max(axis=1)))
         column = int(np.argmax(kept[row]))
         self._move(column, ends[row, column], is_high=bool(is_above[row, column]))
+
+    def _choices(self, failures: FloatArray) -> BoolArray:
+        """Where a side can cut failures off, shape (..., n)."""
+        members = self.model.characteristics
+        return np.asarray((failures != members.original) & members.of_vehicle & ~self.is_fixed)
 
     def _move(self, column: int, end: float, *, is_high: bool) -> None:
         """Move a side to an end, rounded towards the original."""
@@ -179,7 +207,7 @@ def answer_roughly(asked: Asked) -> Answer:
     """The answer with as many simulations as are allowed, in the study's own parameter set."""
     evaluator = asked.evaluator
     members = evaluator.characteristics
-    search = _Search(Model(0, evaluator, asked.unsafe), asked.columns)
+    search = _Search(Model(0, evaluator, asked.unsafe), asked.columns, asked.limits)
     seed = evaluator.seed
     search.limit_alone()
     alone = search.low.copy(), search.high.copy()
@@ -194,7 +222,11 @@ def answer_roughly(asked: Asked) -> Answer:
         if column in asked.columns:
             ends = NOWHERE if together is None else tuple(float(one[column]) for one in together)
             limit = NOWHERE if has_encounters else tuple(float(one[column]) for one in alone)
-            known = (item.name, item.unit, item.original, *limit, *ends)
+            specified, kept = NOWHERE, None
+            if item.name in asked.limits:
+                specified = search.interval(item)
+                kept = False if search.broken is not None else None
+            known = (item.name, item.unit, item.original, *limit, *ends, *specified, kept)
             rows.append((*known, *[None] * (len(LIMITS) - len(known))))
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
@@ -208,7 +240,8 @@ def answer_roughly(asked: Asked) -> Answer:
             f"{number_of(search.tried, 'random vehicle')} within the limits, with half of their"
             f" values at ends. {bound} of such vehicles are unsafe. {AT_ONE_PHASE}"
         ),
-        numbers={**_numbers(asked), "scope": scope_of(evaluator.study, between=False)},
+        failures=_failures(search),
+        numbers={**_numbers(asked, search), "scope": scope_of(evaluator.study, between=False)},
         tables={"limits": limits},
         draw=draw_bars,
     )
@@ -218,7 +251,10 @@ def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: b
     """What was found, and which characteristics can make the vehicle unsafe on their own."""
     members = search.model.characteristics
     words = f"None of {search.tried:,} vehicles that were tried within the joint limits is unsafe."
-    if not is_tested:
+    if search.broken is not None:
+        named = ", ".join(change_texts(members.vehicle, members.named(search.broken)))
+        words = f"The specified limits do not hold: a vehicle within them is unsafe ({named})."
+    elif not is_tested:
         words = "The simulations did not suffice to try enough vehicles within joint limits."
     is_closer = (alone[0] > members.lower) | (alone[1] < members.upper)
     names = [item.name for item, fails in zip(members, is_closer, strict=True) if fails]
@@ -226,7 +262,16 @@ def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: b
     return f"{words} {join_phrases(names)} can make it unsafe alone." if names else words
 
 
-def _numbers(asked: Asked) -> JsonObject:
+def _failures(search: _Search) -> tuple[str, ...]:
+    """Why specified limits are not called kept."""
+    if search.broken is not None:
+        return tuple(f"limit of {name}" for name in search.limits)
+    return ("few simulations call no limit kept",) if search.limits else ()
+
+
+def _numbers(asked: Asked, search: _Search) -> JsonObject:
     numbers: dict[str, Any] = {"unsafe": str(asked.unsafe), "margin": asked.unsafe.keep}
-    numbers |= {"kept": None, "rough": True, "up_to": None, "boxes": 0}
+    up_to = None if asked.up_to is None else float(asked.up_to.partition("=")[2])
+    kept = None if search.broken is None else False
+    numbers |= {"kept": kept, "rough": True, "up_to": up_to, "boxes": 0}
     return {**dict.fromkeys(OF_BOX), **numbers}
