@@ -59,6 +59,8 @@ BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
 time left is known.
 """
+MAX_REPEATS = 5
+"""Largest number of simulations that are repeated where the number is limited."""
 FEW_SKIPPED = 100
 """Number of settings up to which a question skips as many as of these."""
 PORTION = 4096
@@ -92,14 +94,12 @@ def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None
         pool.on_cluster(refuse_other_worker, study, manifest, package_digest())
 
 
-def of_check(most: int) -> int:
-    """How many of the allowed simulations the check of a simulator's class may take."""
-    return most // 10
-
-
-def of_repeats(most: int) -> int:
-    """How many of them may repeat the first batches of workers."""
-    return min(most // 10, 5)
+def spare(most: int, least: int) -> tuple[int, int]:
+    """How many of the allowed simulations the check of a simulator's class may take, and the
+    repeats of first batches; what an answer takes at least is left.
+    """
+    check = min(most // 10, max(most - least, 0))
+    return check, min(most // 10, MAX_REPEATS, max(most - least - check, 0))
 
 
 def evaluate_all(
@@ -213,7 +213,7 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     """
     if user_code_names(study):
         each = simulations_of_setting(system_of(study))
-        most = None if pool.most is None else of_repeats(pool.most) // each
+        most = None if pool.spare is None else pool.spare[1] // each
         pool.everywhere(repeat_first_batch, study, most=most)
 
 
@@ -368,10 +368,10 @@ def check_code(study: Study, pool: Pool) -> Use:
         known = msgspec.json.decode(marker.read_bytes(), type=Use)
         if known.modules == digests_by_name(known.modules, study.origin.places):
             return known
-    job = Task(study=study), None if pool.most is None else of_check(pool.most)
+    job = Task(study=study), None if pool.spare is None else pool.spare[0]
     use: Use
     ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
-    if pool.most is not None:
+    if pool.spare is not None:
         return use
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)

@@ -118,7 +118,7 @@ def run_campaign(
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
     # The directory, with the inputs of its results as they are now.
-    pool.most = None
+    pool.spare = None
     use = check_code(study, pool)
     is_new = not (directory / MANIFEST).exists()
     read: Iterable[str] = ()

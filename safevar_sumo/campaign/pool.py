@@ -68,9 +68,9 @@ class Pool:
         Names of the vehicle models that workers find compiled.
     simulated, failed
         Number of settings that questions have had, of studies that skip those that fail.
-    checked, most
-        Number of simulations of the last check of user code; the largest number of a question in a
-        simulator of the user's own, as far as it is stated.
+    checked, spare
+        Number of simulations of the last check of user code; the largest numbers of a check and of
+        repeats in a simulator of the user's own, None if they are not limited.
     shared
         What the questions of a page have simulated: evaluations by setting, of each study and
         selection; None if questions do not share it.
@@ -90,7 +90,7 @@ class Pool:
         self.compiled = set[str]()
         self.attempts: Path | None = None
         self.simulated = self.failed = self.checked = 0
-        self.most: int | None = None
+        self.spare: tuple[int, int] | None = None
         self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
         self.on_cluster: Callable[..., None] | None = None
 

@@ -19,6 +19,7 @@ from safevar_sumo.campaign.batches import (
     compile_vehicle,
     evaluate_all,
     repeat_first_batches,
+    spare,
 )
 from safevar_sumo.campaign.evaluation import (
     EVERYTHING,
@@ -130,9 +131,12 @@ class Evaluator:
         """
         expected = sum(settings.values())
         if self.account.is_question:
-            has_simulator = self.system.has_simulator
-            self.account.require((least + MEASURED * has_simulator) * self._each, has_simulator)
-            if has_simulator:
+            account = self.account
+            needed = (least + MEASURED * self.system.has_simulator) * self._each
+            account.require(account.spent + needed)
+            if self.system.has_simulator:
+                if account.asked is not None:
+                    self._pool.spare = spare(account.asked, account.least)
                 check_simulator(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
             self.account.open(expected * self._each, seconds, self._pool.checked)
@@ -152,7 +156,8 @@ class Evaluator:
         """Let the question do so many simulations, with those that check a simulator's class."""
         self.account.asked = self.account.most = simulations
         self.account.is_question = True
-        self._pool.most = simulations if self.system.has_simulator else None
+        limits = simulations is not None and self.system.has_simulator
+        self._pool.spare = spare(simulations or 0, 0) if limits else None
         self._pool.checked = 0
 
     def at_most(self, number: int, part: int = 1) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from safevar_sumo.campaign.batches import forget_other, of_check, of_repeats
+from safevar_sumo.campaign.batches import forget_other, spare
 from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
@@ -47,8 +47,8 @@ class Account:
         Whether a question asks, which says first what it costs.
     most
         The largest number of simulations; None if there is none.
-    spent
-        Simulations so far.
+    spent, least
+        Simulations so far; the least number for an answer.
     measure, undefined, judged
         The metric of the question's criterion, if it has one; the numbers of settings without a
         collision that have no such value, and of all.
@@ -60,6 +60,7 @@ class Account:
     is_question: bool = False
     most: int | None = None
     spent: int = 0
+    least: int = 0
     measure: str = ""
     undefined: int = 0
     judged: int = 0
@@ -90,16 +91,12 @@ class Account:
             problem = f"{bound:,} do not suffice: {self.spent:,} are needed to go on"
             raise InputError("simulations", problem, "a larger number")
 
-    def require(self, least: int, has_simulator: bool) -> None:
-        """Refuse fewer simulations than the least number for an answer, and for the check of a
-        simulator.
-        """
-        if self.asked is None:
-            return
-        needed = least + has_simulator * (of_check(self.asked) + of_repeats(self.asked))
-        if self.asked < needed:
-            problem = f"{self.asked:,} do not suffice: an answer takes at least {needed:,}"
-            raise InputError("simulations", problem, f"{needed} or more")
+    def require(self, least: int) -> None:
+        """Refuse fewer simulations than the least number for an answer."""
+        self.least = least
+        if self.asked is not None and self.asked < least:
+            problem = f"{self.asked:,} do not suffice: an answer takes at least {least:,}"
+            raise InputError("simulations", problem, f"{least} or more")
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
         """Allow what the user allows, or all if that does not take too long; `expected` simulations
@@ -110,7 +107,7 @@ class Account:
         # A number that is stated holds for all: the check, and what is repeated at the end.
         parts = 0
         if self.asked is not None and seconds is not None:
-            parts = of_check(self.asked) + of_repeats(self.asked)
+            parts = sum(spare(self.asked, self.least))
         self.most = self.asked
         if self.asked is not None and self.asked >= expected + parts:
             self.most = None
@@ -119,7 +116,7 @@ class Account:
         longest = LONGEST / self.questions
         if self.asked is None and expected * seconds > longest:
             self.most = round_down(longest / seconds)
-            parts = of_check(self.most) + of_repeats(self.most)
+            parts = sum(spare(self.most, self.least))
         if self.most is not None:
             self.spent += parts
         number = min(expected, float("inf") if self.most is None else self.most)
