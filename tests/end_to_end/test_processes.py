@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
-from safevar_sumo.campaign import questions
+from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
@@ -353,7 +353,7 @@ def test_a_worker_with_another_file_ends_a_question(
         patch.setattr(f"{wrong}.package_digest", lambda: "other")
         refused("risk", "wall.toml", "--cluster", address, message=("has other code",))
     with pytest.MonkeyPatch.context() as patch:
-        now = questions.manifest_now
+        now = batches.manifest_now
 
         def edited(*arguments: Any) -> Any:
             manifest = now(*arguments)
