@@ -9,7 +9,7 @@ import inspect
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from copy import copy, deepcopy
+from copy import Error, copy, deepcopy
 from dataclasses import replace
 from hashlib import sha256
 from inspect import getattr_static
@@ -121,7 +121,9 @@ class _Kept:
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
             for field, value in vars(simulator).items():
-                set_field(simulator, field, deepcopy(value) if isinstance(value, PLAIN) else value)
+                set_field(
+                    simulator, field, _deep_copy(value) if isinstance(value, PLAIN) else value
+                )
             for field, value in vars(self._last.get(name, simulator)).items():
                 if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
                     set_field(simulator, field, value)
@@ -141,12 +143,12 @@ class _Kept:
         kind.close_worker(handle)
 
 
-def _deep_copy(scenario: Simulator) -> Simulator:
+def _deep_copy(value: Any) -> Any:
     """A copy that shares nothing, where that can be copied."""
     try:
-        return deepcopy(scenario)
-    except (TypeError, AttributeError, ValueError, RuntimeError):
-        return copy(scenario)
+        return deepcopy(value)
+    except (TypeError, AttributeError, ValueError, RuntimeError, Error):
+        return copy(value)
 
 
 _kept = _Kept()

@@ -220,6 +220,7 @@ ENDS = "lambda r: dict(r, "
 """The beginning of a result that ends otherwise."""
 KEEPS = """
 from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any
 
 import msgspec
@@ -240,6 +241,7 @@ class Derives:
     def __post_init__(self):
         self.v = self.speed / 3.6
         self.rows = []
+        self.locks = [Lock()]  # which cannot be copied
         self.random = np.random.default_rng(1)
 
     def simulate(self, setting):
