@@ -179,8 +179,7 @@ def _evaluate_shared(
     shared, pool.shared = pool.shared, None
     assert shared is not None
     try:
-        key = msgspec.msgpack.encode((study, selection))
-        known = shared.setdefault(key, {})
+        known = shared.setdefault(msgspec.msgpack.encode((study, selection)), {})
         rows = np.unique(settings, axis=0)
         missing = rows[[row.tobytes() not in known for row in rows]]
         done(len(rows) - len(missing))
@@ -414,8 +413,7 @@ def random_settings(study: Study, *shape: int) -> FloatArray:
             characteristics.lower, characteristics.upper, (count, len(characteristics))
         )
 
-    drawn = region.draw_feasible(draw, math.prod(shape))
-    return np.resize(drawn, (*shape, len(characteristics)))
+    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))
 
 
 def find_in_new_process(study: Study) -> list[Finding]:

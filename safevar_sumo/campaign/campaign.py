@@ -132,11 +132,8 @@ def run_campaign(
     engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
     results.manifest |= _about_algorithms(study)
-    task = Task(
-        study=study,
-        engine=engine_used,
-        batch_size=batch_size or settings_per_batch(system, engine_used),
-    )
+    size = batch_size or settings_per_batch(system, engine_used)
+    task = Task(study=study, engine=engine_used, batch_size=size)
 
     # What the user should know before the search begins.
     asked = len(keys) * study.search.evaluations
@@ -163,13 +160,8 @@ def run_campaign(
 
     # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
     runs.sort(key=lambda run: run.key)
-    for algorithm in study.search.labels:
-        if count := sum(run.discarded for run in runs if run.key.algorithm == algorithm):
-            warn(
-                f"study {study.name!r}: {count} settings that {algorithm} returned are no"
-                " solutions: the original vehicle is not safe in their encounter, or an objective"
-                " is undefined (problem.scoring.valid says which)"
-            )
+    for remark in _remarks_on_discarded(study, runs):
+        warn(remark)
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
     if engine_used is Engine.RECORDED and runs:
@@ -177,6 +169,17 @@ def run_campaign(
         for remark in repeat_in_sumo(task, sample, pool, parts.begin()):
             warn(remark)
     return Campaign(original, runs, system.measuring.scoring, no_verdict)
+
+
+def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:
+    """What algorithms returned that is no solution."""
+    for algorithm in study.search.labels:
+        if count := sum(run.discarded for run in runs if run.key.algorithm == algorithm):
+            yield (
+                f"study {study.name!r}: {count} settings that {algorithm} returned are no"
+                " solutions: the original vehicle is not safe in their encounter, or an objective"
+                " is undefined (problem.scoring.valid says which)"
+            )
 
 
 def _remarks(

@@ -74,8 +74,7 @@ class ClusterWorker:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         # Dask's own serialization turns records into lists
-        job = pickle.dumps((function, arguments))
-        return self._executor.submit(_carry_out, job, self._command)
+        return self._executor.submit(_carry_out, pickle.dumps((function, arguments)), self._command)
 
     def cause_of_death(self, error: BaseException) -> str:
         from distributed import KilledWorker

@@ -116,14 +116,12 @@ class Unsafe:
     @property
     def is_of_points(self) -> bool:
         """Whether points of a rating decide, by `points` or by a bound."""
-        return self.points is not None or (
-            self.bound is not None and self.bound.measure == RATING_POINTS.name
-        )
+        return self.measure == RATING_POINTS.name
 
     @property
     def is_of_impacts(self) -> bool:
         """Whether a bound on the impact decides, which may be allowed."""
-        return self.bound is not None and self.bound.measure == IMPACT_EXCESS.name
+        return self.measure == IMPACT_EXCESS.name
 
     @property
     def _stands_alone(self) -> bool:
@@ -133,7 +131,7 @@ class Unsafe:
     @property
     def _is_of_shares(self) -> bool:
         """Whether a bound on the share of unsafe runs decides."""
-        return self.bound is not None and self.bound.measure == UNSAFE_SHARE.name
+        return self.measure == UNSAFE_SHARE.name
 
     @property
     def worst(self) -> Callable[..., float]:
@@ -208,9 +206,7 @@ class Unsafe:
         without repeats.
         """
         rounds = [] if self._is_of_shares else evaluations.rounds
-        return np.stack(
-            [np.asarray(self._holds(one.outcome, one.column)) for one in rounds or [evaluations]]
-        )
+        return np.stack([self._holds(one.outcome, one.column) for one in rounds or [evaluations]])
 
     def number(self, evaluations: Evaluations) -> float:
         """How many evaluations are unsafe; each counts by the share of its repeats."""
@@ -243,7 +239,7 @@ class Unsafe:
         of the collision.
         """
         if (rounds := evaluations.rounds) and not self._is_of_shares:  # the worst of them
-            return np.asarray(np.min([self._robustness(one) for one in rounds], axis=0))
+            return np.min([self._robustness(one) for one in rounds], axis=0)
         return self._robustness(evaluations)
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:

@@ -332,18 +332,7 @@ class Question:
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)
-            option = next((one.name for one in self.options if one.metavar == CRITERION), "")
-            criterion = values.get(option)
-            cites = ""
-            # A study's own criterion stands where nothing else is asked for; a margin is that of a
-            # collision.
-            if option and all(values.get(name) is None for name in (option, "margin")):
-                criterion = study.unsafe.criterion or None
-                values = {**values, option: criterion}
-                if study.unsafe.source:
-                    cites = f"Criterion: {criterion} ({study.unsafe.source})."
-                if study.unsafe.not_simulated:
-                    cites = f"{cites} Not simulated: {study.unsafe.not_simulated}.".strip()
+            criterion, values, cites = self._criterion(values, study)
             if criterion is not None:
                 unsafe = Unsafe.parse(criterion)
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
@@ -376,6 +365,21 @@ class Question:
         most = account.asked if account.most is None else account.most
         command = "" if most is None else f" --simulations {most}"
         return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
+
+    def _criterion(self, values: JsonObject, study: Study) -> tuple[Any, JsonObject, str]:
+        """What is unsafe, the values of options with it, and where it comes from: a study's own
+        criterion stands where nothing else is asked for; a margin is that of a collision.
+        """
+        option = next((one.name for one in self.options if one.metavar == CRITERION), "")
+        if not option or any(values.get(name) is not None for name in (option, "margin")):
+            return values.get(option), values, ""
+        own = study.unsafe
+        cites = (
+            f"Criterion: {own.criterion or None} ({own.source})." if own.source else "",
+            f"Not simulated: {own.not_simulated}." if own.not_simulated else "",
+        )
+        criterion = own.criterion or None
+        return criterion, {**values, option: criterion}, " ".join(filter(None, cites))
 
     def _following(self, subject: Subject, evaluator: Evaluator, called: str) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,

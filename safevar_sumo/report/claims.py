@@ -205,12 +205,10 @@ class Packed:
                 usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
                 ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
                 part = with_part(text, self.packed.simulations).removeprefix(text)
-                number = len(self.packed.questions) + 1
-                asked = partial(ask, pool=self.pool, questions=number)
+                asked = partial(ask, pool=self.pool, questions=len(self.packed.questions) + 1)
                 where = [self._directory], None, self._jobs, self._progress
                 answer = asked(f"{placed}{part}", [case], *where)
-            command = answer.command.replace(f"{folder}/", "")
-            self._answers[text] = replace(answer, command=command)
+            self._answers[text] = replace(answer, command=answer.command.replace(f"{folder}/", ""))
         return self._answers[text]
 
     def simulations(self) -> dict[str, int]:
@@ -237,8 +235,7 @@ class Packed:
         return with_speed(study, lambda text: self.answer(with_criterion(text, self.packed.unsafe)))
 
     def page(self) -> bytes:
-        study = self.ask_speed()
-        return make_page([study], parts=Parts(self._progress)).encode()
+        return make_page([self.ask_speed()], parts=Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:
         """A study file with all that the study extends."""

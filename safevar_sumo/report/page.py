@@ -138,46 +138,34 @@ def report(
     check_writable(out, "out", (".html", ".htm"))
 
     # The questions: to each of the results alone, and to all together.
-    sources = [getattr(source, "directory", source) for source in results]
-    paths = [Path(check_text("results", source)) for source in sources]
+    paths = [Path(check_text("results", getattr(one, "directory", one))) for one in results]
     cases = load_cases(paths)
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     at_point = cases if point is None else [case_at(case, point) for case in cases]
-    command = f"report {paths} {point} {ask} {unsafe} {quick}"
-    with (
-        open_progress(progress) as show,
-        keep_simulations(command, fresh=fresh),
-        ExitStack() as stack,
-    ):
+    key = f"report {paths} {point} {ask} {unsafe} {quick}"
+    with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
         asked = [quick_questions(texts) if quick else texts for texts in asked]
         texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
-        pool, budgets = None, list[dict[str, int]]()
-        has_simulator = any(assemble(case.study).has_simulator for case in cases)
-        if has_simulator or cluster or simulations:
-            pool = stack.enter_context(open_pool(jobs, cluster))
-        if pool is not None and has_simulator:
-            pool.shared = {}
-        if simulations:
-            budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
+        budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
+        pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
         parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(text: str, chosen: slice, *, is_asked: bool = bool(ask)) -> Answer:
-            """The next answer, about these of the results."""
+            # The next answer, about these of the results.
             stated = with_part(text, budgets[chosen.start or 0]) if budgets else text
             question = with_criterion(stated, unsafe)
             subjects = by_criterion if has_criterion(question, unsafe) else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.split()[0]}"
-            show_part = parts.begin(name)
             answer = answer_to if is_asked else answer_or_reason
-            about = subjects[chosen], paths[chosen], point
+            about = subjects[chosen], paths[chosen], point, jobs, parts.begin(name)
             how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool}
-            return answer(question, *about, jobs, show_part, questions=len(texts), **how)
+            return answer(question, *about, questions=len(texts), **how)
 
         # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
@@ -206,21 +194,37 @@ def _budgets(
     by_criterion: Sequence[Case],
     asked: Sequence[Sequence[str]],
     joint: Sequence[str],
-    simulations: int,
+    simulations: int | None,
 ) -> list[dict[str, int]]:
     """The simulations of the questions about each of the results, which have equal parts; those of
-    joint questions are the first one's. Solutions that were simulated again count.
+    joint questions are the first one's. Solutions that were simulated again count. None without a
+    number.
     """
-    found = []
-    for number, case in enumerate(cases):
+    found = list[dict[str, int]]()
+    for number, case in enumerate(cases if simulations else ()):
         system = assemble(by_criterion[number].study)
         again = (at_point[number] is not case) + (
             by_criterion[number].study != at_point[number].study
         )
         spent = again * len(case.settings) * simulations_of_setting(system)
         texts = [*_with_speed_part(asked[number], case), *(joint if number == 0 else [])]
-        found.append(divided(texts, simulations // len(cases) - spent, system))
+        found.append(divided(texts, (simulations or 0) // len(cases) - spent, system))
     return found
+
+
+def _pool_of(
+    stack: ExitStack, cases: Sequence[Case], jobs: int | None, cluster: str | None, counts: bool
+) -> Pool | None:
+    """The pool that the questions of a page share, with what simulators have simulated, where they
+    take long; None if each opens its own.
+    """
+    has_simulator = any(assemble(case.study).has_simulator for case in cases)
+    if not (has_simulator or cluster or counts):
+        return None
+    pool = stack.enter_context(open_pool(jobs, cluster))
+    if has_simulator:
+        pool.shared = {}
+    return pool
 
 
 def _with_speed_part(asked: Sequence[str], case: Case) -> list[str]:

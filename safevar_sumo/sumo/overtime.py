@@ -45,7 +45,7 @@ def are_closing(on_road: System, runs: SimulationRuns) -> BoolArray:
     distance = runs.encounter.distance[sample]
     is_met = runs.encounter.in_conflict[sample] & (distance >= 0)
     is_near = (closing_speed > STEADY) & (distance < OVERTIME * closing_speed)
-    return np.asarray(is_late & is_met & is_near)
+    return is_late & is_met & is_near
 
 
 def finished(

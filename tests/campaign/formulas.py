@@ -73,7 +73,7 @@ class FormulaPool(InlinePool):
     def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
         if function in (carry_share, evaluate_settings):
             return function(*arguments)
-        return Use({}, []) if function is batches._refuse_defects else ""
+        return (Use({}, []), 0) if function is batches._refuse_defects else ""
 
 
 def with_search(study: Study, **changes: object) -> Study:

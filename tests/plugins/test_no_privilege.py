@@ -100,8 +100,7 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     base = load_study(
         BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search}
     )
-    copy = replace(base, scenario=replace(base.scenario, model=own))
-    assert_equal(base, copy)
+    assert_equal(base, replace(base, scenario=replace(base.scenario, model=own)))
 
 
 DEER = """
@@ -250,8 +249,7 @@ def with_own_models(study: Study, folder: Path) -> Study:
     """A study with copies of its scenario, vehicle and driving system."""
     for key, shipped in {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}.items():
         table = getattr(study, key)
-        own = replace(table, model=copied(shipped[table.model], folder))
-        study = replace(study, **{key: own})
+        study = replace(study, **{key: replace(table, model=copied(shipped[table.model], folder))})
     return study
 
 

@@ -75,8 +75,7 @@ def are_unsafe(
     own = studies_of_sets(study)[fit]
     assert own.matrix is not None
     for test in own.matrix.tests:
-        alone = replace(own.matrix, tests=[test])
-        single = replace(own, matrix=alone)
+        single = replace(own, matrix=replace(own.matrix, tests=[test]))
         system = assemble(single)
         if phase:
             system = assemble(in_phases(single, system))

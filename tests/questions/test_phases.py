@@ -81,8 +81,7 @@ def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
     phases = np.array([0.0, 0.4, 0.4, 0.9131, 0.2])
     found = degrees(phased, np.column_stack([settings, phases]))
     for row, phase in enumerate(phases.tolist()):
-        alone = degrees(at_phase(system, phase), settings[[row]])
-        assert_array_equal(found[:, row], alone[:, 0])
+        assert_array_equal(found[:, row], degrees(at_phase(system, phase), settings[[row]])[:, 0])
 
 
 def test_sumo_repeats_a_phase_to_the_bit() -> None:
@@ -121,8 +120,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     assert claim is not None
     judge = partial(claim.robustness, stage="phases")
     rows, worst = at_worst_phases(claim, judge, settings[some])
-    line = np.interp(speeds[some], speeds[lower], left[lower])
-    assert_allclose(worst, line, atol=0.01)
+    assert_allclose(worst, np.interp(speeds[some], speeds[lower], left[lower]), atol=0.01)
     assert (worst <= left[some]).all()
 
     # What is printed is what was simulated.

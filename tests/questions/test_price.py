@@ -196,8 +196,7 @@ def test_a_number_is_that_of_all_simulations_of_an_edited_class(
         assert "30 for a check of the class, which is shorter" in output.stderr or (
             re.search(r"with 2\d for a check of the class, which is shorter", output.stderr)
         )
-        first = output.stdout
-        assert run(*command, expect=None).stdout == first
+        assert run(*command, expect=None).stdout == output.stdout
 
 
 def test_what_decides_is_said_from_several_vehicles_for_each_characteristic(rig: str) -> None:

@@ -126,8 +126,7 @@ def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     study = load_study("sun")
     characteristics = assemble(study).characteristics
     width = characteristics.upper - characteristics.lower
-    rng = default_rng(1)
-    settings = rng.uniform(characteristics.lower, characteristics.upper, (200, 12))
+    settings = default_rng(1).uniform(characteristics.lower, characteristics.upper, (200, 12))
     settings[:, 3] = characteristics.original[3]
     slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
     response = 1.0 + ((settings - characteristics.original) / width) @ np.nan_to_num(slopes)

@@ -165,8 +165,7 @@ def turned(record: Any, key: str) -> Any:
 
 def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> None:
     wear, joint = load_study("wear"), load_study("wear_joint")
-    tests = [turned(test, "over") for test in wear.matrix.tests]
-    matrix = replace(wear.matrix, tests=tests)
+    matrix = replace(wear.matrix, tests=[turned(test, "over") for test in wear.matrix.tests])
     for study, order, changes in (
         (
             wear,

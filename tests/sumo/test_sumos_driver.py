@@ -256,8 +256,7 @@ def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> Non
     grippy = load_study("native", vehicle={"parameters": {"tyre_friction": 1.0}})
     assert assemble(grippy).remarks == []
 
-    runs = assemble(load_study("native", ads={"model": "idm"}))
-    fast, slow = top_speeds(runs)
+    fast, slow = top_speeds(assemble(load_study("native", ads={"model": "idm"})))
     assert fast > slow + 1
     assert remarks("idm") == remarks("krauss") == []
     assert any("tau has no effect" in remark for remark in remarks("acc"))

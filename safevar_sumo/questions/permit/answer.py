@@ -119,9 +119,8 @@ class PermitAnswer:
         assert new_car is not None
         words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)
         rows = []
-        cells = assumed_cells(vehicle, fleet)
         for name, permit, found, best, assumed in zip(
-            fleet.names, permits, words, repaired, cells, strict=True
+            fleet.names, permits, words, repaired, assumed_cells(vehicle, fleet), strict=True
         ):
             verdict = verdict_of(
                 permit.up_to, new_car, self.span.high, self.need, is_proven=not self.is_quick

@@ -96,7 +96,7 @@ class _Search:
     @property
     def tried(self) -> int:
         """Number of random vehicles that were safe in the box as it is now."""
-        return int(self._are_inside(self._safe).sum())
+        return int(self.box.holds(self._safe).sum())
 
     @property
     def at_most(self) -> float:
@@ -152,7 +152,7 @@ class _Search:
         self._failures = np.vstack([self._failures, needed])
         self._gap *= WIDENING
         self.low, self.high = (end.copy() for end in self._outer)
-        while (inside := self._failures[self._are_inside(self._failures)]).size:
+        while (inside := self._failures[self.box.holds(self._failures)]).size:
             self._cut_off(inside)
 
     def _needed(self, failure: FloatArray) -> FloatArray:
@@ -188,7 +188,7 @@ class _Search:
     def _choices(self, failures: FloatArray) -> BoolArray:
         """Where a side can cut failures off, shape (..., n)."""
         members = self.model.characteristics
-        return np.asarray((failures != members.original) & members.of_vehicle & ~self.is_fixed)
+        return (failures != members.original) & members.of_vehicle & ~self.is_fixed
 
     def _move(self, column: int, end: float, *, is_high: bool) -> None:
         """Move a side to an end, rounded towards the original."""
@@ -198,9 +198,6 @@ class _Search:
             self.high[column] = max(rounded, item.original)
         else:
             self.low[column] = min(rounded, item.original)
-
-    def _are_inside(self, settings: FloatArray) -> BoolArray:
-        return np.asarray(((settings >= self.low) & (settings <= self.high)).all(axis=1))
 
 
 def answer_roughly(asked: Asked) -> Answer:
