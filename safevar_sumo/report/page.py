@@ -222,7 +222,7 @@ def _pool_of(
     if not (has_simulator or cluster or counts):
         return None
     pool = stack.enter_context(open_pool(jobs, cluster))
-    if has_simulator:
+    if has_simulator and counts:
         pool.shared = {}
     return pool
 
