@@ -384,7 +384,6 @@ def simulate_with_original(
         Engine.LIBSUMO,
         listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
     )
-    observations = observations[-len(runs.trace.time) :]  # those of runs that went on, alone
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 
     # With the values that the filter resets.

@@ -342,7 +342,7 @@ SPEED_DIMENSION = "speed"
 class Point(NamedTuple):
     """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
     the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
-    All of it begins `phase` steps later, a number or of shape (N,), and ends `overtime` [s] later.
+    All of it begins `phase` steps later, a number or of shape (N,).
     """
 
     scenario: Scenario
@@ -351,7 +351,6 @@ class Point(NamedTuple):
     parameters: tuple[tuple[str, Any], ...] = ()
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
-    overtime: float = 0.0
 
 
 class PreCrash(StrEnum):

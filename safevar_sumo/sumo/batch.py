@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
@@ -20,14 +19,13 @@ from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
 from safevar_sumo.sumo.network import copied_network, networks_for
-from safevar_sumo.sumo.overtime import finished
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.simulators import joined, simulate_each
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.traffic import LaneWorld, Traffic
+from safevar_sumo.sumo.traffic import OVERTIME, LaneWorld, Traffic
 from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
 from safevar_sumo.sumo.world import Api, SumoWorld
 
@@ -92,8 +90,7 @@ def drive_all(
 
     The result holds the runs at the first point, then the runs at the second point, and so on.
     Several points must have scenarios of tracks; SUMO simulates only one point at once. `listen` is
-    called with what the ADS observes at every sample, and once more from the first sample on if the
-    runs go on beyond their time.
+    called with what the ADS observes at every sample.
 
     Raises
     ------
@@ -109,8 +106,9 @@ def drive_all(
     scenario = on_road.points[0].scenario
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
-        traffic = traffic_of(system, encounters)
-        if not needs_no_sumo(system, engine):  # in SUMO, among the other actors that it moves
+        plays = needs_no_sumo(system, engine)
+        traffic = traffic_of(system, encounters, 0.0 if plays else OVERTIME)
+        if not plays:  # in SUMO, among the other actors that it moves
             with open_points_world(system, encounters, traffic) as sumo_world:
                 observer = observer_of(scenario, sumo_world, traffic)
                 runs = drive(on_road, vehicles, sumo_world, observer, listen)
@@ -121,13 +119,7 @@ def drive_all(
         else:  # in a scene that SUMO has played once
             world = _recorded_world(system, encounters, scenario)
             runs = drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
-
-    # Who still closes on somebody drives again with more time; varied systems drive together.
-    if not all(point.scenario.goes_on and not point.overtime for point in system.points):
-        return runs
-    again = partial(drive_all, engine=engine, listen=listen)
-    together = listen is not None or isinstance(system.ads, VariedAds)
-    return finished(system, settings, runs, again, together=together)
+    return runs
 
 
 def _recorded_world(
@@ -158,9 +150,9 @@ def observer_of(scenario: Scenario, world: SceneWorld, traffic: Traffic | None) 
     return SceneObserver(scenario, world)
 
 
-def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
-    """The bodies around N vehicles in their encounters, shape (N, k), at every point; None if the
-    scenario observes a world itself.
+def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic | None:
+    """The bodies around N vehicles in their encounters, shape (N, k), at every point, for so many
+    seconds `longer` than their scenarios take; None if the scenario observes a world itself.
     """
     points = system.points
     if not all(isinstance(point.scenario, TrackScenario) for point in points):
@@ -178,7 +170,8 @@ def traffic_of(system: System, encounters: FloatArray) -> Traffic | None:
         starts = n_encounters * np.arange(len(points))
         group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
-    n_samples = round(max(float(np.max(last_sample_of(point, step))) for point in points)) + 1
+    last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
+    n_samples = round(last_sample + longer / step) + 1
     return Traffic(points, group, n_encounters=n_encounters, n_samples=n_samples, step=step)
 
 

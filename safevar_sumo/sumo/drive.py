@@ -34,6 +34,7 @@ from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.sumo.traffic import OVERTIME, Traffic
 from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
@@ -78,7 +79,9 @@ def drive(
     outcomes = _Outcomes(n)
     last_samples = [np.zeros(size) + last_sample_of(point, step) for point in points]
     last_sample = np.round(np.concatenate(last_samples)).astype(int)
-    log = _Log(world, int(last_sample.max()) + 1)
+    may_go_on = np.repeat([point.scenario.goes_on for point in points], size)
+    longer = round(OVERTIME / step)
+    log = _Log(world, int(last_sample.max()) + 1 + longer * bool(may_go_on.any()))
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             # What is around the vehicles now, and which runs end by it.
@@ -90,6 +93,12 @@ def drive(
             collisions = contacts.count(world, motion.hits, scene)
             if isinstance(observer, SceneObserver):  # bodies on tracks touch wherever they overlap
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
+            ends = may_go_on & outcomes.is_open & (sample == last_sample)
+            if isinstance(observer, Traffic) and ends.any():
+                ends &= observer.are_closing(motion)
+                may_go_on &= ~ends
+                last_sample = last_sample + longer * ends
+                observer.go_on(int(last_sample.max()) + 1)
             active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
 
             # What the driving systems see, and what they command.
@@ -121,7 +130,7 @@ def drive(
 
 def last_sample_of(point: Point, step: float) -> Quantity:
     """The number of the last sample of runs at a point, which begin later by its phase."""
-    return (point.scenario.duration + point.overtime) / step + point.phase
+    return point.scenario.duration / step + point.phase
 
 
 def _runs(

@@ -80,7 +80,7 @@ class System:
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - `allowed_impact_speed` [m/s], `phase` and `overtime` are those of the only point; see `Point`.
+    - `allowed_impact_speed` [m/s] and `phase` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `criterion` is the study's own.
     - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
@@ -106,7 +106,6 @@ class System:
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
-    overtime: float = 0.0
     repeats: int = 1
     command: str = ""
     skips_failed: bool = False
@@ -124,7 +123,6 @@ class System:
             self.weather,
             allowed_impact_speed=self.allowed_impact_speed,
             phase=self.phase,
-            overtime=self.overtime,
         )
         return (only,)
 
@@ -203,7 +201,6 @@ class System:
             weather=point.weather,
             allowed_impact_speed=point.allowed_impact_speed,
             phase=point.phase,
-            overtime=point.overtime,
             matrix=(),
             rater=None,
         )

@@ -41,6 +41,10 @@ LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a closing speed that is a divisor [m/s]."""
+OVERTIME = 30.0
+"""How much longer a run may take whose vehicle would touch somebody by then [s]."""
+STEADY = 0.05
+"""Closing speed up to which a vehicle follows somebody [m/s]."""
 LANE = Frame((0.0, 0.0), (1.0, 0.0))
 """The coordinates of the vehicle's lane, in which tracks are."""
 BLOCK = 16_384
@@ -73,15 +77,26 @@ class Traffic:
         self.length = first.vut_length
         self.width = first.vut_width
         self.setback = first.sensor_setback
-        times = (np.arange(n_samples) * step).astype(float)[:, np.newaxis]
-        own = self._own(np.zeros(1), np.zeros(1))
         n_groups = int(group.max()) + 1
-        self.tracks = tracks_of(points, times, n_encounters, step, own)
         self.n = len(group)
         self.step = step
         # None: all vehicles share a column, or each has its own.
         self.group: IntArray | None = group if 1 < n_groups < self.n else None
-        bodies = [Moving.of(track, step, self.width) for track in self.tracks]
+        self._points = points
+        self._n_encounters = n_encounters
+        self._sample = 0
+        self._struck = np.full(self.n, NOBODY)
+        self._place(n_samples)
+        self._ended = np.zeros((len(self._bodies), n_samples, self.n), dtype=bool)
+        # Who is not in the path at the start has been approached as soon as it comes into it.
+        self._approached = [~self._row(body.is_in_path, 0) for body in self._bodies]
+
+    def _place(self, n_samples: int) -> None:
+        """Place all bodies at this number of samples."""
+        times = (np.arange(n_samples) * self.step).astype(float)[:, np.newaxis]
+        own = self._own(np.zeros(1), np.zeros(1))
+        self.tracks = tracks_of(self._points, times, self._n_encounters, self.step, own)
+        bodies = [Moving.of(track, self.step, self.width) for track in self.tracks]
         highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
@@ -96,11 +111,27 @@ class Traffic:
             if not any(screen.covers(body) for screen in screens if screen is not body)
         ]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
-        self._ended = np.zeros((len(bodies), n_samples, self.n), dtype=bool)
-        # Who is not in the path at the start has been approached as soon as it comes into it.
-        self._approached = [~self._row(body.is_in_path, 0) for body in bodies]
-        self._sample = 0
-        self._struck = np.full(self.n, NOBODY)
+
+    def are_closing(self, motion: VehicleStates) -> BoolArray:
+        """Which vehicles would touch a body within `OVERTIME` at their closing speeds, at the
+        sample of the last `observe`.
+        """
+        front = motion.fronts[np.newaxis, :, 0]
+        speed = motion.speeds[np.newaxis]
+        samples = slice(self._sample, self._sample + 1)
+        closes = np.zeros(self.n, dtype=bool)
+        for k in self._encountered:
+            apart, rate = self._apart(k, samples, front, speed)
+            counts = ~self._ended[k, samples] & self._table(self._counts[k], samples)
+            closes |= (counts & (rate > STEADY) & (apart < OVERTIME * rate))[0]
+        return closes
+
+    def go_on(self, n_samples: int) -> None:
+        """Move all bodies up to this number of samples, if they do not yet."""
+        known = self._ended.shape[1]
+        if n_samples > known:
+            self._place(n_samples)
+            self._ended = np.pad(self._ended, ((0, 0), (0, n_samples - known), (0, 0)))
 
     def _row(self, column: Sampled, sample: int | None = None) -> Sampled:
         return row(column, self._sample if sample is None else sample, self.group)

@@ -18,8 +18,8 @@ from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size
-from safevar_sumo.sumo.overtime import with_overtime
 from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.traffic import OVERTIME
 from safevar_sumo.sumo.world import SumoWorld
 
 COMPARED = ("position", "gap", "lateral", "obstacle_speed")
@@ -43,14 +43,10 @@ def drive_again(
     trace = runs.trace
     n = len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
-    # Runs may have gone on beyond their scenario's time.
-    (point,) = system.points
-    if trace.time[-1] > np.max(point.scenario.duration) + trace.step:
-        system = with_overtime(system, point)
     vehicles, encounters = system.cut(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
-    traffic = traffic_of(system, encounters)
+    traffic = traffic_of(system, encounters, OVERTIME)
     with user_errors(system.source), open_points_world(system, encounters, traffic, start) as world:
         motion = enter(on_road, vehicles, world).motion
         observer = observer_of(point.scenario, world, traffic)
