@@ -220,10 +220,17 @@ def _listen(event: str, arguments: tuple[Any, ...]) -> None:
     """Note a file or database that user code opens to read."""
     if event not in ("open", "sqlite3.connect") or this_process.opened is None:
         return
-    path, mode, flags = arguments if event == "open" else (*arguments, "", 0)
+    path, mode, flags = arguments if event == "open" else (_database(*arguments), "", 0)
     is_read = not (set(mode or "") & set("wax+") or (flags or 0) & WRITING)
     if is_read and isinstance(path, str | bytes) and _is_from_user_code():
         this_process.opened.add(os.path.abspath(os.fsdecode(path)))
+
+
+def _database(name: Any) -> Any:
+    """The file of a database, which sqlite3 calls by its path or as `file:PATH?OPTIONS`."""
+    path = os.fspath(name) if isinstance(name, os.PathLike) else name
+    is_uri = isinstance(path, str) and path.startswith("file:")
+    return path[len("file:") :].partition("?")[0] if is_uri else path
 
 
 def _is_from_user_code() -> bool:
