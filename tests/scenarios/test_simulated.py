@@ -756,7 +756,9 @@ class Reads(Wall):
 """Files that Python opens, and one that it does not."""
 BY = {
     "opened": "float(open('data.txt').read())",
-    "sqlite3": "sqlite3.connect('file:data.db?mode=ro', uri=True).execute('select x from t').fetchone()[0]",
+    "sqlite3": (
+        "sqlite3.connect('file:data.db?mode=ro', uri=True).execute('select x from t').fetchone()[0]"
+    ),
     "elsewhere": "float(os.popen('cat data.txt').read())",
 }
 
