@@ -18,6 +18,7 @@ from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
+from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
@@ -25,7 +26,7 @@ from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.simulators import joined, simulate_each
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.sumo.traffic import OVERTIME, LaneWorld, Traffic
+from safevar_sumo.sumo.traffic import OVERTIME, Traffic
 from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
 from safevar_sumo.sumo.world import Api, SumoWorld
 

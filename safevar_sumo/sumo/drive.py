@@ -22,6 +22,7 @@ from safevar_sumo.records import (
     Command,
     Encounter,
     FloatArray,
+    IntArray,
     Observation,
     Outcome,
     Quantity,
@@ -80,8 +81,7 @@ def drive(
     last_samples = [np.zeros(size) + last_sample_of(point, step) for point in points]
     last_sample = np.round(np.concatenate(last_samples)).astype(int)
     may_go_on = np.repeat([point.scenario.goes_on for point in points], size)
-    longer = round(OVERTIME / step)
-    log = _Log(world, int(last_sample.max()) + 1 + longer * bool(may_go_on.any()))
+    log = _Log(world, int(last_sample.max()) + 1 + round(may_go_on.any() * OVERTIME / step))
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             # What is around the vehicles now, and which runs end by it.
@@ -95,10 +95,7 @@ def drive(
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
             ends = may_go_on & outcomes.is_open & (sample == last_sample)
             if isinstance(observer, Traffic) and ends.any():
-                ends &= observer.are_closing(motion)
-                may_go_on &= ~ends
-                last_sample = last_sample + longer * ends
-                observer.go_on(int(last_sample.max()) + 1)
+                may_go_on &= ~_go_on(observer, motion, ends, last_sample)
             active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
 
             # What the driving systems see, and what they command.
@@ -126,6 +123,16 @@ def drive(
     encounter = observer.encounter(trace)
     outcomes.ended = outcomes.classify()
     return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
+
+
+def _go_on(
+    traffic: Traffic, motion: VehicleStates, ends: BoolArray, last_sample: IntArray
+) -> BoolArray:
+    """Which of the runs that end by their time go on; their last samples are moved."""
+    goes_on = ends & traffic.are_closing(motion)
+    last_sample[goes_on] += round(OVERTIME / traffic.step)
+    traffic.place_until(int(last_sample.max()) + 1)
+    return goes_on
 
 
 def last_sample_of(point: Point, step: float) -> Quantity:

@@ -27,11 +27,9 @@ from safevar_sumo.sumo.bodies import (
     BodyPairs,
     VehicleStates,
     distance_between,
-    distance_covered,
     find_overlaps,
 )
 from safevar_sumo.sumo.moving import TIE, Moving, Sampled, row, tracks_of
-from safevar_sumo.vehicles import SumoType
 
 APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]; once the vehicle cannot be
@@ -126,7 +124,7 @@ class Traffic:
             closes |= (counts & (rate > STEADY) & (apart < OVERTIME * rate))[0]
         return closes
 
-    def go_on(self, n_samples: int) -> None:
+    def place_until(self, n_samples: int) -> None:
         """Move all bodies up to this number of samples, if they do not yet."""
         known = self._ended.shape[1]
         if n_samples > known:
@@ -389,43 +387,3 @@ class _Seen(NamedTuple):
     closing: FloatArray
     is_passed: BoolArray
     visible: BoolArray
-
-
-class LaneWorld:
-    """N vehicles on a lane among bodies on tracks, which move by SUMO's ballistic update."""
-
-    frame = LANE
-
-    def __init__(self, traffic: Traffic, start_speeds: FloatArray, step: float) -> None:
-        self.n = traffic.n
-        self.step_length = step
-        self._traffic = traffic
-        self._front = np.zeros(traffic.n)
-        self._speed = start_speeds
-        self._sample = 0
-
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
-        return self._motion(np.ones(self.n, dtype=bool))
-
-    def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
-        covered = distance_covered(self._speed, speeds, self.step_length)
-        self._front = np.where(is_open, self._front + covered, self._front)
-        self._speed = np.where(is_open, speeds, self._speed)
-        self._sample += 1
-        return self._motion(is_open)
-
-    def _motion(self, is_open: BoolArray) -> VehicleStates:
-        hits = self._traffic.hits(self._sample, self._front, self._speed, is_open)
-        fronts = np.zeros((self.n, 2))
-        fronts[:, 0] = self._front
-        return VehicleStates(fronts, self._speed, hits)
-
-    def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
-        return self._traffic.bodies(vehicles, self._front, self._speed)
-
-    def vehicle_length(self, actor: str) -> float:
-        return self._traffic.length
-
-    @property
-    def vehicle_width(self) -> float:
-        return self._traffic.width

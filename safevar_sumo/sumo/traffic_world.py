@@ -20,9 +20,10 @@ from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
 from safevar_sumo.sumo.bodies import BodyPairs, VehicleStates
 from safevar_sumo.sumo.engine import open_world
+from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.moving import Sampled, row
 from safevar_sumo.sumo.network import NetworkFiles, copied_network
-from safevar_sumo.sumo.traffic import LaneWorld, Traffic
+from safevar_sumo.sumo.traffic import Traffic
 from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 

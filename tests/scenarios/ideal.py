@@ -14,8 +14,9 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.records import SimulationRuns
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.sumo.drive import drive
+from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.system import System
-from safevar_sumo.sumo.traffic import LaneWorld, Traffic
+from safevar_sumo.sumo.traffic import Traffic
 from safevar_sumo.vehicles import Vehicle, calibration_drive
 from safevar_sumo.vehicles.base import SumoType
 
