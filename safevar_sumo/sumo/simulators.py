@@ -113,17 +113,17 @@ class _Kept:
         # before opened and put into the object is handed on.
         is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
-        simulator = _deep_copy(scenario) if has_worker or is_struct else copy(scenario)
+        simulator = copy(scenario)
+        names = getattr(scenario, "__struct_fields__", None) or [*vars(scenario)]
+        for field, value in ((field, getattr(scenario, field)) for field in names):
+            if has_worker or is_struct or isinstance(value, PLAIN):
+                set_field(simulator, field, _deep_copy(value))
         if has_worker:
             try:
                 set_field(simulator, "worker", handle)
             except AttributeError:  # a Struct has its fields alone
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
-            for field, value in vars(simulator).items():
-                set_field(
-                    simulator, field, _deep_copy(value) if isinstance(value, PLAIN) else value
-                )
             for field, value in vars(self._last.get(name, simulator)).items():
                 if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
                     set_field(simulator, field, value)
@@ -144,11 +144,11 @@ class _Kept:
 
 
 def _deep_copy(value: Any) -> Any:
-    """A copy that shares nothing, where that can be copied."""
+    """A copy that shares nothing; the value itself, such as a lock, where there is none."""
     try:
         return deepcopy(value)
     except (TypeError, AttributeError, ValueError, RuntimeError, Error):
-        return copy(value)
+        return value
 
 
 _kept = _Kept()
