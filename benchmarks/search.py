@@ -45,6 +45,7 @@ class InThisProcess:
     def __init__(self, study: Study) -> None:
         self.characteristics = system_of(study).characteristics
         self._task = Task(study=study)
+        self.phases = self  # which shows no progress
 
     def evaluate(self, settings: FloatArray, stage: str = "") -> Evaluations:
         return evaluate_settings(self._task, settings)
