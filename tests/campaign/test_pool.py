@@ -95,7 +95,15 @@ def take(task: Task, seconds: float) -> None:
 
 
 @pytest.mark.slow
-def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(pool: Pool) -> None:
+def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(
+    pool: Pool, in_tmp: Path
+) -> None:
+    (in_tmp / "my_ads.py").write_text(
+        "from safevar_sumo.ads import ScalarAds\n"
+        "class Mine(ScalarAds):\n"
+        "    def drive(self, seen):\n"
+        "        return 0.1, 0.0\n"
+    )
     study = load_study("smoke", search={"time_limit": 0.2})
     why = "two workers were lost at the same work, 9: a batch took longer than the time limit"
     with pytest.raises(SafevarError, match=f"study 'smoke': {why}"):
