@@ -135,8 +135,9 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
         positive_gap = np.maximum(gap, LEAST_GAP)
         free_road = 1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
-        return self.acceleration * (
-            free_road - desired_gap * desired_gap / (positive_gap * positive_gap)
+        return np.asarray(
+            self.acceleration
+            * (free_road - desired_gap * desired_gap / (positive_gap * positive_gap))
         )
 
 

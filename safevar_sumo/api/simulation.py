@@ -320,7 +320,7 @@ def simulate(
     loaded_study, system = load_and_assemble(study)
     with about("changes"):
         loaded_study, system = with_encounters(
-            loaded_study, system, () if changes is None else [*changes]
+            loaded_study, system, {} if changes is None else dict(changes)
         )
     return simulate_with_original(
         loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered

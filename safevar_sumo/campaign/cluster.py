@@ -74,7 +74,10 @@ class ClusterWorker:
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         # Dask's own serialization turns records into lists
-        return self._executor.submit(_carry_out, pickle.dumps((function, arguments)), self._command)
+        future: Future[Any] = self._executor.submit(
+            _carry_out, pickle.dumps((function, arguments)), self._command
+        )
+        return future
 
     def cause_of_death(self, error: BaseException) -> str:
         from distributed import KilledWorker

@@ -222,7 +222,9 @@ class Run:
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)
-        return self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
+        return np.asarray(
+            self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
+        )
 
     def receive(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of missing settings."""

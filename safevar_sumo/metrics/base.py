@@ -173,7 +173,7 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkn
         shape (M,).
         """
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
-        return evaluations.valid & is_defined & (self.violation(evaluations) == 0)
+        return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
 
 
 F_SAFE = Measure(name="f_safe", title="safety degree", unit="m, -m/s")

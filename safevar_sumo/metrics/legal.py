@@ -118,7 +118,7 @@ def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Relative speed at contact along the vehicle's lane [m/s], at least `LEAST_CLOSING_SPEED`;
     shape (N,), NaN without a collision.
     """
-    return np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED)
+    return np.asarray(np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED))
 
 
 IMPACT_SPEED = Measure(

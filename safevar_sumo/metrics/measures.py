@@ -188,7 +188,7 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     is_defined = (
         (runs.outcome == Outcome.PASSED) & (apart >= 0) & (leaves | comes) & (rate > STANDSTILL)
     )
-    return np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined)
+    return np.asarray(np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined))
 
 
 def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -241,7 +241,9 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
     undefined = np.full_like(deceleration_sum, np.nan)
-    return np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0)
+    return np.asarray(
+        np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0)
+    )
 
 
 AVE_DECE = Measure(

@@ -217,7 +217,7 @@ class Unsafe:
         """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
         unsafe.
         """
-        return self._holds(solutions["outcome"], solutions.__getitem__)
+        return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
         if self.points is not None:
@@ -239,7 +239,7 @@ class Unsafe:
         of the collision.
         """
         if (rounds := evaluations.rounds) and not self._is_of_shares:  # the worst of them
-            return np.min([self._robustness(one) for one in rounds], axis=0)
+            return np.asarray(np.min([self._robustness(one) for one in rounds], axis=0))
         return self._robustness(evaluations)
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:

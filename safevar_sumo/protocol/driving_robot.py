@@ -191,4 +191,4 @@ class DrivingRobot:
         """Which vehicles left the tolerance before the system acted, or acted too early; shape
         (N,).
         """
-        return (self._error_share > 1) | ~np.isnan(self.acted_early)
+        return np.asarray((self._error_share > 1) | ~np.isnan(self.acted_early))

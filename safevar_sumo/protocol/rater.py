@@ -182,7 +182,9 @@ def passing_cells(protocol: Protocol, colours: npt.NDArray[np.int8]) -> BoolArra
     """
     nominal = colours[:, protocol.nominal_numbers]
     only_not_red = [cell.criterion == NOT_RED for cell in protocol.cells]
-    return (colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal)
+    return np.asarray(
+        (colours != UNKNOWN) & np.where(only_not_red, colours != RED, colours <= nominal)
+    )
 
 
 def rated_quantities(runs: SimulationRuns) -> CellResults:

@@ -6,9 +6,9 @@ has the vehicle's characteristics, then a place on each axis.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.scope import are_numbers, at_values, moving_axes, points_of_tests
+from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Scenario, searchable_in, weather_of
 from safevar_sumo.study import PHASE, Domain, MatrixTest, Study
@@ -184,17 +185,24 @@ def _points_of(test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]
         yield (test.name, *over.items()), at_values(test, over)
 
 
-def with_encounters(study: Study, system: System, names: Iterable[str]) -> tuple[Study, System]:
-    """A study and its system; if axes of its matrix, or the phase, are among the names of what a
-    user sets, they are searched parameters, in the tests that have all of these axes.
+def with_encounters(
+    study: Study, system: System, changes: Mapping[str, str | float]
+) -> tuple[Study, System]:
+    """A study and its system; if axes of its matrix, or the phase, are among the names of a user's
+    changes, they are searched parameters, in the tests that have all of these axes, and their
+    values, as far as these are numbers.
 
     Raises
     ------
     InputError
-        If the phase is set, and the study's encounters have none.
+        If the phase is set, and the study's encounters have none; or axes that no test has
+        together.
     """
-    found = _with_axes(study, system, {*names} - {*system.characteristics.names})
-    if PHASE in names and PHASE not in system.characteristics.names:
+    known = system.characteristics.names
+    found = _with_axes(
+        study, system, {name: value for name, value in changes.items() if name not in known}
+    )
+    if PHASE in changes and PHASE not in system.characteristics.names:
         phased = in_phases(found, assemble(found))
         if phased == found:
             problem = f"study {study.name!r} has no {PHASE}"
@@ -210,8 +218,8 @@ def with_encounters(study: Study, system: System, names: Iterable[str]) -> tuple
     return found, replace(searched, measuring=searched.measuring._replace(scoring=scoring))
 
 
-def _with_axes(study: Study, system: System, names: set[str]) -> Study:
-    """A study that searches those of the names that are axes of its matrix which a scenario can
+def _with_axes(study: Study, system: System, places: Mapping[str, str | float]) -> Study:
+    """A study that searches those of the places that are axes of its matrix which a scenario can
     move, in the tests that have all of them, at its point if it is at one.
     """
     matrix = study.matrix
@@ -223,12 +231,21 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
         for test in matrix.tests
         if test.name in here
     ]
-    axes = names & {name for _, domains in moving for name in domains}
+    axes = places.keys() & {name for _, domains in moving for name in domains}
     if not axes:
         return study
 
+    # The tests in which the values lie; if there is none, the one whose domains end last, which
+    # the error names.
+    kept = [(test, domains) for test, domains in moving if axes <= domains.keys()]
+    if not kept:
+        problem = f"no test has {join_phrases(sorted(axes))} together"
+        raise InputError("", problem, "values of one test's axes")
+    farthest = max(kept, key=lambda each: [each[1][name].upper for name in sorted(axes)])
+    has_all = [all(_has(domains[name], places[name]) for name in axes) for _, domains in kept]
+    kept = [*compress(kept, has_all)] or [farthest]
+
     # At a point, the rest of its test stays as it is there.
-    kept = [(test, domains) for test, domains in moving if axes <= {*domains}]
     tests = [without_axes(test, axes) for test, _ in kept]
     if matrix.point:
         of_point = dict(system.points[0].parameters)
@@ -244,16 +261,29 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
             for test in tests
         ]
     domains = {
-        name: replace_in(
-            kept[0][1][name],
-            lower=min(own[name].lower for _, own in kept),
-            upper=max(own[name].upper for _, own in kept),
-        )
-        for name in kept[0][1]
-        if name in axes
+        name: _common(name, [own[name] for _, own in kept]) for name in kept[0][1] if name in axes
     }
     return replace_in(
         study,
         matrix=replace_in(matrix, tests=tests, point=""),
         scenario=replace_in(study.scenario, search=domains),
     )
+
+
+def _common(name: str, domains: Sequence[Domain]) -> Domain:
+    """What domains of an axis have in common."""
+    lower = max(domain.lower for domain in domains)
+    upper = min(domain.upper for domain in domains)
+    if lower >= upper:
+        raise InputError("", f"{name}: the tests have no range in common", "--point, for one test")
+    original = min(max(domains[0].original, lower), upper)
+    return replace_in(domains[0], original=original, lower=lower, upper=upper)
+
+
+def _has(domain: Domain, value: str | float) -> bool:
+    """Whether a value, or both ends of a sweep, lie in a domain; a share of the original may."""
+    ends = str(value).partition(":")[0].split("..")
+    try:
+        return all(domain.lower <= float(end) <= domain.upper for end in ends)
+    except ValueError:
+        return True

@@ -63,7 +63,7 @@ class Box:
         """
         points = rng.random((number, len(self.lower)))
         settings = self.at(np.where(rng.random(points.shape) < 0.5, np.round(points), points))
-        return settings[self.region.feasible(settings)]
+        return np.asarray(settings[self.region.feasible(settings)])
 
     def spread_and_corners(self, number: int, seed: int) -> FloatArray:
         """Settings at Sobol points, and at as many corners, where all changes of the vehicle add

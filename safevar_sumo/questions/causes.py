@@ -125,7 +125,7 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), OTHER_SETS))
     # The first setting of a group, with all changes, is the only unsafe one.
-    return is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
+    return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
 
 
 def _subset_counts(numbers: Sequence[int], most: int | None = None) -> list[int]:

@@ -93,7 +93,7 @@ def _parse_values(change: str, text: str, original: float, forms: str) -> list[f
                 f"{change!r}: {count} values from {sweep[1]} to {sweep[2]}",
                 "NUMBER of at least 2",
             )
-        return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()
+        return np.linspace(float(sweep[1]), float(sweep[2]), count).tolist()  # type: ignore[no-any-return]
     if re.fullmatch(NUMBER_PATTERN, text):
         return [float(text)]
     raise InputError("", repr(change), forms)

@@ -6,13 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
@@ -23,6 +22,9 @@ from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenari
 from safevar_sumo.study import PHASE, unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+
+if TYPE_CHECKING:
+    from safevar_sumo.questions.case import Case
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
 """Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is

@@ -264,4 +264,4 @@ def _children(box: Box, found: Falsification, number: int, rng: np.random.Genera
         + DIFFERENCE * (parents[third] - parents[fourth])
     )
     is_moved = (np.arange(number) % 2 == 1)[:, np.newaxis]
-    return np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper)
+    return np.asarray(np.clip(np.where(is_moved, moved, mutated), box.lower, box.upper))

@@ -100,7 +100,7 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
     changes = (settings - characteristics.original) / (
         characteristics.upper - characteristics.lower
     )
-    return np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE)
+    return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
 
 
 def prediction_band(

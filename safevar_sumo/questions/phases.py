@@ -102,7 +102,7 @@ def _ways(model: Model, settings: FloatArray) -> FloatArray:
     values = system.characteristics.scenario.columns(system.cut(settings)[1])
     points = (encounter(system.points[number], values) for number in model.numbers_of_points)
     speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
-    return system.step * np.maximum.reduce(speeds)
+    return np.asarray(system.step * np.maximum.reduce(speeds))
 
 
 def at_worst_phases(

@@ -324,4 +324,4 @@ def _drop_useless_conditions(
 
 def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
     """Whether each of M settings lies within a box; shape (M,)."""
-    return ((settings >= box[0]) & (settings <= box[1])).all(axis=1)
+    return np.asarray(((settings >= box[0]) & (settings <= box[1])).all(axis=1))

@@ -50,7 +50,8 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     import scipy  # takes longer to load than a simulation
 
     sequence = scipy.stats.qmc.Sobol(dimensions, rng=default_rng(seed))
-    return sequence.random_base2(max(0, math.ceil(math.log2(number))))[:number]
+    points: FloatArray = sequence.random_base2(max(0, math.ceil(math.log2(number))))
+    return points[:number]
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:

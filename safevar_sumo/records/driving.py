@@ -212,7 +212,7 @@ class Trace:
     @property
     def last_active(self) -> IntArray:
         """The last active sample of each of N vehicles, shape (N,)."""
-        return len(self.time) - 1 - np.argmax(self.active[::-1], axis=0)
+        return np.asarray(len(self.time) - 1 - np.argmax(self.active[::-1], axis=0))
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
@@ -282,7 +282,7 @@ class SimulationRuns:
         trace = self.trace
         has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
         has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
-        return trace.active & self.encounter.in_conflict & ~has_stopped
+        return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
 
     @cached_property
     def time_to_collision(self) -> FloatArray:
@@ -385,4 +385,6 @@ class SimulationRuns:
 
         # Otherwise the speed at the end of the step.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
-        return np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
+        return np.asarray(
+            np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
+        )

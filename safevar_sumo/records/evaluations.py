@@ -92,29 +92,31 @@ class Evaluations:
         NaN everywhere.
         """
         if name in ("f_safe", "f_diff", "f_num_diff"):
-            return getattr(self, name)
+            return np.asarray(getattr(self, name))
         return self.metrics.get(name, np.full(len(self), np.nan))
 
     @property
     def collided(self) -> BoolArray:
-        return self.outcome == Outcome.COLLISION.value
+        return np.asarray(self.outcome == Outcome.COLLISION.value)
 
     @property
     def valid(self) -> BoolArray:
         """Where the setting can be scored: it is feasible, the test was valid, and the simulator
         reported no error.
         """
-        return ~self.failed & (self.outcome != Outcome.INVALID_TEST.value) & ~self.infeasible
+        return np.asarray(
+            ~self.failed & (self.outcome != Outcome.INVALID_TEST.value) & ~self.infeasible
+        )
 
     @property
     def infeasible(self) -> BoolArray:
         """Where a constraint of the study is violated, so that nothing was simulated."""
-        return self.outcome == Outcome.INFEASIBLE.value
+        return np.asarray(self.outcome == Outcome.INFEASIBLE.value)
 
     @property
     def failed(self) -> BoolArray:
         """Where the simulation failed."""
-        return self.outcome == Outcome.SIMULATOR_ERROR.value
+        return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR.value)
 
     def reason(self, row: int) -> str:
         """Why a setting that is not valid could not be scored."""

@@ -192,8 +192,9 @@ def show_simulation(
     system = assemble(target.study)
     changes = set
     with about("set"):
-        names = [change.partition("=")[0].strip() for change in changes]
-        study, system = with_encounters(target.study, system, names)
+        texts = [change.partition("=") for change in changes]
+        places = {name.strip(): text for name, _, text in texts}
+        study, system = with_encounters(target.study, system, places)
         target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:

@@ -257,7 +257,7 @@ class Scenario:
         create: Any = (
             msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
         )
-        return create(self, **values)
+        return create(self, **values)  # type: ignore[no-any-return]
 
     def lanes(self, roads: Roads) -> XmlChanges:
         """Changes to the lanes of the built network."""

@@ -124,7 +124,7 @@ class Ranges:
             setting = self._draw_setting(rng)
             if self._problem.feasible(setting[np.newaxis])[0]:
                 return setting
-        return self._problem.repaired(setting[np.newaxis])[0]
+        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
 
     def _draw_setting(self, rng: Generator) -> FloatArray:
         setting = self._characteristics.original.copy()

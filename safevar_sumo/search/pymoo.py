@@ -277,7 +277,7 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
     algorithm: Any = msgspec.defstruct(
         label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace
     )
-    return algorithm
+    return algorithm  # type: ignore[no-any-return]
 
 
 def _class_of(name: str) -> Any:

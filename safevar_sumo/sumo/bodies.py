@@ -67,7 +67,7 @@ class Body(NamedTuple):
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
         left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-        return (
+        return np.asarray(
             self.along * self.speed[:, np.newaxis] + left * np.asarray(self.drift)[..., np.newaxis]
         )
 
@@ -355,7 +355,7 @@ def _overlaps_along(own: Body, other: Body) -> FloatArray:
     """The overlaps in that direction of the own bodies in which they are less deep [m]."""
     axes = _axes_of(own)
     distance = _dot(other.middle - own.middle, axes)
-    return np.minimum(*(_joint_extent(own, other, axes) - np.abs(distance)))
+    return np.asarray(np.minimum(*(_joint_extent(own, other, axes) - np.abs(distance))))
 
 
 def _axes_of(body: Body) -> FloatArray:

@@ -396,4 +396,4 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
 
     # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf
-    return order[np.argmin(values, axis=0)]
+    return np.asarray(order[np.argmin(values, axis=0)])

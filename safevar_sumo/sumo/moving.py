@@ -144,7 +144,7 @@ class Moving(NamedTuple):
 
 
 def _rotated(track: Track) -> BoolArray:
-    return np.minimum(np.abs(track.along), np.abs(track.left)) > LEAST_SINE
+    return np.asarray(np.minimum(np.abs(track.along), np.abs(track.left)) > LEAST_SINE)
 
 
 def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:

@@ -217,7 +217,9 @@ class RecordedWorld:
         along = np.abs(dx * east + dy * north)
         across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
-        return (across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis])
+        return np.asarray(
+            (across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis])
+        )
 
     def _overlaps(
         self, moment: _Moment, vehicles: IntArray, actors: IntArray, is_checked: BoolArray

@@ -114,8 +114,12 @@ class _Kept:
         is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
         simulator = copy(scenario)
-        names = getattr(scenario, "__struct_fields__", None) or [*vars(scenario)]
-        for field, value in ((field, getattr(scenario, field)) for field in names):
+        fields = (
+            msgspec.structs.asdict(scenario)
+            if isinstance(scenario, msgspec.Struct)
+            else _attributes(scenario)
+        )
+        for field, value in fields.items():
             if has_worker or is_struct or isinstance(value, PLAIN):
                 set_field(simulator, field, _deep_copy(value))
         if has_worker:
@@ -124,7 +128,7 @@ class _Kept:
             except AttributeError:  # a Struct has its fields alone
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
-            for field, value in vars(self._last.get(name, simulator)).items():
+            for field, value in _attributes(self._last.get(name, simulator)).items():
                 if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
                     set_field(simulator, field, value)
         self._last[name] = simulator
@@ -141,6 +145,11 @@ class _Kept:
         if last is not None:
             last.close()
         kind.close_worker(handle)
+
+
+def _attributes(simulator: Simulator) -> dict[str, Any]:
+    """The attributes of a simulator; none where its class has slots."""
+    return dict(getattr(simulator, "__dict__", {}))
 
 
 def _deep_copy(value: Any) -> Any:

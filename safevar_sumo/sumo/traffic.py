@@ -202,7 +202,7 @@ class Traffic:
             second = (half - position) / change
             enter = np.maximum(enter, np.minimum(first, second))
             leave = np.minimum(leave, np.maximum(first, second))
-        return (enter < leave) & (leave > 0) & (enter < 1)
+        return np.asarray((enter < leave) & (leave > 0) & (enter < 1))
 
     def _scene_of(self, seen: _Seen, over: BoolArray) -> Scene:
         body = self._bodies[seen.body]

@@ -299,7 +299,7 @@ class CharacteristicSet:
 
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
-        return filtered != self.original
+        return np.asarray(filtered != self.original)
 
     def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
         """The objectives `f_diff` and `f_num_diff` of settings, after the filter."""
@@ -318,7 +318,8 @@ class CharacteristicSet:
         scale = np.where(
             vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
         )
-        return np.max(np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale, axis=1)
+        changes = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
+        return np.asarray(np.max(changes, axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
         """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method

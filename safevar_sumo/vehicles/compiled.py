@@ -31,7 +31,7 @@ class _Refuser(event.Listener):
 def equation(function: Function) -> Function:
     """Make a function a part of the compiled functions that call it."""
     part: Any = numba.njit(error_model="numpy", inline="always")(function)
-    return part
+    return part  # type: ignore[no-any-return]
 
 
 def compiled(function: Function) -> Function:
@@ -42,7 +42,7 @@ def compiled(function: Function) -> Function:
         made: Any = numba.njit(error_model="numpy", cache=True)(function)
     except RuntimeError:  # no folder for a cache can be written
         made = numba.njit(error_model="numpy")(function)
-    return made
+    return made  # type: ignore[no-any-return]
 
 
 def is_compiled(call: Callable[[], object]) -> bool:

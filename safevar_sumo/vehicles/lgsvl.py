@@ -341,7 +341,9 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     """The gear ratio in use."""
-    return s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
+    return np.asarray(
+        s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
+    )
 
 
 def _roll(
@@ -423,7 +425,9 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     )  # grip_share = x (2 - x), x = slip / PEAK_SLIP
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
-    return np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim)
+    return np.asarray(
+        np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim)
+    )
 
 
 def _tyre_stiffness(
@@ -441,4 +445,4 @@ def _tyre_stiffness(
         sliding = (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP)
         friction_by_slip = np.where(is_sliding, sliding, friction_by_slip)
     load = p.weight + DOWNFORCE * speed * speed
-    return p.friction * load * friction_by_slip / denominator
+    return np.asarray(p.friction * load * friction_by_slip / denominator)

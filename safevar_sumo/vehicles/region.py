@@ -108,7 +108,7 @@ class FeasibleRegion:
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings satisfy all constraints; shape (N,)."""
-        return self.violation(settings) == 0
+        return np.asarray(self.violation(settings) == 0)
 
     def check(self, settings: FloatArray, *, otherwise: str = "") -> None:
         """Refuse settings, shape (N, n), that are not feasible.

@@ -129,4 +129,10 @@ def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
     both = json_of("simulate", "wear", "--set", "speed=33", "--set", "impact_location=40")
     assert [row["point"] for row in both["tables"]["points"]["rows"]] == ["CPNA, wet"]
     refused("simulate", "wear", "--set", "speed=70", message=("speed = 70.0", "[10, 60] km/h"))
+    within = json_of("simulate", "fmvss127", "--set", "speed=65")["tables"]["points"]["rows"]
+    tests = {row["point"].partition(",")[0] for row in within}
+    assert {"stopped lead vehicle", "slower lead vehicle"} < tests
+    assert "adult crosses from the right" not in tests, "its range ends at 60 km/h"
+    both = ("--set", "speed=50", "--set", "headway=1")
+    refused("simulate", "fmvss127", *both, message=("no test has headway and speed together",))
     refused("simulate", "wear", "--fit", "12", message=("--fit: 12", "a number up to 11"))

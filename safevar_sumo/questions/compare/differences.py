@@ -322,4 +322,4 @@ def _onset_places(evaluator: Evaluator) -> FloatArray:
     not [m].
     """
     onsets, _ = drive_new_cars(evaluator.system, evaluator.characteristics.original[np.newaxis])
-    return onsets[0]
+    return np.asarray(onsets[0])

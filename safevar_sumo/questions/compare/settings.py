@@ -160,7 +160,7 @@ class CommonDomain(NamedTuple):
     def holds(self, settings: Sequence[FloatArray]) -> BoolArray:
         """Which settings are in both domains, shape (M,)."""
         values = np.stack(settings, axis=1)  # shape (M, 2, n)
-        return np.all((values >= self.lower) & (values <= self.upper), axis=(1, 2))
+        return np.asarray(((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2)))
 
     def in_both(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A's settings, and the same in B; what rounding moves out of B's domain is put onto its

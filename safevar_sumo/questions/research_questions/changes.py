@@ -60,7 +60,9 @@ def change_numbers(case: Case) -> list[str]:
 
 def count_changes(case: Case) -> TextArray:
     """The number j of changed characteristics of each critical solution, "1".."n"."""
-    return np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+    return np.asarray(
+        np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
+    )
 
 
 def _means_by_change_count(

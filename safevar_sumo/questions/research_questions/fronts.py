@@ -27,7 +27,7 @@ CURVE_POINTS = 50
 
 def nondominated_points(points: FloatArray) -> FloatArray:
     """The distinct non-dominated points for minimisation, with shape (points, objectives)."""
-    return moocore.filter_dominated(points)
+    return np.asarray(moocore.filter_dominated(points))
 
 
 def hypervolume(front: FloatArray, coordinate: float) -> float:
@@ -43,7 +43,7 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
     """
     ideal = reference.min(axis=0)
     nadir = reference.max(axis=0)
-    return (points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0)
+    return np.asarray((points - ideal) / np.where(nadir > ideal, nadir - ideal, 1.0))
 
 
 def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:

@@ -238,7 +238,7 @@ def _alone_in(ends: _Ends, failures: FloatArray, model: Model) -> FloatArray:
     inside = failures[
         (values != ends.item.original) & (values >= ends.ends[0]) & (values <= ends.ends[1])
     ]
-    return inside[model.are_unsafe(inside, ALONE_STAGE)] if len(inside) else inside
+    return np.asarray(inside[model.are_unsafe(inside, ALONE_STAGE)] if len(inside) else inside)
 
 
 def _move(ends: Sequence[_Ends], model: Model, failures: Sequence[FloatArray]) -> bool:

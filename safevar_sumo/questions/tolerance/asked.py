@@ -82,7 +82,7 @@ class Asked(NamedTuple):
         # They are unsafe in the whole study; those in encounters above the value do not count.
         settings = settings[((settings >= members.lower) & (settings <= members.upper)).all(axis=1)]
         evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
-        return settings[evaluations.valid & self.unsafe.of(evaluations)]
+        return np.asarray(settings[evaluations.valid & self.unsafe.of(evaluations)])
 
 
 def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:

@@ -34,7 +34,7 @@ BATCH = 8
 """Number of vehicles that are tried at once in search of a counterexample."""
 KEPT = 1 / 3
 """Share of the settings that has to be tried in the final box."""
-FIRST_GAP, WIDENING = 1 / 50, 1.2
+FIRST_GAP, WIDENING = 1 / 50, 1.25
 """How far limits keep off failures first, as a share of the domain, and the factor by which each
 further failure makes this larger.
 """
@@ -50,6 +50,9 @@ class _Search:
     ----------
     low, high
         The ends of its sides, shape (n,).
+    tried
+        Number of random vehicles that were safe in the box since it was cut last. Those before do
+        not count: the box was chosen by what they did.
     broken
         A vehicle within the specified limits that is unsafe by what they allow alone, shape (n,);
         None as long as none is known.
@@ -60,6 +63,7 @@ class _Search:
     limits: Mapping[str, Limit]
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
+    tried: int = 0
     broken: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -75,7 +79,6 @@ class _Search:
         self._outer = self.low, self.high
         self._gap = FIRST_GAP
         self._failures = np.empty((0, len(members)))
-        self._safe = np.empty((0, len(members)))
         self._budget = self.left
 
     def interval(self, item: Characteristic) -> tuple[float, float]:
@@ -92,11 +95,6 @@ class _Search:
     def left(self) -> int:
         """Settings that may still be simulated, none once a specified limit is broken."""
         return 0 if self.broken is not None else self.model.evaluator.left or 0
-
-    @property
-    def tried(self) -> int:
-        """Number of random vehicles that were safe in the box as it is now."""
-        return int(self.box.holds(self._safe).sum())
 
     @property
     def at_most(self) -> float:
@@ -132,13 +130,14 @@ class _Search:
 
     def find(self, rng: Generator) -> bool:
         """Cut the box until a third of all settings was tried in it; whether this was reached."""
-        while self.left >= BATCH + len(self.columns):
-            settings = self.box.with_ends(BATCH, rng)
+        while self.left >= 2 * BATCH + len(self.columns):
+            vehicles = self.box.with_ends(BATCH, rng)
+            settings = vehicles if self.tried else np.concatenate([self._corners(), vehicles])
             is_unsafe = self.are_unsafe(settings)
             if is_unsafe.any():
                 self._cut(settings[is_unsafe][0])
             else:
-                self._safe = np.concatenate([self._safe, settings])
+                self.tried += len(vehicles)
         return self.tried >= KEPT * self._budget and self.at_most <= GREATEST_SHARE
 
     def _cut(self, failure: FloatArray) -> None:
@@ -151,9 +150,23 @@ class _Search:
             return
         self._failures = np.vstack([self._failures, needed])
         self._gap *= WIDENING
+        self.tried = 0
+
+        # From the limits alone on, all that are known are cut off.
         self.low, self.high = (end.copy() for end in self._outer)
         while (inside := self._failures[self.box.holds(self._failures)]).size:
             self._cut_off(inside)
+
+    def _corners(self) -> FloatArray:
+        """The corners of the box towards the last failures that were cut off, in their encounters:
+        where a box that is still too large is unsafe most likely, shape (K, n).
+        """
+        members = self.model.characteristics
+        failures = self._failures[-BATCH:]
+        ends = np.where(failures > members.original, self.high, self.low)
+        is_moved = members.of_vehicle & (failures != members.original)
+        corners = np.where(is_moved, ends, failures)
+        return corners[self.box.region.feasible(corners)]
 
     def _needed(self, failure: FloatArray) -> FloatArray:
         """A failure, shape (n,), without the changes that it does not need, one after another."""
@@ -170,6 +183,7 @@ class _Search:
         """Move the side that loses the least share of its length by it, for that of K failures,
         shape (K, n), for which this loss is the greatest.
         """
+        # Where each side would end, and which share of its length would stay.
         members = self.model.characteristics
         gap = self._gap * (members.upper - members.lower)
         is_above = failures > members.original
@@ -181,6 +195,8 @@ class _Search:
         lengths = np.maximum(self.high - self.low, 1e-300)
         kept = np.where(is_above, ends - self.low, self.high - ends) / lengths
         kept = np.where(self._choices(failures), kept, -np.inf)
+
+        # The failure whose best cut costs most is cut off first.
         row = int(np.argmin(kept.max(axis=1)))
         column = int(np.argmax(kept[row]))
         self._move(column, ends[row, column], is_high=bool(is_above[row, column]))
@@ -188,7 +204,7 @@ class _Search:
     def _choices(self, failures: FloatArray) -> BoolArray:
         """Where a side can cut failures off, shape (..., n)."""
         members = self.model.characteristics
-        return (failures != members.original) & members.of_vehicle & ~self.is_fixed
+        return np.asarray((failures != members.original) & members.of_vehicle & ~self.is_fixed)
 
     def _move(self, column: int, end: float, *, is_high: bool) -> None:
         """Move a side to an end, rounded towards the original."""

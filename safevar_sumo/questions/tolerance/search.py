@@ -139,7 +139,7 @@ class BoxGeometry:
         needs none.
         """
         change = settings - self.original
-        return np.stack([-change, change], axis=1) - ROUNDING * self.width
+        return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
 
     def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
         """A box with some sides moved outwards by a share of the domain, up to their longest."""
@@ -155,7 +155,9 @@ class BoxGeometry:
         shares = np.divide(
             boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0
         )
-        return np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)  # finite for a width of 0, too
+        return np.asarray(
+            np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)
+        )  # finite for a width of 0, too
 
 
 class BoxSearch(BoxGeometry):
@@ -221,7 +223,7 @@ class BoxSearch(BoxGeometry):
         (K, n).
         """
         is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
-        return self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1]
+        return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
 
     def needs(self, settings: FloatArray) -> FloatArray:
         """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2,
@@ -235,7 +237,7 @@ class BoxSearch(BoxGeometry):
         not.
         """
         needs = self.extents(self.unsafe_settings) if needs is None else needs
-        return self.unsafe_settings[(needs <= sides).all(axis=(1, 2))]
+        return np.asarray(self.unsafe_settings[(needs <= sides).all(axis=(1, 2))])
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one
@@ -381,7 +383,7 @@ class BoxSearch(BoxGeometry):
         boxes = rows.reshape(-1, *self.domain.shape)
         needs = self.needs(self.unsafe_settings)
         holds_failure = [(needs <= box).all(axis=(1, 2)).any() for box in boxes]
-        return ~self.are_safe(boxes) | holds_failure
+        return np.asarray(~self.are_safe(boxes) | holds_failure)
 
     def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
         """A box within `start` that is safe at the known corners, and keeps off known unsafe
@@ -414,7 +416,7 @@ class BoxSearch(BoxGeometry):
         is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
         steps = rng.normal(0.0, deviation, shape) * is_moved
         boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
-        return boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN]
+        return np.asarray(boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN])
 
     def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
         """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
