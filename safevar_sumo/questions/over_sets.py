@@ -11,16 +11,25 @@ import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.words import percentage
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.study import Study
 
 STAGE = "other parameter sets"
 """Phase of progress."""
 PART = 10
 """In each other set one of so many vehicles of a sample is simulated."""
+
+
+def planned_over_sets(study: Study, stage: str, settings: int) -> NamedValues:
+    """The phases of progress of a sample, each with its number of settings: `stage`, in which all
+    are simulated with the study's own set, and that of a tenth of them with each other set.
+    """
+    sets = len(studies_of_sets(study)) if study.spread else 1
+    return {stage: settings, STAGE: (sets - 1) * (settings // PART)}
 
 
 class SharesOverSets(NamedTuple):

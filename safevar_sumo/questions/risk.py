@@ -36,7 +36,7 @@ from safevar_sumo.questions.answer import (
 from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.over_sets import SharesOverSets
+from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -129,9 +129,9 @@ def risk(
     study = evaluator.study
     model = VariationModel(study)
     has_design = not (model.is_correlated or model.region or study.scenario.search)
-    block = len(evaluator.characteristics) + 2  # settings of Saltelli's design for a base point
-    of_design = has_design * BASE_POINTS * block
-    evaluator.begin({SAMPLING: samples, SENSITIVITY: of_design}, least=LEAST_SETTINGS)
+    of_design = has_design * BASE_POINTS * (len(evaluator.characteristics) + 2)
+    phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
+    evaluator.begin(phases, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)

@@ -21,7 +21,7 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tab
 from safevar_sumo.questions.ask import Count, Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.over_sets import SharesOverSets
+from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -92,7 +92,8 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.begin({SAMPLED_STAGE: samples}, least=LEAST_SETTINGS)
+    # In each other set a tenth of those that test rules is simulated, and as many within the rules.
+    evaluator.begin(planned_over_sets(study, SAMPLED_STAGE, samples), least=LEAST_SETTINGS)
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)

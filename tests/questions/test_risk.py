@@ -19,7 +19,9 @@ from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.over_sets import STAGE
 from safevar_sumo.questions.risk import OUTPUTS, deciding_in_words
+from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray
@@ -291,3 +293,17 @@ def test_shares_have_a_range_over_the_parameter_sets() -> None:
     assert (table["density_greatest"] >= table["density"]).all()
     few = risk(study, simulations=400, unsafe="collision", pool=InlinePool())
     assert "the study's own parameter set of the vehicle model alone" in few.verdict
+
+
+def test_the_other_parameter_sets_are_planned() -> None:
+    """Progress counts them from the beginning. A number of simulations that suffices for all but
+    these is a bound, within which the own set answers alone.
+    """
+    shown = list[tuple[str, int, int]]()
+    rules("wear", samples=400, unsafe="collision", jobs=1, progress=lambda *one: shown.append(one))
+    expected = 26 * (400 + 11 * 40)  # at 26 points
+    assert {total for phase, _, total in shown if phase == SAMPLED_STAGE} == {expected}
+    assert shown[-1][0] == STAGE
+    assert shown[-1][1] <= expected
+    bounded = risk("wear", samples=400, simulations=135_000, pool=InlinePool())
+    assert "own parameter set of the vehicle model alone" in bounded.verdict
