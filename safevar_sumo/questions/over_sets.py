@@ -24,12 +24,15 @@ PART = 10
 """In each other set one of so many vehicles of a sample is simulated."""
 
 
-def planned_over_sets(study: Study, stage: str, settings: int) -> NamedValues:
+def planned_over_sets(
+    study: Study, stage: str, settings: int, fits: int | None = None
+) -> NamedValues:
     """The phases of progress of a sample, each with its number of settings: `stage`, in which all
-    are simulated with the study's own set, and that of a tenth of them with each other set.
+    are simulated with the study's own set, and that of a tenth of them with each other one of the
+    first `fits` sets, by default of all.
     """
-    sets = len(studies_of_sets(study)) if study.spread else 1
-    return {stage: settings, STAGE: (sets - 1) * (settings // PART)}
+    others = studies_of_sets(study)[1:fits] if study.spread else []
+    return {stage: settings, STAGE: len(others) * (settings // PART)}
 
 
 class SharesOverSets(NamedTuple):
@@ -55,9 +58,11 @@ class SharesOverSets(NamedTuple):
         unsafe: Unsafe,
         settings: FloatArray,
         groups: Sequence[BoolArray] = (),
+        fits: int | None = None,
     ) -> Self:
         """Simulate a tenth of M settings, shape (M, n), which are the first group, and for further
-        groups, shape (M,) each, as many of their settings.
+        groups, shape (M,) each, as many of their settings, with the first `fits` sets, by default
+        with all.
         """
         number = len(settings) // PART
         is_first = np.arange(len(settings)) < number
@@ -67,7 +72,7 @@ class SharesOverSets(NamedTuple):
         members = np.array([is_first, *groups])[:, is_chosen]
         others = list[FloatArray]()
         if evaluator.left is None and number:
-            for model in models_of(evaluator, unsafe, None, with_unsafe_originals=True).members[1:]:
+            for model in models_of(evaluator, unsafe, fits, with_unsafe_originals=True).members[1:]:
                 runs = model.evaluator.evaluate(part, STAGE)
                 counted = members & runs.valid
                 totals = counted.sum(axis=1)
@@ -98,7 +103,7 @@ class SharesOverSets(NamedTuple):
             for number in (int(np.nanargmin(shares)), int(np.nanargmax(shares)))
         ]
         return (
-            f" Over {len(shares)} parameter sets of the vehicle model the share is"
-            f" {' to '.join(ends)}, with {self.vehicles:,} vehicles in each set but the study's"
+            f" Over {len(shares)} parameter sets of the vehicle model the share of unsafe vehicles"
+            f" is {' to '.join(ends)}, with {self.vehicles:,} vehicles in each set but the study's"
             " own."
         )

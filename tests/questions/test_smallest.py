@@ -13,10 +13,13 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
+from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
 from tests.questions.conftest import ORIGINAL, made_up_evaluator, nowhere
 
@@ -106,6 +109,16 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     assert "All causes" not in answer["verdict"]
     first, *_, last = answer["tables"]["staircase"]["rows"]
     assert (first["share"], first["fewest"], last["fewest"]) == (1.0, 2, None)
+
+    # A tenth of the sampled vehicles with the other parameter set.
+    study = load_study("rain")
+    with open_evaluator(study, InlinePool()) as evaluator:
+        drawn = evaluator.feasible_settings(4096, study.search.seed, feasible_after_filter=True)
+        tenth = evaluator.characteristics.filter(drawn)[:409]
+    other = drive_and_score(assemble(studies_of_sets(study)[1]), tenth).collided.mean()
+    own = numbers["failures"] / numbers["settings"]
+    assert numbers["by_set"] == [own, other]
+    assert "Over 2 parameter sets of the vehicle model the share of unsafe" in answer["verdict"]
 
 
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:

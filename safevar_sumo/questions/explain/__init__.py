@@ -46,12 +46,8 @@ from safevar_sumo.questions.explain.tables import (
     failures_frame,
     statistics_tables,
 )
-from safevar_sumo.questions.explain.words import (
-    DRAWN,
-    SOLUTIONS,
-    others_in_words,
-    verdict_on_failures,
-)
+from safevar_sumo.questions.explain.words import others_in_words, verdict_on_failures
+from safevar_sumo.questions.over_sets import planned_over_sets
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -91,6 +87,7 @@ LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
         "failures",
         "other_outcomes",
         "left_out",
+        "by_set",
         "original_outcome",
         "original_degree",
     ),
@@ -137,14 +134,14 @@ def explain(
         few failures.
     """
     of_study, study = isinstance(subject, Study), evaluator.study
-    limit = _plan(subject, evaluator, quick)
+    limit = _plan(subject, evaluator, quick, 0 if quick else fits)
     if quick or evaluator.left is not None:
         fits = 0
 
     # The failures.
     if evaluator.left is not None:
         top = max(1, min(top, evaluator.left // FOR_ONE))
-    population = gather_failures(subject, evaluator, solution, unsafe)
+    population = gather_failures(subject, evaluator, solution, unsafe, fits)
     runs = population.evaluations
     # Of an unsafe original no change is a cause, but in another encounter it may be safe.
     is_caused = bool(study.scenario.search or not population.unsafe.of(population.original)[0])
@@ -186,8 +183,7 @@ def explain(
     verdict = verdict_on_failures(evaluator, population, tables["causes"])
     if smallest is not None:
         verdict = smallest.sentences(evaluator, population.unsafe)
-    kind = DRAWN if of_study else SOLUTIONS
-    sentences = [*verdict, *others_in_words(study, population, complete, verdicts, kind)]
+    sentences = [*verdict, *others_in_words(study, population, complete, verdicts)]
     return Answer(
         question="explain",
         study=study,
@@ -198,26 +194,28 @@ def explain(
     )
 
 
-def _plan(subject: Subject, evaluator: Evaluator, quick: bool) -> int:
+def _plan(subject: Subject, evaluator: Evaluator, quick: bool, fits: int) -> int:
     """Plan the phases; returns the number of simulations for minimal causes of failures."""
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
         limit = max(QUICK_LIMIT if quick else STUDY_LIMIT, OF_SAMPLE * points)
-        planned = {TO_EXPLAIN: SAMPLED_SETTINGS, COMBINATIONS: MAX_SETTINGS}
+        planned = planned_over_sets(subject, TO_EXPLAIN, SAMPLED_SETTINGS, fits)
+        planned[COMBINATIONS] = MAX_SETTINGS
     else:
         limit = QUICK_LIMIT if quick else LIMIT
-        planned = {TO_EXPLAIN: len(subject.solutions)}
+        planned = {TO_EXPLAIN: float(len(subject.solutions))}
     evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit
 
 
 def _counts(population: Population, subject: Subject, analysed: int, explained: int) -> JsonObject:
-    """The numbers of settings, and of failures that were analysed and are explained; how the
-    original vehicle ends, and the number of collisions that the search simulated but its objectives
-    leave out of the solutions.
+    """The numbers of settings, and of failures that were analysed and are explained; the unsafe
+    share of drawn settings with each parameter set; how the original vehicle ends, and the number
+    of collisions that the search simulated but its objectives leave out of the solutions.
     """
     runs = population.evaluations
     original = population.original
+    over_sets = population.over_sets
     left_out = 0
     if isinstance(subject, Case) and not subject.study.origin.point and not runs.collided.any():
         left_out = int(are_collisions(subject.evaluations).sum())
@@ -227,6 +225,7 @@ def _counts(population: Population, subject: Subject, analysed: int, explained: 
         "failures": population.unsafe.number(runs),
         "other_outcomes": population.otherwise,
         "left_out": left_out,
+        "by_set": None if over_sets is None else over_sets.of_all(population.share),
         "original_outcome": str(original.outcome[0]),
         "original_degree": float(original.f_safe[0]),
         "analysed": analysed,

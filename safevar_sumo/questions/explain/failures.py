@@ -22,6 +22,7 @@ from safevar_sumo.questions.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.over_sets import SharesOverSets
 from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray, TextArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
@@ -69,6 +70,8 @@ class Population(NamedTuple):
     left_out
         Number of drawn settings in whose encounter the original vehicle does not keep its margin,
         which are no rows.
+    over_sets
+        The unsafe shares of drawn settings over the parameter sets; None for solutions.
     """
 
     original: Evaluations
@@ -79,12 +82,23 @@ class Population(NamedTuple):
     is_named: bool
     otherwise: int
     left_out: int
+    over_sets: SharesOverSets | None
+
+    @property
+    def share(self) -> float:
+        """The share of the rows that is unsafe."""
+        return self.unsafe.number(self.evaluations) / max(len(self.evaluations), 1)
 
 
 def gather_failures(
-    subject: Subject, evaluator: Evaluator, solutions: Sequence[str], criterion: Unsafe | str | None
+    subject: Subject,
+    evaluator: Evaluator,
+    solutions: Sequence[str],
+    criterion: Unsafe | str | None,
+    fits: int,
 ) -> Population:
-    """Evaluate all solutions of results, or settings drawn from a study's whole domain.
+    """Evaluate all solutions of results, or settings drawn from a study's whole domain, a tenth of
+    these with each other one of the first `fits` parameter sets.
 
     Raises
     ------
@@ -113,11 +127,13 @@ def gather_failures(
 
     # Settings without a valid encounter do not count.
     left_out = otherwise = 0
+    over_sets = None
     if isinstance(subject, Study):
         left_out = int(evaluations.infeasible.sum())
         counts = np.flatnonzero(~evaluations.infeasible)
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
+        over_sets = SharesOverSets.of(evaluator, unsafe, evaluations.settings, fits=fits)
     else:
         recorded = candidates.recorded
         otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
@@ -126,7 +142,8 @@ def gather_failures(
     rows = (
         list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     )
-    return Population(original, evaluations, names, unsafe, rows, bool(named), otherwise, left_out)
+    counted = bool(named), otherwise, left_out, over_sets
+    return Population(original, evaluations, names, unsafe, rows, *counted)
 
 
 class _Candidates(NamedTuple):

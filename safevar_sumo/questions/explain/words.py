@@ -104,14 +104,16 @@ def _beyond_in_words(
 
 
 def others_in_words(
-    study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame, kind: str
+    study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame
 ) -> Iterator[str]:
     """Up to which size causes are complete, who avoids the failures, and which settings count."""
     if complete:
         yield f"All minimal causes of up to {number_of(complete, 'change')} are found."
     yield avoided_in_words(verdicts)
-    yield _number_in_words(population, kind)
-    if kind == DRAWN:
+    over_sets = population.over_sets
+    yield _number_in_words(population, DRAWN if over_sets else SOLUTIONS)
+    if over_sets:
+        yield over_sets.in_words(population.share).strip()
         yield from counted_in_words(study, population.left_out)
     yield from constraints_in_words(study)
 
