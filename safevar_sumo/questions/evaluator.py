@@ -35,7 +35,12 @@ from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.price import MEASURED, Account, seconds_of_simulation
+from safevar_sumo.questions.price import (
+    MEASURED,
+    Account,
+    print_price_of_list,
+    seconds_of_simulation,
+)
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
@@ -125,9 +130,10 @@ class Evaluator:
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def begin(self, settings: NamedValues, least: int = 1) -> None:
+    def begin(self, settings: NamedValues, least: int = 1, *, of_list: bool = False) -> None:
         """Begin a question of these phases, each with the number of settings that it is expected to
-        simulate; below the `least` number there is no answer.
+        simulate; below the `least` number there is no answer. One about a list of vehicles says how
+        long it takes where a simulation is short, too.
         """
         expected = sum(settings.values())
         if self.account.is_question:
@@ -142,6 +148,9 @@ class Evaluator:
             self.account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:
                 self.account.spend(MEASURED * self._each)
+            elif of_list and self.left is None:
+                simulations = expected * len(self.system.points)
+                print_price_of_list(self.study, self.system, self._pool, simulations)
         share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
         self.phases.plan(planned, len(self.system.points))

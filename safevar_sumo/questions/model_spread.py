@@ -158,6 +158,11 @@ def studies_of_sets(study: Study) -> list[Study]:
     ]
 
 
+def other_sets(study: Study, fits: int | None = None) -> list[Study]:
+    """The study with each of its first `fits` parameter sets but its own, by default with all."""
+    return studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
+
+
 def parameters_outside_sets(study: Study) -> list[str]:
     """The parameters under [spread] whose value in `study` is not that of the first set.
 

@@ -18,7 +18,7 @@ from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
-from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
@@ -203,12 +203,10 @@ def models_of(
     study's own, and a distance to keep there alone. No other set may collide. Those with an unsafe
     original are left out unless they are wanted.
     """
-    study = evaluator.study
-    studies = studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
     in_fits = replace(unsafe, keep=0.0)
     members = [Model(0, evaluator, unsafe)]
     left_out = list[Model]()
-    for number, fitted in enumerate(studies, 1):
+    for number, fitted in enumerate(other_sets(evaluator.study, fits), 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         if with_unsafe_originals:
             members.append(model)

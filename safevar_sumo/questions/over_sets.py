@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.words import percentage
@@ -31,8 +31,7 @@ def planned_over_sets(
     are simulated with the study's own set, and that of a tenth of them with each other one of the
     first `fits` sets, by default of all.
     """
-    others = studies_of_sets(study)[1:fits] if study.spread else []
-    return {stage: settings, STAGE: len(others) * (settings // PART)}
+    return {stage: settings, STAGE: len(other_sets(study, fits)) * (settings // PART)}
 
 
 class SharesOverSets(NamedTuple):

@@ -8,13 +8,15 @@ import sys
 import time
 from dataclasses import dataclass
 
+import numpy as np
 from rich.console import Console
 
 from safevar_sumo.campaign.batches import forget_other, spare
-from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings
+from safevar_sumo.campaign.evaluation import Selection, Task, carry_out, evaluate_settings
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.progress import Phases
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
@@ -25,6 +27,8 @@ LONGEST = 900.0
 """Time up to which a question does by default all that it is made for [s]."""
 MEASURED = 2
 """Settings that are simulated to know how long one takes."""
+BATCH = 512
+"""Vehicles that are simulated side by side to know how long one of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples answers."""
 DIGITS = 2
@@ -120,7 +124,7 @@ class Account:
         if self.most is not None:
             self.spent += parts
         number = min(expected, float("inf") if self.most is None else self.most)
-        words = f"about {number:,.0f} simulations, about {_duration(number * seconds)}"
+        words = _price(number, seconds)
         if self.most is not None:
             words = f"at most {words.removeprefix('about ')}, of about {expected:,.0f} in full"
         how = "with" if self.asked is not None else "besides"
@@ -144,14 +148,36 @@ def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | N
     """
     if not system.has_simulator:
         return None
-    jobs = [(Task(study=study), CharacteristicSet.of(study).original_settings)]
-    carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
-    start = time.perf_counter()
-    (original,) = carry_out(evaluate_settings, jobs, pool)
-    seconds = time.perf_counter() - start
+    settings = CharacteristicSet.of(study).original_settings
+    original, seconds = _timed(Task(study=study), settings, pool)
     if system.repeats == 1 and not original.failed[0]:
         forget_other(study, pool, original)
     return seconds / (pool.workers * simulations_of_setting(system))
+
+
+def print_price_of_list(study: Study, system: System, pool: Pool, simulations: float) -> None:
+    """Print how long a list of vehicles takes, which share batches: by the time of one at a point.
+    This number bounds nothing, and what is timed does not count.
+    """
+    task = Task(study=study, selection=Selection(points=(len(system.points) // 2,)))
+    batch = np.repeat(system.characteristics.original_settings, BATCH, axis=0)
+    _, seconds = _timed(task, batch, pool)
+    price = _price(simulations, seconds / (BATCH * pool.workers))
+    print_text(Console(file=sys.stderr), f"at most {price}; cars that fail early take fewer")
+
+
+def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:
+    """What settings do, and how long a worker takes for them [s]."""
+    jobs = [(task, settings)]
+    carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
+    start = time.perf_counter()
+    (evaluations,) = carry_out(evaluate_settings, jobs, pool)
+    return evaluations, time.perf_counter() - start
+
+
+def _price(simulations: float, seconds: float) -> str:
+    """A number of simulations, and how long they take if one takes so many seconds."""
+    return f"about {simulations:,.0f} simulations, about {_duration(simulations * seconds)}"
 
 
 def _duration(seconds: float) -> str:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.questions import model_spread
 from safevar_sumo.questions.ask import quick_questions
 from safevar_sumo.report.page import report
-from tests.in_process import run
+from tests.in_process import InlinePool, run
 
 
 @pytest.mark.slow
@@ -37,6 +41,32 @@ def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
     assert answer.verdict.startswith("Rough answer (--quick")
     assert answer.numbers["rough"]
     assert answer.tables["causes"]["fits"].isna().all()
+
+
+WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
+PROMISE = {"promise": ("brakeTorque >= 0.95",), "change": ("margin",)}
+
+
+def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """No study with another parameter set is even made."""
+    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
+    sv.permit("wear", cars=WORN, others="new", quick=True, pool=InlinePool())
+    price = r"at most about [\d,]+ simulations, about 0:\d\d:\d\d; cars that fail early take fewer"
+    assert re.fullmatch(price, capfd.readouterr().err.strip())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ask", "options"),
+    [(sv.explain, {}), (sv.tolerance, {"characteristics": ("brakeTorque",)}), (sv.repair, PROMISE)],
+)
+def test_rough_answers_simulate_the_own_parameter_set_alone(
+    ask: Callable[..., Any], options: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
+    ask("wear", quick=True, pool=InlinePool(), **options)
 
 
 @pytest.mark.slow

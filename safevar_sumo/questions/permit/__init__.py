@@ -178,7 +178,8 @@ def _drive(
     repairs = [REPAIR_STAGE] if not is_rough and len(asked[0].vehicles) == 1 else []
     # Tests are simulated alone, so that settings at all points of a matrix are fewer.
     each = search.usual_simulations(1 + len(asked)) / len(evaluator.system.points)
-    evaluator.begin({**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)})
+    phases = {**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)}
+    evaluator.begin(phases, of_list=len(asked) > 1)
     above = [-np.inf, *[None] * len(asked)]
     new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
     if new_car.up_to is None:

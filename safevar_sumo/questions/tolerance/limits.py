@@ -16,7 +16,7 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import Model, Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
 from safevar_sumo.questions.scope import scope_of
@@ -137,7 +137,7 @@ def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None)
     phases = {SCAN_STAGE: float(SCAN_VALUES * columns)}
     if is_rated(study):
         return phases
-    sets = len(studies_of_sets(study)[1:fits]) if study.spread and fits != 0 else 0
+    sets = len(other_sets(study, fits))
     own = USUAL_BOXES * budget / points
     of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
     phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
