@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 from hypothesis import given, settings, strategies as st
@@ -20,9 +21,10 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.tables import reader_columns, tabulate
 from safevar_sumo.questions.tolerance import search
 from safevar_sumo.questions.tolerance.alone import AloneLimit
-from safevar_sumo.questions.tolerance.rows import uncertainty_rows
+from safevar_sumo.questions.tolerance.rows import LIMITS, uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.words import one_set_in_words
 from safevar_sumo.questions.words import bound_in_words
@@ -30,6 +32,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 from tests.in_process import InlinePool, run
 from tests.made_up import case_of
+from tests.manual import ROOT
 from tests.questions.conftest import Plant, Region, made_up_study, nowhere, two_islands
 
 SLOW = pytest.mark.slow
@@ -355,3 +358,15 @@ def test_a_verdict_says_that_other_parameter_sets_of_a_study_were_not_tried(
     model: Any = SimpleNamespace(evaluator=SimpleNamespace(study=load_study(study)))
     assert [*one_set_in_words([model, model], left_out)] == []
     assert ("not tried" in " ".join(one_set_in_words([model], left_out))) is is_said
+
+
+def test_the_manual_names_the_columns_of_limits_that_text_may_leave_out() -> None:
+    """They are shown where they have a value, and no other column is ever left out."""
+    values = {name: "any" for name in LIMITS}
+    always = {name: values[name] for name in ("characteristic", "unit", "original")}
+    shown, fewest = (
+        {column.head for column in reader_columns(tabulate("", LIMITS, pd.DataFrame([row])))}
+        for row in (values, dict.fromkeys(LIMITS) | always)
+    )
+    table = (ROOT / "docs/tolerance.md").read_text().partition("empty in every row where")[2]
+    assert shown - fewest == {*re.findall("`([^`]+)`", table.partition("\n\n")[0])}
