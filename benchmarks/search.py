@@ -37,6 +37,8 @@ COUNTS = (100, 200, 500, 800, 1000)
 """Numbers of simulations."""
 EXAMINED = 20
 """Failures of a run whose minimal causes are counted."""
+ALL = 10**9
+"""Settings that their causes may take: all subsets of their changes."""
 
 
 class InThisProcess:
@@ -101,7 +103,7 @@ def causes_of(study: Study, found: Evaluations, evaluator: Any) -> list[int]:
 
         # Causes of those that are new.
         new = np.array([row for row in settings if row.tobytes() not in known])
-        found_causes = find_minimal_causes(evaluator, new, criterion) if len(new) else []
+        found_causes = find_minimal_causes(evaluator, new, criterion, ALL) if len(new) else []
         for row, causes in zip(new, found_causes, strict=True):
             kinds = {directions(evaluator.characteristics, cause.changes) for cause in causes}
             known[row.tobytes()] = kinds

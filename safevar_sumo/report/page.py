@@ -50,10 +50,9 @@ from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progre
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-USUAL_QUESTIONS = ("tolerance", "explain", "risk --samples 4000", "rules --samples 4000")
-"""Questions of a page, the one whose verdict decides first; with smaller samples than those of the
-commands.
-"""
+SMALLEST = "explain --of-study"
+USUAL_QUESTIONS = ("tolerance", SMALLEST, "explain", "risk --samples 4000", "rules --samples 4000")
+"""Questions of a page, whose first verdict decides; samples are smaller than those of commands."""
 LEAST_COST = 40_000
 USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
 PAGE_COSTS = 25_000, 5_000
@@ -261,7 +260,7 @@ def _later_changes(
 
 def usual_questions(case: Case, point: str | None = None) -> list[str]:
     """The questions of a page about results; that of a rated study is about its points, with the
-    variant that loses some by the fewest changes.
+    variant that loses some by the fewest changes. A simulator has no time for the smallest changes.
     """
     # A rating of the worst solution.
     if is_rated(case.study) and point is None:
@@ -270,7 +269,9 @@ def usual_questions(case: Case, point: str | None = None) -> list[str]:
         return [f"rating --solution {handle}" if handle else "rating"]
 
     can_repair = case.study.repair.promise or case.study.limits
-    return [*USUAL_QUESTIONS, *(["repair"] if can_repair else [])]
+    left_out = SMALLEST if assemble(case.study).has_simulator else ""
+    questions = [text for text in USUAL_QUESTIONS if text != left_out]
+    return [*questions, *(["repair"] if can_repair else [])]
 
 
 def answer_to(
@@ -362,7 +363,7 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
     """Answers for the template: the heading, the answer in HTML, and its figure if it has one."""
     for number, answer in enumerate(answers, 1):
-        name = answer.question
+        name = "smallest changes" if "staircase" in answer.tables else answer.question
         try:
             picture = _picture(answer.figure())
         except InputError:  # it has nothing to draw

@@ -5,6 +5,7 @@ what the verdict claims of them.
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,6 +120,12 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     own = numbers["failures"] / numbers["settings"]
     assert numbers["by_set"] == [own, other]
     assert "Over 2 parameter sets of the vehicle model the share of unsafe" in answer["verdict"]
+
+
+def test_the_study_of_results_is_explained_as_without_results(slippery: Path) -> None:
+    answer = sv.explain(slippery, of_study=True, simulations=600, jobs=1)
+    study = sv.load(slippery).study
+    assert answer.to_dict() == sv.explain(study, simulations=600, jobs=1).to_dict()
 
 
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:

@@ -193,6 +193,16 @@ def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     assert question.command_line([], None, values) == f"python -m safevar_sumo {text}"
 
 
+def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slippery: Path) -> None:
+    asked = "explain --of-study --simulations 600"
+    page = page_of(slippery, ask=("rules --samples 20", asked), jobs=1)
+    section = page.partition(">Smallest changes<")[2].partition("</section>")[0]
+    first = r'The fewest changes at a share[^\n]*\n[^\n]*>1\.0</td>[^\n]*class="label"[^>]*>(\w+)'
+    part = re.findall(first, section)[0]
+    picture = unquote(section.partition("data:image/svg+xml,")[2])
+    assert f">{part}</text>" in picture
+
+
 def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:
     arguments = "repair", [case], [slippery], None, 1, show_no_progress
     assert answer_or_reason(*arguments).verdict.startswith("No answer: ")
@@ -210,9 +220,9 @@ def test_the_sentence_about_a_model_is_whole() -> None:
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
-    assert [text.partition(" ")[0] for text in usual_questions(case)] == [
-        one.partition(" ")[0] for one in ASK
-    ]
+    usual = usual_questions(case)
+    assert usual.pop(1) == "explain --of-study"
+    assert [text.partition(" ")[0] for text in usual] == [one.partition(" ")[0] for one in ASK]
     limited = replace(case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}}))
     assert usual_questions(limited)[-1] == "repair"
     rated = replace(case, study=load_study("euro_ncap_rating"))

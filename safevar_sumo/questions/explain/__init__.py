@@ -107,6 +107,7 @@ def explain(
     *,
     solution: tuple[str, ...] = (),
     unsafe: Criterion = None,
+    of_study: bool = False,
     top: Annotated[int, Range(1, 1000)] = 8,
     fits: Annotated[int, Range(0, 1000)] = 20,
     quick: bool = False,
@@ -124,6 +125,9 @@ def explain(
         the fewest and the smallest changes, the most severe one, and one of each distinct cause.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+    of_study
+        Explain the study of results as if it had none: the smallest changes, and vehicles sampled
+        over the domain.
     top
         Largest number of failures that are explained.
     fits
@@ -133,10 +137,10 @@ def explain(
         A rough answer: the study's own parameter set alone, and a short search. It has causes of
         few failures.
     """
-    of_study, study = isinstance(subject, Study), evaluator.study
+    study, of_study = evaluator.study, of_study or isinstance(subject, Study)
+    subject = study if of_study else subject
     limit = _plan(subject, evaluator, quick, 0 if quick else fits)
-    if quick or evaluator.left is not None:
-        fits = 0
+    fits = 0 if quick or evaluator.left is not None else fits
 
     # The failures.
     if evaluator.left is not None:
@@ -150,10 +154,9 @@ def explain(
     # of a smaller one where few simulations are allowed.
     has_smallest = of_study and is_caused
     smallest = Smallest.of(evaluator, population.unsafe, fits) if has_smallest else None
-    if evaluator.left is not None:
-        limit = evaluator.left // 4
-    chosen = choose_failures(population, evaluator, limit, 0 if of_study else top)
-    reasons, sample, causes, complete = chosen
+    limit = limit if evaluator.left is None else evaluator.left // 4
+    top = 0 if of_study else top
+    reasons, sample, causes, complete = choose_failures(population, evaluator, limit, top)
     of_chosen, of_sample = (
         [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
     )

@@ -241,29 +241,25 @@ def draw_staircase(answer: Answer) -> Figure:
     )
     shares = [share for share, _, _ in found]
     fewest = [number for _, number, _ in found]
-    axis.step(shares, fewest, "o-", where="mid", color=BLUE)
+    axis.step(shares, fewest, "o-", where="post", color=BLUE)
     for place, (share, number, causes) in enumerate(found):
-        if place and causes == found[place - 1][2]:
+        if place and causes[0] == found[place - 1][2][0]:
             continue
+        others = f"\n(one of {len(causes)})" if len(causes) > 1 else ""
         axis.annotate(
-            escape_dollars(causes[0].replace(", ", "\n") + ("\n..." if len(causes) > 1 else "")),
+            escape_dollars(causes[0].replace(", ", "\n") + others),
             (share, number),
-            xytext=(0, 6),
+            xytext=(5, 6),
             textcoords="offset points",
-            ha="center",
             fontsize=FONT_SIZE - 2,
         )
     for row in rows:
         if not row["causes"]:
-            axis.text(
-                100 * row["share"],
-                1,
-                f"none of {row['tried']:,}",
-                fontsize=FONT_SIZE - 2,
-                rotation=90,
-                ha="center",
-            )
-    axis.set_xlim(0, 108)
+            words = f"none of {row['tried']:,}\nsimulated"
+            axis.text(100 * row["share"], 1.1, words, fontsize=FONT_SIZE - 2, ha="center")
+    axis.set_xlim(0, 125)  # with room for names at the right
+    axis.set_xticks(range(0, 101, 20))
+    axis.grid(visible=False, axis="x")
     axis.set_ylim(0.5, max(fewest, default=1) + 1.6)
     axis.yaxis.get_major_locator().set_params(integer=True)
     axis.set_xlabel("share of the way from the original to the end of the domain [%]")
