@@ -43,9 +43,9 @@ COMMANDS = (
     "tolerance rain",
     'tolerance wear --limits "treadDepth >= 3" --quick',
     'tolerance wear --limits "treadDepth >= 3"',
-    "tolerance sun_joint",
-    "tolerance wear_joint",
-    "permit wear_joint --set treadDepth=3 --set payload=300 --set brakeTorque=0.9",
+    "tolerance sun --ranges",
+    "tolerance wear --ranges",
+    "permit wear --set treadDepth=3 --set payload=300 --set brakeTorque=0.9",
     "repair wear --promise all",
     "report results/rain",
 )
@@ -89,7 +89,7 @@ def vehicles_each(study: Study) -> int:
     """Vehicles that drive for a setting: the original one in the same encounter, too, where
     encounters are searched.
     """
-    return 2 if study.scenario.search else 1
+    return 2 if study.ranges else 1
 
 
 def seconds_of_one(study: Study) -> float:

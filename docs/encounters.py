@@ -1,11 +1,11 @@
-"""The picture of collisions over speed and tread in the study wear_joint.
+"""The picture of collisions over speed and tread in the ranges of the study wear.
 
     python docs/encounters.py docs/pictures/encounters.png [count]
 
 With `count` it prints the numbers of the page, too.
 
-The car has the wear `WORN` besides its tread, with which the study wear, whose speeds are dotted,
-finds it safe.
+The car has the wear `WORN` besides its tread, with which it is safe in the tests of the study,
+whose speeds are dotted.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import sys
 import numpy as np
 
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
+from safevar_sumo.questions.part import study_up_to
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 
@@ -31,15 +32,15 @@ WORN = {
 }
 IMPACT_LOCATION = 25.0
 GRID_SPEEDS = (10, 20, 30, 40)
-"""Speeds of the study wear [km/h]."""
+"""Speeds of the tests that cross the road [km/h]."""
 SPEEDS, TREADS = 51, 33
 VEHICLES, ENCOUNTERS = 150, 24
 LINES, PARTS, ENCOUNTERS_ON_LINES = 30, 25, 16
 
 
 def _up_to(fastest: float) -> System:
-    """The study wear_joint up to a speed [km/h]."""
-    return assemble(read_study("wear_joint", scenario={"search": {"speed": {"upper": fastest}}}))
+    """The study wear in its ranges, up to a speed [km/h]."""
+    return assemble(study_up_to(with_ranges(read_study("wear")), f"speed={fastest:g}"))
 
 
 def main(path: str) -> None:
@@ -55,7 +56,9 @@ def main(path: str) -> None:
     evaluations = drive_and_score(system, settings)
     collided = evaluations.collided.reshape(TREADS, SPEEDS)
     unsafe_original = system.measuring.scoring.violation(evaluations).reshape(TREADS, SPEEDS)[0] > 0
-    figure, ((axis,),) = new_figure("wear_joint: collisions over speed and tread", 1, 1, (6.4, 3.4))
+    figure, ((axis,),) = new_figure(
+        "wear --ranges: collisions over speed and tread", 1, 1, (6.4, 3.4)
+    )
     axis.contourf(speeds, treads, collided, levels=[0.5, 1.5], colors=[VERMILION], alpha=0.45)
     border = speeds[np.argmax(unsafe_original)] if unsafe_original.any() else FASTEST
     axis.axvspan(border, FASTEST + 1, color="0.75")
@@ -68,15 +71,13 @@ def main(path: str) -> None:
         f"{item.name} {WORN[item.name]:g}{item.suffix}" for item in members if item.name in WORN
     )
     axis.set_title(f"{wear},\nimpact location {IMPACT_LOCATION:g} %", fontsize=8)
-    colours = (
-        "orange: collision; grey: the original is not safe; blue, dotted: speeds of the study wear"
-    )
+    colours = "orange: collision; grey: the original is not safe; blue, dotted: speeds of the tests"
     figure.supxlabel(colours, fontsize=8)
     figure.savefig(path, dpi=110)
 
 
 def count_between(fastest: float) -> None:
-    """Print how many vehicles are safe at all points of wear, and how many of these collide in
+    """Print how many vehicles are safe in all tests of wear, and how many of these collide in
     encounters up to a speed [km/h].
     """
     grid, joint = assemble(read_study("wear")), _up_to(fastest)
@@ -95,14 +96,14 @@ def count_between(fastest: float) -> None:
     fails = evaluations.collided & (joint.measuring.scoring.violation(evaluations) == 0)
     found = int(fails.reshape(len(safe), -1).any(axis=1).sum())
     print(
-        f"{len(safe)} of {VEHICLES} vehicles are safe in wear, {found} of these collide in"
-        " wear_joint"
+        f"{len(safe)} of {VEHICLES} vehicles are safe in the tests of wear, {found} of these"
+        " collide in its ranges"
     )
 
 
 def compare_lines(fastest: float) -> None:
     """Print on how many lines from the original to worn cars the first collision is earlier in
-    wear_joint than in wear, and on how many later.
+    the ranges of wear than in its tests, and on how many later.
     """
     grid, joint = assemble(read_study("wear")), _up_to(fastest)
     members, of_vehicle, rng = (
@@ -130,7 +131,7 @@ def compare_lines(fastest: float) -> None:
         firsts.append(np.where(rows.any(axis=1), shares[np.argmax(rows, axis=1)], np.inf))
     on_grid, between = firsts
     print(
-        f"of {LINES} lines earlier in wear_joint: {(between < on_grid).sum()}, later:"
+        f"of {LINES} lines earlier in the ranges: {(between < on_grid).sum()}, later:"
         f" {(between > on_grid).sum()}"
     )
 

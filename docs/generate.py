@@ -115,7 +115,8 @@ def _structs(kind: Any) -> Iterator[Any]:
         yield kind
         for field in kind.fields:
             yield from _structs(field.type)
-    parts = (getattr(kind, name) for name in ("item_type", "value_type") if hasattr(kind, name))
+    inner = ("item_type", "value_type", "type")  # `type` of an annotated one
+    parts = (getattr(kind, name) for name in inner if hasattr(kind, name))
     for part in [*getattr(kind, "types", ()), *getattr(kind, "item_types", ()), *parts]:
         yield from _structs(part)
 

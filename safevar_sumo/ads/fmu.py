@@ -17,7 +17,7 @@ from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
 from safevar_sumo.errors import InputError, check_name, missing_extra, unknown_name
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import NamedValues, Nominal, Observation
-from safevar_sumo.study.schema import ModelTable
+from safevar_sumo.study.encounters import ModelTable
 
 NOMINAL = "nominal_"
 """Prefix of what an FMU may be given of the original vehicle."""

@@ -76,7 +76,7 @@ def evaluate(
         the filtered setting, as in the paper), the metrics in their units (NaN where undefined),
         collision_speed [m/s], outcome: simulator-error if a setting cannot be simulated,
         invalid-test if it leaves a test's speed before the driving system acts. These have no
-        metrics, and are neither failures nor successes. If the study searches its scenario,
+        metrics, and are neither failures nor successes. If encounters are ranges,
         feasible says whether the original is safe in the same encounter.
 
     Raises

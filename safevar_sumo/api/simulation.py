@@ -40,6 +40,7 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.encounters import where_met
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import worst_point
 from safevar_sumo.sumo.models import create_shipped_models
@@ -320,10 +321,11 @@ def simulate(
     loaded_study, system = load_and_assemble(study)
     with about("changes"):
         loaded_study, system = with_encounters(
-            loaded_study, system, {} if changes is None else dict(changes)
+            loaded_study, system, () if changes is None else [*changes]
         )
+    setting = changed_setting(system, changes, filtered, beyond)
     return simulate_with_original(
-        loaded_study, system, changed_setting(system, changes, filtered, beyond), filtered=filtered
+        loaded_study, where_met(system, setting), setting, filtered=filtered
     )
 
 

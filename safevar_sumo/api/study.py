@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
 from contextlib import suppress
@@ -27,10 +28,11 @@ from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Criterion, Jobs, Range
+from safevar_sumo.questions.ask import Criterion, Jobs, PointName, Range, UpTo
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.measure import cases_by, study_by
+from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.research_questions.answer import (
     REMARKS,
     answer_questions,
@@ -50,6 +52,7 @@ from safevar_sumo.questions.words import (
 )
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
@@ -111,6 +114,9 @@ def study(
     evaluations: Annotated[int | None, Range(1, 10_000_000)] = None,
     algorithms: Annotated[str | None, "NAME,..."] = None,
     seed: Annotated[int | None, Range(0, 2**63 - 1)] = None,
+    ranges: bool = False,
+    point: PointName = None,
+    up_to: UpTo = None,
     unsafe: Criterion = None,
     engine: Literal["recorded", "sumo"] = "recorded",
     out: Path | None = None,
@@ -134,6 +140,12 @@ def study(
         Algorithms, separated by commas.
     seed
         Seed of the whole study.
+    ranges
+        Search the encounter, too, in the ranges of the study's axes.
+    point
+        Only this test, or this point, of the study's matrix.
+    up_to
+        Only encounters up to this value of an axis, such as speed=40.
     unsafe
         What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as
         "drac > 6".
@@ -157,14 +169,11 @@ def study(
     status
         Show the progress of the study in its directory, without disturbing it.
     """
-    as_written = read_study(study)
-    directory = out or Path("results") / as_written.name
+    as_written = part_of_study(read_study(study), ranges, point, up_to)
+    directory = out or Path("results") / directory_name(as_written)
     if unsafe is not None and (status or dry_run):
-        raise InputError(
-            "unsafe",
-            f"beside --{'status' if status else 'dry-run'}, which simulates no search",
-            "one of the two options",
-        )
+        problem = f"beside --{'status' if status else 'dry-run'}, which simulates no search"
+        raise InputError("unsafe", problem, "one of the two options")
     if status:
         return summarise(load(directory))
 
@@ -179,7 +188,7 @@ def study(
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
     if system.has_simulator and not dry_run:
-        fewer = question_command("explain", study)
+        fewer = f"{PROGRAM_COMMAND} explain {loaded.words}"
         warn(f"{fewer} --simulations N looks for the smallest changes with N simulations alone")
 
     # Measured or searched.
@@ -199,7 +208,7 @@ def study(
                 only=keys,
                 engine=engine,
             )
-            return _found(results, system, unsafe, jobs, parts.begin(), study)
+            return _found(results, system, unsafe, jobs, parts.begin(), loaded.words)
     except KeyboardInterrupt:
         warn(INTERRUPTED.format(directory))
         raise
@@ -219,15 +228,15 @@ def _found(
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
-    directory = str(results.directory)
-    asked = ("explain", study), ("explain", directory), ("tolerance", directory)
-    following = ", ".join(question_command(*one) + criterion for one in asked)
+    directory = quote(str(results.directory))
+    asked = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
+    following = ", ".join(f"{PROGRAM_COMMAND} {one}{criterion}" for one in asked)
 
     # Questions refuse an original encounter in which the original vehicle is not safe.
     demanded = results.case.scoring.safe_original
     if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
         following = (
-            "a smaller scenario.margin, or original values of scenario.search with which the"
+            "a smaller scenario.margin, or original values of the axes with which the"
             " original vehicle is safe, as questions demand"
         )
     changes: Rows = []
@@ -248,6 +257,14 @@ def _found(
         numbers={"driven": not reason, **answer.numbers},
         tables=tables,
     )
+
+
+def directory_name(study: Study) -> str:
+    """The name of a directory of results: that of the study, and of the part that is searched."""
+    origin = study.origin
+    parts = ["ranges" if origin.ranges else "", origin.point, origin.up_to]
+    name = "-".join([study.name, *filter(None, parts)])
+    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", name)
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:

@@ -41,34 +41,38 @@ _first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Restricts a task to some points of a study, and varies parameters of its ADS; no original
-    vehicle drives in the encounters of a study that searches its scenario.
+    """Restricts a task to some points of a study, and varies parameters of its ADS; every encounter
+    counts, so that no original vehicle drives beside a setting.
 
     Attributes
     ----------
     parameters
         Parameters of the ADS whose values follow the characteristics in every row of the settings.
     points
-        Numbers of the points of a matrix to simulate; all if empty.
+        Numbers of the points of a matrix to simulate; None for all.
     arrays
         Whether one ADS drives all rows, with arrays as parameters.
     each
         Whether the evaluations have the rated results at each point of a matrix, `cells`.
+    all_count
+        Whether every encounter counts, where nothing else is selected.
     """
 
     parameters: tuple[str, ...] = ()
-    points: tuple[int, ...] = ()
+    points: tuple[int, ...] | None = None
     arrays: bool = True
     each: bool = False
+    all_count: bool = False
 
     def of(self, system: System) -> System:
         """The system at the selected points."""
-        points = tuple(system.points[number] for number in self.points)
-        return replace(system, matrix=points) if points else system
+        if self.points is None:
+            return system
+        return replace(system, matrix=tuple(system.points[number] for number in self.points))
 
 
 EVERYTHING = Selection()
-"""All points, and the study's own values of the ADS's parameters."""
+"""All points, the study's own values of the ADS's parameters, and its own rule of what counts."""
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):

@@ -136,7 +136,7 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkn
     """The metrics of a study and the objectives of its searches; stored in results beside the
     study.
 
-    In a study that searches its scenario, a setting is feasible if the original vehicle has at
+    Where encounters are ranges, a setting is feasible if the original vehicle has at
     least the safety degree `safe_original` in the same encounter [m].
     """
 
@@ -154,8 +154,8 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkn
         return np.where(np.isnan(shortfall), np.inf, np.maximum(shortfall, 0.0))
 
     def feasible_rows(self, frame: pd.DataFrame) -> BoolArray:
-        """In which rows the original vehicle is safe in the same encounter: all, unless the study
-        searches its scenario.
+        """In which rows the original vehicle is safe in the same encounter: all, unless encounters
+        are ranges.
         """
         if self.safe_original is None or ORIGINAL_DEGREE not in frame:
             return np.ones(len(frame), dtype=bool)

@@ -41,7 +41,7 @@ from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import file_of_module, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.study import Study, convert_table, data_files
-from safevar_sumo.study.schema import Parameters
+from safevar_sumo.study.encounters import Parameters
 
 A_DAY = 86_400.0
 """The longest time limit [s]."""

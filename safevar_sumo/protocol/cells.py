@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from safevar_sumo.records import FloatArray, NamedValues
 from safevar_sumo.shipped import shipped_table
-from safevar_sumo.study.schema import Parameters
+from safevar_sumo.study.encounters import Parameters
 
 EURO_NCAP_2026 = "euro_ncap_2026"
 COLOURS = ("green", "yellow", "orange", "brown", "red")

@@ -203,8 +203,8 @@ def join_cells(quantities: Sequence[CellResults]) -> CellResults:
 
 
 def is_rated(study: Study) -> bool:
-    """Whether a study's settings are rated: in all cells of a protocol, not at one point alone."""
-    return study.matrix is not None and bool(study.matrix.protocol) and not study.matrix.point
+    """Whether a study's settings are rated: in all cells of a protocol."""
+    return study.matrix is not None and bool(study.matrix.protocol)
 
 
 def rater_of(study: Study) -> Rater | None:
@@ -268,6 +268,4 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
             MatrixTest(name=cell.name, model=model, parameters=parameters, weathers=weathers)
         )
     no_parameters = replace(study.scenario, parameters={})  # each test has its own parameters
-    return replace(
-        study, matrix=MatrixTable(tests=tests, point=study.matrix.point), scenario=no_parameters
-    )
+    return replace(study, matrix=MatrixTable(tests=tests), scenario=no_parameters)

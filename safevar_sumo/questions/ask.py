@@ -25,7 +25,7 @@ from safevar_sumo.errors import MAX_JOBS, InputError, check_name, check_text, un
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
-from safevar_sumo.questions.subject import Results, reduce_to_point, study_in, study_or_case
+from safevar_sumo.questions.subject import Results, part_of, study_in, study_or_case
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
@@ -85,11 +85,15 @@ ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
 Fits = Annotated[int | None, Range(0, 1000)]
 """A number of parameter sets; None for all."""
 PointName = Annotated[str | None, "NAME"]
-"""A point of a study's matrix."""
+"""A test, or a point, of a study's matrix."""
+UpTo = Annotated[str | None, "NAME=V"]
+"""A value at which an axis ends."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
 Cluster = Annotated[str | None, "ADDRESS"]
 """The address of a Dask scheduler."""
+UP_TO = "up_to"
+"""The option that cuts an axis."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
@@ -100,7 +104,14 @@ ROUGH = (
 Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
 """The largest number of simulations."""
 COMMON_OPTIONS = (
-    ("point", PointName, None, "Only this point of the study's matrix."),
+    ("point", PointName, None, "Only this test, or this point, of the study's matrix."),
+    (
+        "ranges",
+        bool,
+        False,
+        "Any encounter in the ranges of the study's axes, not the tests alone.",
+    ),
+    ("up_to", UpTo, None, "Only encounters up to this value of an axis, such as speed=40."),
     ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
     ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
     (
@@ -133,6 +144,11 @@ COMMON_OPTIONS = (
 """Options that every question has: name, type, default, and meaning."""
 
 
+def flag_of(name: str) -> str:
+    """The flag of an option."""
+    return f"--{name.replace('_', '-')}"
+
+
 class Option(NamedTuple):
     """An option of a function: the type of a value, its range, choices or the form of its text, its
     default and its meaning.
@@ -149,7 +165,7 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
-        return f"--{self.name.replace('_', '-')}"
+        return flag_of(self.name)
 
     def check(self, value: Any) -> Any:
         """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has
@@ -219,15 +235,17 @@ class Question:
         }
         """Further positional parameters, and whether each is a file instead of a subject."""
         # Options that all questions have.
+        own = inspect.signature(compute).parameters
+        further = [option for option in COMMON_OPTIONS if option[0] not in own]
         common = [
             inspect.Parameter(
                 name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
             )
-            for name, kind, default, _ in COMMON_OPTIONS
+            for name, kind, default, _ in further
         ]
         shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
         self.__signature__ = inspect.Signature(shown, return_annotation="Answer")
-        texts = "\n".join(f"{name}\n    {text}" for name, _, _, text in COMMON_OPTIONS)
+        texts = "\n".join(f"{name}\n    {text}" for name, _, _, text in further)
         self.__doc__ = f"{inspect.cleandoc(compute.__doc__ or '')}\n{texts}"
 
     @cached_property
@@ -245,6 +263,8 @@ class Question:
         source: StudyLike | Results | None = None,
         *others: StudyLike | Results,
         point: str | None = None,
+        ranges: bool = False,
+        up_to: str | None = None,
         jobs: int | None = None,
         cluster: str | None = None,
         simulations: int | None = None,
@@ -254,6 +274,9 @@ class Question:
         fresh: bool = False,
         **values: Any,
     ) -> Answer:
+        # Where the question itself cuts encounters, it gets the whole of them.
+        is_own = any(option.name == UP_TO for option in self.options)
+        cut, values = (None, {**values, UP_TO: up_to}) if is_own else (up_to, values)
         # Options that it has, with legal values.
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
@@ -270,12 +293,14 @@ class Question:
             shortfall = "" if isinstance(subject, Study) else subject.shortfall
             if shortfall:
                 warn(shortfall)
-            return reduce_to_point(subject, point)
+            return part_of(subject, ranges, point, cut)
 
         from safevar_sumo.campaign.cache import keep_simulations  # SUMO takes long to load
 
         # What it is about, as studies, results or files.
-        command = self.command_line([_name(source), *map(_name, others)], point, values)
+        cuts = {"point": point, "up_to": cut}
+        named = [_name(source), *map(_name, others)]
+        command = self.command_line(named, cuts, values, ["--ranges"] * ranges)
         how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
         how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
@@ -361,7 +386,7 @@ class Question:
             numbers["rough"] = bool(rough or numbers.get("rough"))
         sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
         verdict = " ".join(filter(None, sentences))
-        following = self._following(subjects[0], evaluator, called) or answer.next
+        following = self._following(subjects[0], evaluator, called, values) or answer.next
         most = account.asked if account.most is None else account.most
         command = "" if most is None else f" --simulations {most}"
         return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
@@ -381,7 +406,9 @@ class Question:
         criterion = own.criterion or None
         return criterion, {**values, option: criterion}, " ".join(filter(None, cites))
 
-    def _following(self, subject: Subject, evaluator: Evaluator, called: str) -> str:
+    def _following(
+        self, subject: Subject, evaluator: Evaluator, called: str, values: JsonObject
+    ) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
         and where nobody else is on the road nothing is unsafe by itself.
         """
@@ -393,9 +420,18 @@ class Question:
         ):
             return ""
         is_too_early = declared.next == "report" and isinstance(subject, Study)
-        return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {quote(called)}"
+        words = subject.words if isinstance(subject, Study) else quote(called)
+        cut = values.get(UP_TO) if isinstance(subject, Study) else None
+        words += f" {flag_of(UP_TO)} {quote(cut)}" if cut else ""
+        return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {words}"
 
-    def command_line(self, subjects: Sequence[str], point: str | None, values: JsonObject) -> str:
+    def command_line(
+        self,
+        subjects: Sequence[str],
+        part: Mapping[str, str | None],
+        values: JsonObject,
+        flags: Sequence[str] = (),
+    ) -> str:
         """The command that asks this question; it has a flag for each option that is not at its
         default.
         """
@@ -411,7 +447,11 @@ class Question:
                 f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag
                 for text in texts
             ]
-        return " ".join([*words, *([f"--point {quote(str(point))}"] if point else [])])
+        words += [
+            *flags,
+            *(f"{flag_of(name)} {quote(str(text))}" for name, text in part.items() if text),
+        ]
+        return " ".join(words)
 
 
 def question(compute: Callable[..., Answer]) -> Question:

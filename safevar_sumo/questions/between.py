@@ -6,9 +6,9 @@ has the vehicle's characteristics, then a place on each axis.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from itertools import compress, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -22,8 +22,9 @@ from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.scope import are_numbers, at_values, moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import Scenario, searchable_in, weather_of
-from safevar_sumo.study import PHASE, Domain, MatrixTest, Study
+from safevar_sumo.scenarios import Scenario, searchable_in
+from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
+from safevar_sumo.study.encounters import Axes
 from safevar_sumo.sumo.system import System, assemble
 
 DECIMALS = 2
@@ -51,20 +52,13 @@ class MovingTest:
 
     def __init__(self, model: Model, test: MatrixTest, domains: dict[str, Domain], new_car: Unsafe):
         study = model.evaluator.study
-        assert study.matrix is not None
-        self.test = test
+        self.test = replace_in(test, over={**study.lists_of(test)})
         self.axes = tuple(domains)
         self._base = model
-        moving = replace_in(
-            study,
-            matrix=replace_in(study.matrix, tests=[without_axes(test, domains)]),
-            scenario=replace_in(study.scenario, search=domains),
-        )
+        moving = in_ranges(study, [(self.test, domains)])
         evaluator = model.evaluator.for_study(moving, verified=0)
-        # At points that are selected no original drives beside each vehicle: only those beside
-        # failures have to.
-        points = tuple(range(len(evaluator.system.points)))
-        self.model = Model(model.fit, evaluator, model.unsafe, points, new_car)
+        # Originals drive beside failures alone.
+        self.model = Model(model.fit, evaluator, model.unsafe, all_count=True, new_car=new_car)
 
     @property
     def original(self) -> FloatArray:
@@ -136,13 +130,22 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
 
 def domains_of_axes(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
     """The axes of a test that move, each from its least to its greatest value."""
-    axes = axes_of(test, scenario)
+    axes = axes_of(study, test, scenario)
     return {name: axes[name] for name in moving_axes(study, test, scenario)}
 
 
-def axes_of(test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
-    """The axes of a test that its scenario can move, each from its least to its greatest value; one
-    with a single value as far as is legal.
+def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]) -> Study:
+    """A study of some tests alone, of which some axes may have any value of a domain."""
+    moving = []
+    for test, domains in tests:
+        over: Axes = {**study.lists_of(test), **{name: axis_of(domains[name]) for name in domains}}
+        moving.append(replace_in(test, over=over))
+    return replace_in(study.listed().with_tests(moving), encounters=RANGES)
+
+
+def axes_of(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
+    """The listed axes of a test that its scenario can move, each from its least to its greatest
+    value; one with a single value as far as is legal.
     """
     searchable = searchable_in(scenario)
     return {
@@ -152,45 +155,36 @@ def axes_of(test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
             lower=float(min(values) if len(values) > 1 else searchable[name].lower),
             upper=float(max(values) if len(values) > 1 else searchable[name].upper),
         )
-        for name, values in test.over.items()
+        for name, values in study.lists_of(test).items()
         if name in searchable and are_numbers(values)
     }
-
-
-def without_axes(test: MatrixTest, axes: Collection[str]) -> MatrixTest:
-    """A test whose matrix does not have these axes."""
-    return replace_in(test, over={name: test.over[name] for name in test.over if name not in axes})
 
 
 def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
     """A model at further tests beside those of its matrix, or at these `alone`; a point that the
     matrix has counts once.
     """
-    study = model.evaluator.study
+    study = model.evaluator.study.listed()
     assert study.matrix is not None
     known = [] if alone else study.matrix.tests
-    points = dict(point for test in tests for point in _points_of(test))
-    for name, _ in (point for test in known for point in _points_of(test)):
+    points = dict(point for test in tests for point in _points_of(study, test))
+    for name, _ in (point for test in known for point in _points_of(study, test)):
         points.pop(name, None)
-    matrix = replace_in(study.matrix, tests=[*known, *points.values()])
-    return model._replace(
-        evaluator=model.evaluator.for_study(replace_in(study, matrix=matrix), verified=0), points=()
-    )
+    further = study.with_tests([*known, *points.values()])
+    return model._replace(evaluator=model.evaluator.for_study(further, verified=0), points=None)
 
 
-def _points_of(test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]:
+def _points_of(study: Study, test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]:
     """The test at each of its points alone, with what tells it from others."""
-    for place in product(*test.over.values()):
-        over = dict(zip(test.over, place, strict=True))
+    lists = study.lists_of(test)
+    for place in product(*lists.values()):
+        over = dict(zip(lists, place, strict=True))
         yield (test.name, *over.items()), at_values(test, over)
 
 
-def with_encounters(
-    study: Study, system: System, changes: Mapping[str, str | float]
-) -> tuple[Study, System]:
-    """A study and its system; if axes of its matrix, or the phase, are among the names of a user's
-    changes, they are searched parameters, in the tests that have all of these axes, and their
-    values, as far as these are numbers.
+def with_encounters(study: Study, system: System, changes: Collection[str]) -> tuple[Study, System]:
+    """A study and its system; if axes of its matrix, or the phase, are among the names of what a
+    user sets, settings have values of these, in the tests that have all of the axes.
 
     Raises
     ------
@@ -198,11 +192,9 @@ def with_encounters(
         If the phase is set, and the study's encounters have none; or axes that no test has
         together.
     """
-    known = system.characteristics.names
-    found = _with_axes(
-        study, system, {name: value for name, value in changes.items() if name not in known}
-    )
-    if PHASE in changes and PHASE not in system.characteristics.names:
+    names = {*changes} - {*system.characteristics.names}
+    found = _with_axes(study, system, names)
+    if PHASE in names:
         phased = in_phases(found, assemble(found))
         if phased == found:
             problem = f"study {study.name!r} has no {PHASE}"
@@ -218,72 +210,25 @@ def with_encounters(
     return found, replace(searched, measuring=searched.measuring._replace(scoring=scoring))
 
 
-def _with_axes(study: Study, system: System, places: Mapping[str, str | float]) -> Study:
-    """A study that searches those of the places that are axes of its matrix which a scenario can
-    move, in the tests that have all of them, at its point if it is at one.
+def _with_axes(study: Study, system: System, names: set[str]) -> Study:
+    """A study in which those of the names that are listed axes, which a scenario can move, may have
+    any value, in the tests that have all of them.
     """
-    matrix = study.matrix
-    if matrix is None or matrix.protocol or study.scenario.search:
+    if study.matrix is None or study.matrix.protocol or study.ranges:
         return study
-    here = {test.name: own for test, own in points_of_tests(study, system.points)}
     moving = [
-        (test, axes_of(test, here[test.name][0].scenario))
-        for test in matrix.tests
-        if test.name in here
+        (test, axes_of(study, test, own[0].scenario))
+        for test, own in points_of_tests(study, system.points)
     ]
-    axes = places.keys() & {name for _, domains in moving for name in domains}
+    axes = names & {name for _, domains in moving for name in domains}
     if not axes:
         return study
-
-    # The tests in which the values lie; if there is none, the one whose domains end last, which
-    # the error names.
-    kept = [(test, domains) for test, domains in moving if axes <= domains.keys()]
+    kept = [
+        (test, {name: domains[name] for name in domains if name in axes})
+        for test, domains in moving
+        if axes <= domains.keys()
+    ]
     if not kept:
         problem = f"no test has {join_phrases(sorted(axes))} together"
         raise InputError("", problem, "values of one test's axes")
-    farthest = max(kept, key=lambda each: [each[1][name].upper for name in sorted(axes)])
-    has_all = [all(_has(domains[name], places[name]) for name in axes) for _, domains in kept]
-    kept = [*compress(kept, has_all)] or [farthest]
-
-    # At a point, the rest of its test stays as it is there.
-    tests = [without_axes(test, axes) for test, _ in kept]
-    if matrix.point:
-        of_point = dict(system.points[0].parameters)
-        tests = [
-            replace_in(
-                at_values(test, {name: of_point[name] for name in test.over}),
-                weathers=[
-                    weather
-                    for weather in test.weathers
-                    if weather_of(weather).name == of_point["weather"]
-                ],
-            )
-            for test in tests
-        ]
-    domains = {
-        name: _common(name, [own[name] for _, own in kept]) for name in kept[0][1] if name in axes
-    }
-    return replace_in(
-        study,
-        matrix=replace_in(matrix, tests=tests, point=""),
-        scenario=replace_in(study.scenario, search=domains),
-    )
-
-
-def _common(name: str, domains: Sequence[Domain]) -> Domain:
-    """What domains of an axis have in common."""
-    lower = max(domain.lower for domain in domains)
-    upper = min(domain.upper for domain in domains)
-    if lower >= upper:
-        raise InputError("", f"{name}: the tests have no range in common", "--point, for one test")
-    original = min(max(domains[0].original, lower), upper)
-    return replace_in(domains[0], original=original, lower=lower, upper=upper)
-
-
-def _has(domain: Domain, value: str | float) -> bool:
-    """Whether a value, or both ends of a sweep, lie in a domain; a share of the original may."""
-    ends = str(value).partition(":")[0].split("..")
-    try:
-        return all(domain.lower <= float(end) <= domain.upper for end in ends)
-    except ValueError:
-        return True
+    return in_ranges(study, kept)

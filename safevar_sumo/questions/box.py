@@ -19,7 +19,7 @@ from safevar_sumo.vehicles import FeasibleRegion
 MAX_CORNERS = 4096
 """Largest number of corners of a box that are simulated."""
 MET_BY_CORNERS = 32_768
-"""Number of encounters that the corners meet together, in a study that searches its scenario."""
+"""Number of encounters that the corners meet together, where encounters are ranges."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Box:
     def corners(self, seed: int, attempt: int) -> FloatArray:
         """Settings at all corners; at `MAX_CORNERS` random ones if it has more.
 
-        In a study that searches its scenario, each corner of the vehicle's characteristics meets
+        Where encounters are ranges, each corner of the vehicle's characteristics meets
         equally many encounters, drawn anew in each attempt.
         """
         # Every combination of ends, or some of them.

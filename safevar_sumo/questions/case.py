@@ -139,7 +139,7 @@ class Case:
 
     def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
         """The original vehicle's safety degree beside each solution: in the solution's own
-        encounter, if the study searches its scenario.
+        encounter, where encounters are ranges.
         """
         own = solutions.get(ORIGINAL_DEGREE)
         return (

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
-SCENARIO: Columns = DESCRIBED | {"search": "what [scenario.search] may vary, and its widest domain"}
+SCENARIO: Columns = DESCRIBED | {"search": "axes of its encounters, and their widest ranges"}
 STUDIES: Columns = NAME | {
     key: f"its {key}" for key in ("title", "vehicle", "ads", "scenario", "weather")
 }

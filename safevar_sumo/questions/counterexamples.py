@@ -146,8 +146,8 @@ def as_printed(
 
 def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
-    points = model.evaluator.system.points
-    points = tuple(points[number] for number in model.points) or points
+    everywhere = model.evaluator.system.points
+    points = [everywhere[number] for number in model.numbers_of_points]
     members = model.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)

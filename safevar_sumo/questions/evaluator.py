@@ -59,7 +59,7 @@ setting collides, else a safety degree.
 FIRST_SETTINGS = 64
 """Number of them that are tried first: one collision decides."""
 ENCOUNTERS = 16
-"""Number of encounters in which a vehicle is tried, in a study that searches its scenario."""
+"""Number of encounters in which a vehicle is tried, where encounters are ranges."""
 CANDIDATES = 512
 """Number of encounters over its domain from which they are chosen."""
 
@@ -117,15 +117,26 @@ class Evaluator:
 
         Settings that violate a constraint of the study are not simulated and get the outcome
         `infeasible`, unless `ignore_constraints` is true. So do settings in whose encounter the
-        original vehicle is not safe, in a study that searches its scenario.
+        original vehicle is not safe, where encounters are ranges.
         """
-        is_feasible = self.region.feasible(settings) | ignore_constraints
-        if is_feasible.all():
+        if ignore_constraints:
             return self._evaluate_shown(settings, stage, self._verified)
-        infeasible = settings[~is_feasible]
-        changes = self.characteristics.change_objectives(infeasible)
+        return self._evaluate_feasible(settings, stage, self._verified, EVERYTHING)
+
+    def _evaluate_feasible(
+        self, rows: FloatArray, stage: str, verified: int, selection: Selection
+    ) -> Evaluations:
+        """Evaluate rows, of which those that violate a constraint are not simulated."""
+        n = len(self.characteristics)
+        is_feasible = self.region.feasible(rows[:, :n])
+        if is_feasible.all():
+            return self._evaluate_shown(rows, stage, verified, selection)
+        infeasible = rows[~is_feasible]
+        changes = self.characteristics.change_objectives(infeasible[:, :n])
         not_simulated = Evaluations.undefined(infeasible, Outcome.INFEASIBLE, METRICS, **changes)
-        simulated = self._evaluate_shown(settings[is_feasible], stage, self._verified)
+        if not is_feasible.any():
+            return not_simulated
+        simulated = self._evaluate_shown(rows[is_feasible], stage, verified, selection)
         both = Evaluations.concatenate([simulated, not_simulated])
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
@@ -184,9 +195,11 @@ class Evaluator:
         of the ADS.
 
         The values stand beside the settings, shape (M, n + P). Encounters in which the original
-        vehicle is not safe count, too.
+        vehicle is not safe count, too. Settings that violate a constraint are not simulated, but
+        for results at each point.
         """
-        return self._evaluate_shown(rows, stage, 0, selection)
+        evaluate = self._evaluate_shown if selection.each else self._evaluate_feasible
+        return evaluate(rows, stage, 0, selection)
 
     def _evaluate_shown(
         self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
@@ -242,7 +255,7 @@ class Evaluator:
     def evaluate_over_encounters(
         self, settings: FloatArray, unsafe: Unsafe, stage: str
     ) -> Evaluations:
-        """Evaluate M settings, shape (M, n); in a study that searches its scenario, in that of its
+        """Evaluate M settings, shape (M, n); where encounters are ranges, in that of its
         critical encounters and the original one which is worst by the criterion.
         """
         if not len(self.characteristics.scenario):
@@ -261,7 +274,7 @@ class Evaluator:
     @cached_property
     def critical_encounters(self) -> FloatArray:
         """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe,
-        shape (k, n); none if the study searches no scenario.
+        shape (k, n); none where encounters are listed.
         """
         if not len(self.characteristics.scenario):
             return np.zeros((0, len(self.characteristics)))
@@ -273,7 +286,7 @@ class Evaluator:
     @cached_property
     def share_left_out(self) -> float:
         """The share of the encounters over the domain in which the original vehicle is not safe, so
-        that they do not count; 0 if the study searches no scenario.
+        that they do not count; 0 where encounters are listed.
         """
         if not len(self.characteristics.scenario):
             return 0.0
@@ -330,13 +343,13 @@ class Evaluator:
         SimulationError
             If the original vehicle cannot be simulated.
         InputError
-            If the study searches its scenario, and the original vehicle is not safe in the original
+            If encounters are ranges, and the original vehicle is not safe in the original
             encounter.
         """
         evaluations = self.evaluate(self.characteristics.original_settings, "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
             problem = (
-                "scenario.search: the original vehicle is not safe in the encounter of the original"
+                "encounters: the original vehicle is not safe in the encounter of the original"
                 " values"
             )
             raise InputError(

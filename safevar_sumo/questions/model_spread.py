@@ -12,10 +12,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Evaluations, FloatArray, NamedValues, finite_or_none
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import SAFETY_DEGREE, Study, convert_table, locate_parameter
-from safevar_sumo.sumo.matrix import at_point, drive_and_score
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 

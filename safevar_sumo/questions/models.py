@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import Selection
+from safevar_sumo.campaign.evaluation import EVERYTHING, Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
@@ -26,7 +26,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SEARCHED_MARGIN = 0.1
-"""Distance to keep in a study that searches its scenario [m]: where the original keeps just its
+"""Distance to keep where encounters are ranges [m]: where the original keeps just its
 margin, wear may use up the rest, and contact is no limit to release.
 """
 
@@ -40,7 +40,9 @@ class Model(NamedTuple):
     fit
         Its number among the sets of [spread]; the study's own is 0.
     points
-        Numbers of the points of the study's matrix that count; all if empty.
+        Numbers of the points of the study's matrix that count; None for all.
+    all_count
+        Whether every encounter counts, whatever the original vehicle does in it.
     new_car
         What the original must not be in an encounter that counts, where it has not been tried.
     at_worst_phase
@@ -50,7 +52,8 @@ class Model(NamedTuple):
     fit: int
     evaluator: Evaluator
     unsafe: Unsafe
-    points: tuple[int, ...] = ()
+    points: tuple[int, ...] | None = None
+    all_count: bool = False
     new_car: Unsafe | None = None
     at_worst_phase: bool = False
 
@@ -62,21 +65,22 @@ class Model(NamedTuple):
     @property
     def numbers_of_points(self) -> Sequence[int]:
         """Numbers of the points that count."""
-        return self.points or range(len(self.evaluator.system.points))
+        if self.points is None:
+            return range(len(self.evaluator.system.points))
+        return self.points
 
     @property
     def in_phases(self) -> Model | None:
         """The model of settings that end with the phase of their encounter; None without phases,
         and for points of a rating.
 
-        All points of a study that does not search its scenario count, whatever the original does.
+        All points of a study with listed encounters count, whatever the original does.
         """
         evaluator = self.evaluator.in_phases
         if evaluator is None or self.unsafe.is_of_points:
             return None
-        is_searched = len(self.characteristics.scenario) > 0
-        points = self.points if is_searched else tuple(self.numbers_of_points)
-        return self._replace(evaluator=evaluator, points=points, at_worst_phase=False)
+        all_count = self.all_count or not len(self.characteristics.scenario)
+        return self._replace(evaluator=evaluator, all_count=all_count, at_worst_phase=False)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
         """The evaluations of M settings, shape (M, n), at the points that count; at their worst
@@ -86,9 +90,10 @@ class Model(NamedTuple):
         if claim is not None:
             judge = partial(claim.robustness, stage=stage)
             return claim.evaluate(at_worst_phases(claim, judge, settings)[0], stage)
-        if not self.points:
+        selection = Selection(points=self.points, all_count=self.all_count)
+        if selection == EVERYTHING:
             return self.evaluator.evaluate(settings, stage)
-        return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
+        return self.evaluator.evaluate_selection(settings, selection, stage)
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
@@ -117,7 +122,7 @@ class Model(NamedTuple):
 
     def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
         """The model at the points of the study's matrix at which settings are worst; without a
-        matrix, and in a study that searches its scenario, as it is.
+        matrix, and where encounters are ranges, as it is.
         """
         if len(self.characteristics.scenario):
             return self
@@ -125,9 +130,7 @@ class Model(NamedTuple):
         if worst is None:
             return self
         numbers = np.unique(worst).tolist()
-        return self._replace(
-            points=tuple(self.points[number] for number in numbers) if self.points else (*numbers,)
-        )
+        return self._replace(points=tuple(self.numbers_of_points[number] for number in numbers))
 
 
 def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
@@ -193,7 +196,7 @@ def check_margin(criterion: Unsafe, margin: float | None) -> None:
 
 def distance_to_keep(study: Study, margin: float | None) -> float:
     """The stated distance [m]; without one `SEARCHED_MARGIN` or that of the study."""
-    return SEARCHED_MARGIN if margin is None and study.scenario.search else margin_of(study, margin)
+    return SEARCHED_MARGIN if margin is None and study.ranges else margin_of(study, margin)
 
 
 def models_of(

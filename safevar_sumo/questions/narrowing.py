@@ -20,7 +20,7 @@ OTHERS = 16
 class NarrowedJudge:
     """Judges settings in a model: the first ones at all points of its matrix; later ones at those
     points that were worst for some setting, and at all points those that then leave least, and a
-    part of the others. In a study without a matrix, or that searches its scenario, all meet
+    part of the others. Without a matrix, or where encounters are ranges, all meet
     everything.
 
     Attributes

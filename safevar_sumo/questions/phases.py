@@ -11,7 +11,8 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import PHASES
-from safevar_sumo.study import PHASE, PHASE_DECIMALS, Domain, Study
+from safevar_sumo.study import PHASE, PHASE_DECIMALS, RANGES, Domain, Study, axis_of
+from safevar_sumo.study.encounters import Axes
 from safevar_sumo.sumo.batch import reason_for_sumo
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import System
@@ -44,8 +45,9 @@ def in_phases(study: Study, system: System) -> Study:
     has_phases = system.rater is None and all(point.scenario.has_phase for point in system.points)
     if not has_phases or reason_for_sumo(system) or PHASE in system.characteristics.names:
         return study
-    search = {**study.scenario.search, PHASE: DOMAIN}
-    return replace_in(study, scenario=replace_in(study.scenario, search=search))
+    base = study.listed()
+    over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
+    return replace_in(base, encounters=RANGES, scenario=replace_in(base.scenario, over=over))
 
 
 def meet_worst_phases(

@@ -23,12 +23,13 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
 from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.tables import Column, Columns, with_interval
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import PreCrash
 from safevar_sumo.study import ModelTable
-from safevar_sumo.sumo.matrix import at_point, drive_worst
+from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System
 
 REFERENCE_DRIVERS = "reference drivers in the same vehicle"
@@ -172,10 +173,10 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
         study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
-        settings = collisions.settings[rows]
-        there = system.at(point)
+        here = evaluator.for_study(study)
+        settings = here.characteristics.of_others(system.characteristics, collisions.settings[rows])
         verdicts.loc[rows, list(drivers)] = _assess_at_point(
-            evaluator.for_study(study), there, settings, drivers
+            here, here.system.at(here.system.points[0]), settings, drivers
         )
         verdicts.loc[rows, "point"] = point.name
     return verdicts
@@ -217,7 +218,7 @@ def _assess_at_point(
 
 def approach_parameters(system: System) -> JsonObject | None:
     """Parameters with which a reference driver approaches from rest as the driving system does with
-    the original vehicle; None in a study that searches its scenario, where that would be the
+    the original vehicle; None where encounters are ranges, where that would be the
     approach to another encounter.
 
     The driver replays the throttle until the driving system first brakes or reaches its peak speed,

@@ -123,11 +123,11 @@ def rating(
     study = evaluator.study
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}
-    if study.scenario.search:
+    if study.ranges:
         raise InputError(
             study.name,
-            "searches its scenario, and the cells of a rating are fixed",
-            "a study without [scenario.search]",
+            "has ranges of encounters, and the cells of a rating are fixed",
+            "a study whose encounters are tests",
         )
     if not is_rated(study):
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]

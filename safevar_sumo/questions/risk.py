@@ -128,7 +128,7 @@ def risk(
     # Vehicles as the study says that they vary.
     study = evaluator.study
     model = VariationModel(study)
-    has_design = not (model.is_correlated or model.region or study.scenario.search)
+    has_design = not (model.is_correlated or model.region or study.ranges)
     of_design = has_design * BASE_POINTS * (len(evaluator.characteristics) + 2)
     phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
     evaluator.begin(phases, least=LEAST_SETTINGS)

@@ -28,35 +28,28 @@ def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
 
 
 def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
-    """The tests of a study's matrix, each with its points; of a study at one point that test
-    alone.
-    """
+    """The tests of a study's matrix, each with its points."""
     assert study.matrix is not None
-    if study.matrix.point:
-        of_point = dict(points[0].parameters)
-        test = next(test for test in study.matrix.tests if test.name == of_point["test"])
-        return [(at_values(test, {name: of_point[name] for name in test.over}), [*points])]
     rest = iter(points)
     tests = []
     for test in study.matrix.tests:
         count = max(len(test.weathers), 1)
-        for values in test.over.values():
+        for values in study.lists_of(test).values():
             count *= len(values)
         tests.append((test, [*islice(rest, count)]))
     return tests
 
 
 def moving_axes(study: Study, test: MatrixTest, scenario: Scenario) -> list[str]:
-    """The axes of a test that its scenario can move between their values. A study that searches its
-    scenario, or is at one point, moves none.
+    """The axes of a test that its scenario can move between their values; none where encounters are
+    ranges.
     """
-    assert study.matrix is not None
-    if study.scenario.search or study.matrix.point:
+    if study.ranges:
         return []
     searchable = searchable_in(scenario)
     return [
         name
-        for name, values in test.over.items()
+        for name, values in study.lists_of(test).items()
         if name in searchable and len(values) > 1 and are_numbers(values)
     ]
 
@@ -112,15 +105,15 @@ def _parameters_in_words(
     """The speeds and other parameters of a test that vary: over its axes, and in a search over the
     scenario.
     """
-    # Axes of the matrix, and searched parameters.
-    over = {} if test is None else test.over
+    # Axes that are listed, and those of which any value may occur.
+    over = study.lists_of(test)
     searchable = searchable_in(points[0].scenario)
     moving = moving_axes(study, test, points[0].scenario) if test and between else []
     phrases = {}
     for name, values in over.items():
         unit = unit_text(searchable[name].unit) if name in searchable else ""
         phrases[name] = f"{_values_in_words(values, name in moving)}{unit}"
-    for name, domain in study.scenario.search.items():
+    for name, domain in study.ranges_of(test).items():
         phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
 
     # Speeds of tests that state none, first.

@@ -14,6 +14,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST, manifest_differences, read_manifest
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study, StudyLike, study_names
+from safevar_sumo.study.file import ENDED_STUDIES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +65,7 @@ class Results:
     @property
     def evaluations(self) -> pd.DataFrame:
         """One row per simulated setting of every run, in the order of the run's requests; same
-        columns as `solutions`. If the study searches its scenario, `feasible` is true where the
+        columns as `solutions`. If encounters are ranges, `feasible` is true where the
         original vehicle is safe in the same encounter: only these count.
         """
         return self.case.evaluations
@@ -136,7 +137,7 @@ def study_or_case(
             source = load(source)
         elif is_study and os.path.exists(os.path.join(source, MANIFEST)):
             warn(f"{source} is the study; the results in the directory of this name are ./{source}")
-        elif not (is_study or os.path.lexists(source)):
+        elif not (is_study or os.path.lexists(source) or source in ENDED_STUDIES):
             raise InputError(
                 source,
                 f"is neither a results directory, a study nor a file{did_you_mean(source, names)}",
@@ -156,24 +157,33 @@ def study_or_case(
     return read_study(source)
 
 
-def study_in(subject: Subject) -> Study:
-    """The study itself, or the study of the results."""
-    return subject if isinstance(subject, Study) else subject.study
-
-
-def reduce_to_point(subject: Subject, point: str | None) -> Subject:
-    """A study or results at one point of the study's matrix; the subject itself without a point.
+def part_of(subject: Subject, ranges: bool, point: str | None, up_to: str | None) -> Subject:
+    """A study in the ranges of its axes, at a test or point, and up to a value of an axis, as far
+    as these are given; results at a test or point alone.
 
     Raises
     ------
     InputError
-        If the study has no such point.
+        If the study has no such part.
     """
-    from safevar_sumo.sumo.matrix import at_point
+    from safevar_sumo.questions.part import part_of_study  # SUMO takes long to load
 
-    if point is None:
-        return subject
-    return at_point(subject, point) if isinstance(subject, Study) else case_at(subject, point)
+    if isinstance(subject, Study):
+        return part_of_study(subject, ranges, point, up_to)
+    refuse_part_of_results(ranges=ranges, up_to=up_to)
+    return subject if point is None else case_at(subject, point)
+
+
+def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
+    """Refuse options that results do not have."""
+    if ranges or up_to is not None:
+        option = "ranges" if ranges else "up_to"
+        raise InputError(option, "of results, whose encounters are those of their study", "a study")
+
+
+def study_in(subject: Subject) -> Study:
+    """The study itself, or the study of the results."""
+    return subject if isinstance(subject, Study) else subject.study
 
 
 def case_at(case: Case, point: str) -> Case:
@@ -185,14 +195,14 @@ def case_at(case: Case, point: str) -> Case:
     InputError
         If the study has no such point.
     """
-    from safevar_sumo.sumo.matrix import at_point, drive_and_score
+    from safevar_sumo.questions.part import at_point
+    from safevar_sumo.sumo.matrix import drive_and_score
     from safevar_sumo.sumo.system import assemble
 
     study = at_point(case.study, point)
     system = assemble(study)
-    return case.simulated_as(
-        study, system.measuring.scoring, drive_and_score(system, case.settings)
-    )
+    settings = system.characteristics.of_others(case.characteristics, case.settings)
+    return case.simulated_as(study, system.measuring.scoring, drive_and_score(system, settings))
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:

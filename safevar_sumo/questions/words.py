@@ -162,12 +162,12 @@ def two_decimals(value: float | None) -> str:
 
 
 def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
-    """What a vehicle of a study that searches its scenario meets, and how many encounters do not
+    """What a vehicle of a study whose encounters are ranges meets, and how many encounters do not
     count, in a sentence; empty for any other study.
     """
-    if not study.scenario.search:
+    if not study.ranges:
         return []
-    names = join_phrases(study.scenario.search)
+    names = join_phrases(study.ranges)
     own = f"Each vehicle drives in its own encounter ({names})."
     left = [] if left_out is None else [f"{number_of(left_out, 'encounter')} left out."]
     return [own, *demanded_in_words(study), *left]
@@ -185,7 +185,7 @@ def demanded_in_words(study: Study) -> list[str]:
     """
     margin = f"at least {study.scenario.margin:g} m of clearance (scenario.margin)"
     sentence = f"Only encounters count in which the original vehicle keeps {margin}."
-    return [sentence] if study.scenario.search else []
+    return [sentence] if study.ranges else []
 
 
 def constraints_in_words(study: Study) -> list[str]:
@@ -193,7 +193,7 @@ def constraints_in_words(study: Study) -> list[str]:
     characteristics = study.vehicle.characteristics
     conditions = "; ".join(
         f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
-        for constraint in study.constraints
+        for constraint in study.shared_constraints
     )
     return (
         [f"Only vehicles that satisfy the study's constraints count: {conditions}."]

@@ -150,6 +150,16 @@ class Evaluations:
             reasons=dict(self.reasons),  # user code has a view, which no process can send
         )
 
+    def where(self, is_kept: BoolArray, outcome: str) -> Evaluations:
+        """Evaluations, undefined and with this outcome where they are not kept, shape (M,)."""
+        metrics = {name: np.where(is_kept, own, np.nan) for name, own in self.metrics.items()}
+        return replace(
+            self,
+            outcome=np.where(is_kept, self.outcome, str(outcome)),
+            collision_speed=np.where(is_kept, self.collision_speed, np.nan),
+            metrics=metrics,
+        )
+
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
         """Empty evaluations, for settings of `n` characteristics."""

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import PointName, Range
+from safevar_sumo.questions.ask import PointName, Range, UpTo
 from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
@@ -28,7 +28,8 @@ from safevar_sumo.questions.model_spread import (
     remarks_on_sets,
     studies_of_sets,
 )
-from safevar_sumo.questions.subject import study_in, study_or_case
+from safevar_sumo.questions.part import part_of_study
+from safevar_sumo.questions.subject import refuse_part_of_results, study_in, study_or_case
 from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
@@ -47,13 +48,8 @@ from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, 
 from safevar_sumo.scenarios import FROM_CENTRES, pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, PHASE_DECIMALS, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import (
-    PointResult,
-    at_point,
-    point_record,
-    simulate_all_points,
-    vehicle_remarks,
-)
+from safevar_sumo.sumo.encounters import where_met
+from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, vehicle_remarks
 from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
@@ -111,7 +107,7 @@ OUTCOME_NAMES = (
 OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
 """Results that say what others say, or that a search minimises."""
 NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
-"""Why a setting of a study that searches its scenario is in no result."""
+"""Why a setting of a study whose encounters are ranges is in no result."""
 
 
 class Target(NamedTuple):
@@ -152,6 +148,8 @@ def show_simulation(
     gui: bool = False,
     spread: bool = False,
     point: PointName = None,
+    ranges: bool = False,
+    up_to: UpTo = None,
     fit: Annotated[int, Range(0, 1000)] = 0,
     as_it_is_now: bool = False,
 ) -> Answer:
@@ -179,7 +177,11 @@ def show_simulation(
     spread
         Add the vehicle model's own uncertainty: other parameters that fit published data as well.
     point
-        Only this point of the study's matrix.
+        Only this test, or this point, of the study's matrix.
+    ranges
+        The encounter has values of its own, in the ranges of the study's axes.
+    up_to
+        Only encounters up to this value of an axis, such as speed=40.
     fit
         With this parameter set of the vehicle model, by its number in [spread]; 0 is the study's.
     as_it_is_now
@@ -187,14 +189,13 @@ def show_simulation(
         say so.
     """
     # What is simulated: a study or a solution, with changes.
-    target = load_target(source, solution, as_it_is_now, point)
+    target = load_target(source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to)
     target = target._replace(study=_with_set(target.study, fit))
     system = assemble(target.study)
     changes = set
     with about("set"):
-        texts = [change.partition("=") for change in changes]
-        places = {name.strip(): text for name, _, text in texts}
-        study, system = with_encounters(target.study, system, places)
+        names = [change.partition("=")[0].strip() for change in changes]
+        study, system = with_encounters(target.study, system, names)
         target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:
@@ -220,7 +221,8 @@ def show_simulation(
             raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
         return _sweep(target.study, system, requested, list(values))
 
-    # One setting beside the original vehicle.
+    # One setting beside the original vehicle, in the tests that have its encounter.
+    system = _where_met(system, requested[0])
     simulation = simulate_with_original(target.study, system, requested[0], filtered=False)
     # Results belong to the whole matrix.
     if target.row and "outcome" in target.row and not changes and point is None:
@@ -235,6 +237,17 @@ def show_simulation(
         show_in_gui(comparison)
     answer = _answer(target, system, simulation, with_spread=spread)
     return replace(answer, draw=lambda _: draw_comparison(comparison))
+
+
+def _where_met(system: System, setting: FloatArray) -> System:
+    """The system at the points that a setting, shape (n,), meets; a warning names other tests."""
+    here = where_met(system, setting)
+    of_test = [
+        {dict(one.parameters).get("test", "") for one in each.points} for each in (system, here)
+    ]
+    if left_out := sorted(of_test[0] - of_test[1]):
+        warn(f"not driven, as their ranges do not have this encounter: {', '.join(left_out)}")
+    return here
 
 
 def _meets(system: System, setting: FloatArray) -> list[str]:
@@ -362,7 +375,15 @@ def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
                 )
 
 
-def load_target(source: str, solution: str | None, as_it_is_now: bool, point: str | None) -> Target:
+def load_target(
+    source: str,
+    solution: str | None,
+    as_it_is_now: bool,
+    point: str | None,
+    *,
+    ranges: bool = False,
+    up_to: str | None = None,
+) -> Target:
     """The study by name or path, or that of a results directory, at a point or as a whole, with the
     solution that is named or chosen.
 
@@ -375,8 +396,9 @@ def load_target(source: str, solution: str | None, as_it_is_now: bool, point: st
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=solution is not None)
     if not isinstance(subject, Study) and subject.shortfall:
         warn(subject.shortfall)
-    whole = study_in(subject)
-    study = whole if point is None else at_point(whole, point)
+    if not isinstance(subject, Study):
+        refuse_part_of_results(ranges=ranges, up_to=up_to)
+    study = part_of_study(study_in(subject), ranges, point, up_to)
     if isinstance(subject, Study) or solution is None:
         return Target(study, source)
 

@@ -298,7 +298,7 @@ def answer_to(
         expected = f"{len(question.others) + 1} results directories"
         raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
     simulations = values.pop(SIMULATIONS.name, None)
-    command = question.command_line([str(directory) for directory in directories], point, values)
+    command = question.command_line([*map(str, directories)], {"point": point}, values)
     how: JsonObject = {"simulations": simulations, "jobs": jobs, "as_it_is_now": as_it_is_now}
     how |= {"pool": pool, "questions": questions}
     answer = question.answer(cases, values, **how, progress=progress)

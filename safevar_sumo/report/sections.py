@@ -47,7 +47,7 @@ MAX_CAUSES = 6
 """Maximum number of replays of settings that answers name by their changes."""
 CHANGES, ENCOUNTER = "changes", "encounter"
 """A table's column of settings to replay: values by characteristic, all others as in the original
-vehicle; and, in a study that searches its scenario, the column of their encounters.
+vehicle; and, where encounters are ranges, the column of their encounters.
 """
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated, and no result contains them",

@@ -58,11 +58,12 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     unsafe = Unsafe.parse(numbers.get("unsafe", "collision"))
     is_screening = _is_relative(study.case, unsafe)
     missing = _why_no_limits(study, limits)
-    wider = [] if missing or "wider" not in limits.tables else _records(limits.tables["wider"])
+    found = None if missing else limits.tables.get("ranges")
+    ranges = [] if found is None else _records(found)
     claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
     if study.speed is not None:
         claim = study.speed
-        up_to, missing = _greatest_speed(study, claim, wider)
+        up_to, missing = _greatest_speed(study, claim, ranges)
         reasons = [claim.verdict]
 
     # The table, and what it is about.
@@ -102,7 +103,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "ads": name_and_sentence(ADS, limits.study.ads.model),
         "tests": [_tests_in_words(phrase) for phrase in tests],
         "road": road,
-        "wider": wider,
+        "in_ranges": ranges,
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
         "ranges": [
@@ -167,18 +168,18 @@ def speeds_of(case: Case) -> Span | None:
 
 
 def _greatest_speed(
-    study: ReportedStudy, speed: Answer, wider: Sequence[Mapping[Any, Any]]
+    study: ReportedStudy, speed: Answer, ranges: Sequence[Mapping[Any, Any]]
 ) -> tuple[str, str]:
     """The greatest speed of vehicles within the limits, with its unit; empty if there is no answer
     or they are not safe at the least one, with a sentence that says so.
 
-    It is below the least speed at which such a vehicle fails in a wider study.
+    It is below the least speed at which such a vehicle fails in the ranges of the study.
     """
     if not speed.tables:
         return "", "The question about the greatest speed has no answer."
     span = speeds_of(study.case)
     assert span is not None
-    failing = [row["fails_at"] or {} for row in wider if not row["kept"]]
+    failing = [row["fails_at"] or {} for row in ranges if not row["kept"]]
     below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
     greatest = min([*speed.tables["cars"]["up_to"].astype(float), *below])
     if greatest >= span.low:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from safevar_sumo.records import JsonObject
-from safevar_sumo.study import PYMOO, Study, tables_of, with_effect
+from safevar_sumo.study import PYMOO, RANGES, Study, tables_of, with_effect
 from safevar_sumo.study.schema import Tables
 
 FORMAT = 6
@@ -70,9 +70,34 @@ def packages_of(study: Study) -> tuple[str, ...]:
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
-    """Those of a study's tables that affect evaluations."""
-    keys: JsonObject = with_effect(tables, Study)
+    """Those of a study's tables that affect evaluations: of the axes only what is driven."""
+    driven = tables if tables.get("encounters") == RANGES else _without_ranges(tables)
+    keys: JsonObject = with_effect(driven, Study)
     return keys
+
+
+def _without_ranges(tables: Tables) -> JsonObject:
+    """A study's tables with listed encounters alone, without what is about others."""
+
+    def lists(table: JsonObject) -> JsonObject:
+        axes = table.get("over", {}).items()
+        listed = {name: axis.get("at") if isinstance(axis, dict) else axis for name, axis in axes}
+        over = {name: values for name, values in listed.items() if values}
+        return {
+            **{key: table[key] for key in table if key != "over"},
+            **({"over": over} if over else {}),
+        }
+
+    result = {**tables, "scenario": lists(tables.get("scenario", {}))}
+    result["scenario"].pop("margin", None)
+    if matrix := tables.get("matrix"):
+        tests = [lists(test) for test in matrix.get("tests", [])]
+        result["matrix"] = {**matrix, **({"tests": tests} if tests else {})}
+    if constraints := result.pop("constraints", None):
+        known = tables["vehicle"]["characteristics"].keys()
+        of_vehicle = [one for one in constraints if one["sum"].keys() <= known]
+        result |= {"constraints": of_vehicle} if of_vehicle else {}
+    return result
 
 
 def identity_in(manifest: JsonObject) -> JsonObject:

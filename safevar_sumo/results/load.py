@@ -22,6 +22,7 @@ from safevar_sumo.results.store import (
     solutions_frame,
     stored_journals,
 )
+from safevar_sumo.study import Study, convert_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,7 +94,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     folder = Path(directory)
     manifest = read_manifest(folder)
     study = manifest["study"]
-    characteristics = [*study["vehicle"]["characteristics"], *study["scenario"].get("search", ())]
+    characteristics = [*convert_table(study, Study).domains]
     if "imported" in manifest:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))

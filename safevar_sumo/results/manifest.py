@@ -174,6 +174,15 @@ def read_manifest(directory: Path) -> JsonObject:
             f"holds results in format {format_number}; this version reads format {FORMAT}",
             f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
         )
+
+    # So are those of a study with keys that ended, but for one without effect.
+    study = manifest.get("study")
+    if isinstance(study, dict):
+        study.pop("wider", None)
+    if isinstance(study, dict) and "search" in (study.get("scenario") or ()):
+        problem = "holds results of a study with [scenario.search]"
+        legal = f"the release that wrote them, safevar_sumo {written_by}; or another `out`"
+        raise InputError(directory, problem, legal)
     with about(file):
         convert_table(manifest, _Manifest)
     return dict(manifest)

@@ -37,7 +37,7 @@ from safevar_sumo.results.manifest import (
     write_manifest,
     write_whole,
 )
-from safevar_sumo.study import Study, label_of, tables_of
+from safevar_sumo.study import Study, convert_table, label_of, tables_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -167,7 +167,7 @@ def stored_journals(
     """
     study = manifest["study"]
     search = study["search"]
-    characteristics = [*study["vehicle"]["characteristics"], *study["scenario"].get("search", ())]
+    characteristics = [*convert_table(study, Study).domains]
     digest = identity_digest(manifest)
     labels = dict.fromkeys(map(label_of, search["algorithms"]))
     for algorithm, run in product(labels, range(search["runs"])):

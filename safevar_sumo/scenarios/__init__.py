@@ -9,9 +9,7 @@ import msgspec
 from safevar_sumo.errors import check_name
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
-    SPEED_DIMENSION as SPEED_DIMENSION,
     VUT as VUT,
-    Point as Point,
     PreCrash as PreCrash,
     Scenario as Scenario,
     Scene as Scene,
@@ -21,6 +19,7 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.metadrive import LearnedDriver
+from safevar_sumo.scenarios.point import SPEED_DIMENSION as SPEED_DIMENSION, Point as Point
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
 from safevar_sumo.scenarios.simulated import Simulator as Simulator

@@ -15,7 +15,7 @@ from msgspec import Meta
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
 from safevar_sumo.scenarios.roads import Roads, World
-from safevar_sumo.study import FreeParameter, Weather, free_parameters
+from safevar_sumo.study import FreeParameter, free_parameters
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
@@ -333,24 +333,6 @@ class WorldScenario(Scenario):
         arrays of N values: the same as `actors` and `observe` make SUMO do.
         """
         raise NotImplementedError
-
-
-SPEED_DIMENSION = "speed"
-"""Keys of a point that are rows and columns where `simulate` tabulates a matrix."""
-
-
-class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
-    the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
-    All of it begins `phase` steps later, a number or of shape (N,).
-    """
-
-    scenario: Scenario
-    weather: Weather
-    name: str = ""
-    parameters: tuple[tuple[str, Any], ...] = ()
-    allowed_impact_speed: float = 0.0
-    phase: Quantity = 0.0
 
 
 class PreCrash(StrEnum):

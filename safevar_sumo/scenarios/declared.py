@@ -1,31 +1,35 @@
-"""The reading of a study: of its searched parameters, [scenario.search] may leave out what the
-scenario's class declares, shipped or the user's own, or the weather.
+"""The reading of a study: the ranges of its axes may leave out what the scenario's class declares,
+shipped or the user's own, or the weather.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
-from safevar_sumo.errors import about, warn
+from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.plugins import Lookup
-from safevar_sumo.scenarios import SCENARIO_BASES, SCENARIOS, weather_of
+from safevar_sumo.scenarios import SCENARIO_BASES, SCENARIOS, WEATHER_PARAMETERS, weather_of
 from safevar_sumo.study import (
-    Domain,
+    RANGES,
+    TESTS,
+    FreeParameter,
     MatrixTable,
     SearchTable,
     Study,
     StudyLike,
+    StudyTables,
     Weather,
     checked_study,
     convert_table,
     free_parameters,
     read_tables,
+    tables_of,
 )
-from safevar_sumo.study.schema import Parameters
+from safevar_sumo.study.encounters import Parameters
 
 
 def read_study(study: StudyLike, **changes: Any) -> Study:
@@ -42,69 +46,125 @@ def read_study(study: StudyLike, **changes: Any) -> Study:
     return complete_study
 
 
+def with_ranges(study: Study) -> Study:
+    """The study whose vehicles meet any encounter in the ranges of its axes; itself if none of them
+    has a range.
+    """
+    if study.encounters == RANGES:
+        return study
+    tables = _with_declared({**tables_of(study), "encounters": RANGES}, study.origin.places)
+    tests = tables.get("matrix", {}).get("tests", [])
+    overs = [one.get("over", {}) for one in (tables["scenario"], *tests)]
+    axes = [axis for over in overs for axis in over.values()]
+    if not any(isinstance(axis, dict) and "lower" in axis for axis in axes):
+        return study
+    origin = msgspec.structs.replace(study.origin, ranges=True)
+    return checked_study(StudyTables(study.source, tables, origin))
+
+
 def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
-    """The tables of a study, with what the scenario's class declares of parameters that the study
-    searches.
+    """The tables of a study, with what the scenarios' classes and the weather declare of axes that
+    have a range: stated ones, and all that can be moved where encounters are ranges.
     """
     scenario = tables.get("scenario")
-    search = scenario.get("search") if isinstance(scenario, dict) else None
-    if not isinstance(scenario, dict) or not isinstance(search, dict):
+    matrix = tables.get("matrix")
+    if not isinstance(scenario, dict):
         return tables
-    required = {field.name for field in msgspec.structs.fields(Domain) if field.required}
-    domains = {
-        name: _completed(domain, name, tables, places)
-        if isinstance(domain, dict) and required - domain.keys()
-        else domain
-        for name, domain in search.items()
-    }
-    return {**tables, "scenario": {**scenario, "search": domains}}
+    if matrix is not None and not (isinstance(matrix, dict) and matrix.get("tests") == []):
+        convert_table(matrix, MatrixTable, "matrix")  # none drops those of a study that it extends
+    tests = matrix.get("tests", []) if matrix else []
+    is_range = tables.get("encounters", TESTS) == RANGES
+    declared = _Declared(tables, places)
+
+    def completed(over: Parameters, key: str, test: Parameters) -> Parameters:
+        return {
+            name: declared.completed(f"{key}.{name}", name, axis, test)
+            if isinstance(axis, dict) or (is_range and isinstance(axis, list))
+            else axis
+            for name, axis in over.items()
+        }
+
+    # Axes of all tests, and of each.
+    result = {**tables}
+    if isinstance(shared := scenario.get("over"), dict):
+        first = tests[0] if tests else {}
+        result["scenario"] = {**scenario, "over": completed(shared, "scenario.over", first)}
+    if any("over" in test for test in tests):
+        own = [
+            {**test, "over": completed(test["over"], f"matrix.tests: {test['name']!r}: over", test)}
+            if "over" in test
+            else test
+            for test in tests
+        ]
+        result["matrix"] = {**(matrix or {}), "tests": own}
+    return result
 
 
-def _completed(
-    domain: Parameters, name: str, tables: Parameters, places: Sequence[str]
-) -> Parameters:
-    """The domain of a searched parameter with all keys that a scenario's class or the weather
-    declares.
+class _Declared:
+    """What classes declare of the axes of a study."""
 
-    The original is the class's default, or the value of the study's weather. In a matrix the class
-    is that of the first test that has the parameter.
-    """
-    for model, values in _models(tables, places):
-        parameter = free_parameters(model).get(name)
+    def __init__(self, tables: Parameters, places: Sequence[str]) -> None:
+        self._scenario: Parameters = tables["scenario"]
+        weather = tables.get("weather", "")
+        table = weather_of(
+            weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
+        )
+        self._weather = msgspec.structs.asdict(table)
+        time_limit = convert_table(tables.get("search"), SearchTable, "search").time_limit
+        self._lookup = Lookup(places, time_limit=time_limit)
+
+    def completed(self, key: str, name: str, axis: Any, test: Parameters) -> Any:
+        """An axis with all keys of its range; as it is if it lists what cannot be moved.
+
+        The original is by default the first value of a list, else the test's own value.
+        """
+        table = {"at": axis} if isinstance(axis, list) else axis
+        values = table.get("at", [])
+        is_listed = isinstance(axis, list) and (
+            len({*map(str, values)}) < 2 or not _are_numbers(values)
+        )
+        if is_listed or {"unit", "original", "lower", "upper"} <= table.keys():
+            return axis
+        parameter, own = self._parameter(name, test)
         if parameter is None:
-            continue
-        declared = {
+            if isinstance(axis, list):
+                return axis
+            problem = f"{key}: no scenario or weather declares a range of {name}"
+            raise InputError("", problem, "unit, original, lower and upper, or a list of values")
+
+        # What the class says, then the values, then the study.
+        found: Parameters = {
             "unit": parameter.unit,
             "lower": parameter.lower,
             "upper": parameter.upper,
             "meaning": parameter.meaning,
         }
-        if isinstance(values[name], int | float):
-            declared["original"] = values[name]
-        return {**declared, **domain}
-    return domain
+        if isinstance(own, int | float):
+            found["original"] = own
+        if values and _are_numbers(values):
+            found |= {"lower": min(values), "upper": max(values), "original": values[0]}
+        return {**found, **table}
 
-
-def _models(tables: Parameters, places: Sequence[str]) -> Iterator[tuple[type, Parameters]]:
-    """The weather's class with its values, and those of the scenarios with their defaults."""
-    # The weather's parameters.
-    weather = tables.get("weather", "")
-    table = weather_of(
-        weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
-    )
-    yield Weather, msgspec.structs.asdict(table)
-
-    # The scenarios of the tests, or the only one.
-    matrix = tables.get("matrix")
-    tests = convert_table(matrix, MatrixTable, "matrix").tests if matrix else []
-    time_limit = convert_table(tables.get("search"), SearchTable, "search").time_limit
-    lookup = Lookup(places, time_limit=time_limit)
-    for name in dict.fromkeys([test.model for test in tests] or [""]):
-        model = name or tables["scenario"].get("model")
+    def _parameter(self, name: str, test: Parameters) -> tuple[FreeParameter | None, Any]:
+        """What is declared of a parameter, and the value that a test has of it."""
+        if name in WEATHER_PARAMETERS:
+            return WEATHER_PARAMETERS[name], self._weather[name]
+        model = test.get("model") or self._scenario.get("model")
         if not isinstance(model, str):
-            return  # which the check of the whole study refuses
-        member = lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
-        yield member.target, _defaults(member.target)
+            return None, None  # which the check of the whole study refuses
+        own = model == self._scenario.get("model")
+        stated = {
+            **(self._scenario.get("parameters", {}) if own else {}),
+            **test.get("parameters", {}),
+        }
+        member = self._lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
+        default = stated.get(name, _defaults(member.target).get(name))
+        return free_parameters(member.target).get(name), default
+
+
+def _are_numbers(values: Sequence[object]) -> bool:
+    """Whether there are values, all of which are numbers."""
+    return bool(values) and all(type(value) in (int, float) for value in values)
 
 
 def _defaults(model: type) -> Parameters:

@@ -113,7 +113,7 @@ class OpenScenario(TrackScenario):
             ) from None
         if len({scene.ego for scene in found}) > 1:
             problem = f"the body of {self.ego} depends on a searched parameter"
-            raise InputError("scenario.search", problem, "values of it in the matrix")
+            raise InputError("over", problem, "values of it in the matrix")
         return found
 
     def __getstate__(self) -> dict[str, Any]:
@@ -252,7 +252,7 @@ class OpenScenario(TrackScenario):
         shape = bodies[0].shape
         if len({(body.name, body.shape.length, body.shape.width) for body in bodies}) > 1:
             problem = f"the body of {name} depends on a searched parameter"
-            raise InputError("scenario.search", problem, "values of it in the matrix")
+            raise InputError("over", problem, "values of it in the matrix")
 
         # Places relative to where Ego starts, along its direction.
         place, facing, speed = (

@@ -76,7 +76,7 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ones. The default mutation probability is 1/n per variable; crossover is simulated binary,
     mutation polynomial, both bounded by the domains. A tournament has `tournament_size`
     individuals. The result is the non-dominated part of the last population. A setting whose
-    simulation failed does not survive. In a study that searches its scenario, a feasible setting is
+    simulation failed does not survive. Where encounters are ranges, a feasible setting is
     better than an infeasible one, and of two infeasible ones that with the smaller violation.
     """
 

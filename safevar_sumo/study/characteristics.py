@@ -203,7 +203,8 @@ class Constraint(Table, frozen=True, kw_only=True):
 
     `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its
     bounds, is the unit of a characteristic or "-"; it may be omitted if all characteristics of the
-    sum have the same unit. `meaning` explains the constraint and names its source.
+    sum have the same unit. `meaning` explains the constraint and names its source. It holds in the
+    `tests` of these names alone, by default in all.
     """
 
     sum: Annotated[dict[str, float], Meta(min_length=1)]
@@ -211,6 +212,7 @@ class Constraint(Table, frozen=True, kw_only=True):
     at_most: float | None = None
     unit: str | None = None
     meaning: LongText = ""
+    tests: list[str] = []
 
     def __post_init__(self) -> None:
         if 0 in self.sum.values():
@@ -228,16 +230,15 @@ class Constraint(Table, frozen=True, kw_only=True):
             "^- ", "-", " ".join(terms).removeprefix("+ ")
         )  # the first term has its sign without a space
 
-    def allows(self, values: Mapping[str, float]) -> bool:
-        """Whether the sum is within its bounds at these values, or one of its terms has no value
-        among them.
+    def allows(self, values: Mapping[str, Any]) -> Any:
+        """Whether the sum is within its bounds at these values, numbers or arrays of shape (N,), or
+        one of its terms has no value among them.
         """
         if not self.sum.keys() <= values.keys():
             return True
         total = sum(weight * values[name] for name, weight in self.sum.items())
-        return (self.at_least is None or total >= self.at_least) and (
-            self.at_most is None or total <= self.at_most
-        )
+        is_high = self.at_least is None or total >= self.at_least
+        return is_high & (self.at_most is None or total <= self.at_most)
 
     def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""

@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
+from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.study.marks import (
     OF_MATRIX,
     OF_SCENARIO,
@@ -28,13 +29,12 @@ from safevar_sumo.study.marks import (
     WHOLE,
     keys_with,
 )
-from safevar_sumo.study.scenario_file import MODEL, files_of_scenario, with_file
+from safevar_sumo.study.scenario_file import MODEL, WEATHER, files_of_scenario, with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     OBJECTIVES,
     PYMOO,
     Origin,
-    Parameters,
     RepairTable,
     SearchTable,
     Study,
@@ -47,6 +47,25 @@ from safevar_sumo.study.validation import convert_table
 
 SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
+
+
+ENDED_KEYS = {
+    "scenario.search": (
+        '[scenario.over] in its place; and encounters = "ranges", or --ranges, to search it'
+    ),
+    "wider": "no such key: limits are attacked in the ranges of their own study",
+    "matrix.point": "--point",
+}
+"""Keys that studies had, and what stands in their place."""
+ENDED_STUDIES = {
+    "wear_joint": "wear",
+    "wear_fleet": "wear",
+    "sun_joint": "sun",
+    "alks_joint": "alks at --point cut_in",
+    "alks_joint_cut_out": "alks at --point cut_out",
+    "alks_joint_following": "alks at --point following",
+}
+"""Shipped studies that are a part of another one now."""
 
 
 class StudyTables(NamedTuple):
@@ -80,6 +99,10 @@ def study_path(study: str) -> Path:
         raise InputError("study", f"{study!r} is a directory", legal)
     if os.path.exists(study):
         return Path(study)
+    if study in ENDED_STUDIES:
+        problem = f"{study!r} is the ranges of another study now"
+        legal = f'{ENDED_STUDIES[study]}, with --ranges or encounters = "ranges"'
+        raise InputError("study", problem, legal)
     problem = f"there is no study or file {study!r}"
     names = study_names()
     legal = f"the path of a study file (TOML), or {one_of(names)}"
@@ -91,15 +114,26 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
     of the records; `safevar_sumo.scenarios.declared.read_study` completes and checks them.
     """
     raw = _raw_study(study)
+    if "encounters" in changes:  # is another view of the study, and not another study
+        raw = raw._replace(tables={**raw.tables, "encounters": changes.pop("encounters")})
     if changes:
         arguments = ", ".join(f"{name}=..." for name in changes)
         raw = _with_overrides(raw, plain_values(changes), f"{raw.source} with {arguments}")
     with about(raw.source):
         if "origin" in raw.tables:
             raise InputError("", "origin: there is no such key")
+        _refuse_ended(raw.tables)
         tables = with_file(raw.tables, raw.origin.places)
         tables = _with_parameters(tables, "search", SearchTable)
         return raw._replace(tables=_with_parameters(tables, "repair", RepairTable))
+
+
+def _refuse_ended(tables: Tables) -> None:
+    """Refuse keys of earlier releases, with what to write instead."""
+    for key, legal in ENDED_KEYS.items():
+        table, _, name = key.rpartition(".")
+        if name in (tables.get(table) or {} if table else tables):
+            raise InputError("", f"{key} is a key of releases before 0.5", legal)
 
 
 def plain_values(value: Any) -> Any:
@@ -143,6 +177,7 @@ def checked_study(raw: StudyTables) -> Study:
 
     # Records, and what concerns several of them.
     study = convert_table(tables, Study)
+    study.check_axes(study.vehicle.characteristics)
     if study.rating.claims and not (study.matrix and study.matrix.protocol):
         raise InputError(
             "", "rating.claims: the study is not rated", "matrix.protocol, or no claims"
@@ -260,13 +295,17 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
 
 def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> StudyTables:
     """Override a study's tables, but for those that the new study does not inherit: their marks in
-    the records say when.
+    the records say when; of another weather not the axes of its parameters.
     """
     # Keys about this one study, and keys about its scenario, if the overrides name another one.
     left_out = {*keys_with(OF_STUDY, Study)}
     if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
         left_out.update(keys_with(OF_SCENARIO, Study))
     inherited = {key: value for key, value in base.tables.items() if key not in left_out}
+    scenario = inherited.get("scenario")
+    if "weather" in overrides and isinstance(scenario, dict) and "over" in scenario:
+        over = {name: axis for name, axis in scenario["over"].items() if name not in WEATHER}
+        inherited["scenario"] = {**scenario, "over": over}
     tables = _merge(inherited, overrides)
 
     # Keys about the parts of the system that differ now.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from functools import cache
 from types import UnionType
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import msgspec
 from msgspec import Meta, Struct
@@ -63,7 +63,7 @@ def with_effect(value: Any, kind: Any) -> Any:
         return {name: with_effect(inner, inner_kinds[1]) for name, inner in value.items()}
     if get_origin(kind) is list:
         return [with_effect(inner, inner_kinds[0]) for inner in value]
-    if get_origin(kind) is UnionType and isinstance(value, dict):
+    if get_origin(kind) in (Union, UnionType) and isinstance(value, dict):
         return with_effect(value, next((one for one in inner_kinds if isinstance(one, type)), None))
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return value

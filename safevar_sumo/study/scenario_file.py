@@ -24,8 +24,8 @@ from safevar_sumo.openscenario import (
     read,
     text_of,
 )
+from safevar_sumo.study.encounters import RANGES, TESTS, MatrixTest, Parameters, Weather
 from safevar_sumo.study.parameters import free_parameters
-from safevar_sumo.study.schema import MatrixTest, Parameters, Weather
 
 MODEL = "openscenario"
 """The scenario that plays a file."""
@@ -63,16 +63,13 @@ def files_of_scenario(
     # Texts alone choose files: points that differ in numbers are read once.
     points = {}
     for test in tests or (MatrixTest(name=""),):
+        lists = {name: axis.at for name, axis in test.axes.items() if axis.at}
         axes = [
             column if any(isinstance(value, str) for value in column) else column[:1]
-            for column in test.over.values()
+            for column in lists.values()
         ]
         for combination in product(*axes):
-            point = {
-                **scenario,
-                **test.parameters,
-                **dict(zip(test.over, combination, strict=True)),
-            }
+            point = {**scenario, **test.parameters, **dict(zip(lists, combination, strict=True))}
             points[frozenset(item for item in point.items() if isinstance(item[1], str))] = point
 
     # The file itself, its catalogs and its road.
@@ -96,8 +93,9 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
     """The tables of a study whose scenario names a `file`, with all that the file says in its
     place.
 
-    A range that is searched becomes its domain; what is not searched and has several values becomes
-    points of the matrix, without those that the file's constraints exclude.
+    Where encounters are ranges, an axis of [scenario.over] gets the file's range; what has several
+    values beside them becomes points of the matrix, without those that the file's constraints
+    exclude.
     """
     scenario = tables.get("scenario")
     if not isinstance(scenario, dict) or "file" not in scenario:
@@ -114,7 +112,7 @@ def with_file(tables: Raw, places: Sequence[str]) -> Parameters:
     name = scenario["file"]
     if not isinstance(name, str):
         raise InputError("", f"scenario.file = {name!r}", "a path")
-    for key in ("values", "search"):
+    for key in ("values", "over"):
         value = scenario.get(key, {})
         if not isinstance(value, dict):
             raise InputError("", f"scenario.{key} = {value!r}", "a table")
@@ -131,7 +129,8 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     offered = open_file(path)
     scenario: Parameters = tables["scenario"]
     values = scenario.get("values", {})
-    search = scenario.get("search", {})
+    is_range = tables.get("encounters", TESTS) == RANGES
+    search = scenario.get("over", {}) if is_range else {}
     for name in [*values, *(name for name in search if name not in WEATHER)]:
         if name not in offered.values:
             raise unknown_name(
@@ -155,14 +154,15 @@ def _expanded(tables: Raw, path: str, places: Sequence[str]) -> Parameters:
     parameters = {"file": _relative(offered.concrete, places), **fixed}
     if "ego" in scenario:
         parameters["ego"] = scenario["ego"]
-    kept = {key: value for key, value in scenario.items() if key not in ("file", "ego", "values")}
+    left_out = {"file", "ego", "values", *(() if is_range else ("margin",))}
+    kept = {key: value for key, value in scenario.items() if key not in left_out}
     if path != offered.concrete:
         kept["files"] = [_relative(path, places)]  # results depend on it, and a pack has it
 
     # Searched ones have domains.
     result = {
         **tables,
-        "scenario": {**kept, "model": MODEL, "parameters": parameters, "search": domains},
+        "scenario": {**kept, "model": MODEL, "parameters": parameters, "over": domains},
     }
 
     # All others are points of a matrix, if there are several.
@@ -197,10 +197,10 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
     """The domain of a searched parameter: what the study leaves out comes from the file."""
     if not isinstance(table, dict):
         raise InputError(
-            "scenario", f"scenario.search.{name} = {table!r}", "a table, which may be empty"
+            "scenario", f"scenario.over.{name} = {table!r}", "a table, which may be empty"
         )
     if name in offered.whole_numbers:
-        problem = f"scenario.search.{name}: the file declares {name} as a whole number"
+        problem = f"scenario.over.{name}: the file declares {name} as a whole number"
         raise InputError("scenario", problem, "a parameter of type double")
 
     # A number with a range, in the file or in the study.
@@ -212,7 +212,7 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
         )
     if ends is None and not {"lower", "upper"} <= table.keys():
         raise InputError(
-            "scenario", f"{name} has no range in the file", "lower and upper in [scenario.search]"
+            "scenario", f"{name} has no range in the file", "lower and upper in [scenario.over]"
         )
     lower, upper = ends or (-np.inf, np.inf)
 
@@ -229,14 +229,13 @@ def _domain(name: str, table: object, offered: Source) -> Parameters:
     # Within the file's range.
     if all(isinstance(domain[key], int | float) for key in ("lower", "upper", "original")):
         if domain["lower"] < lower or domain["upper"] > upper:
-            problem = f"scenario.search.{name}: {domain['lower']:g} to {domain['upper']:g}"
+            problem = f"scenario.over.{name}: {domain['lower']:g} to {domain['upper']:g}"
             raise InputError(
                 "scenario", problem, f"a part of the file's range, {lower:g} to {upper:g}"
             )
         if not domain["lower"] <= domain["original"] <= domain["upper"]:
             problem = (
-                f"scenario.search.{name}: the file's value {domain['original']:g} is not in its"
-                " range"
+                f"scenario.over.{name}: the file's value {domain['original']:g} is not in its range"
             )
             raise InputError(
                 "scenario",
@@ -312,7 +311,10 @@ def _too_many(rest: Source, total: int) -> InputError:
     sizes = ", ".join(
         f"{' and '.join(choice.names)} ({len(choice.sets)})" for choice in rest.choices
     )
-    legal = "parameters under [scenario.search] or [scenario.values], so that fewer are left"
+    legal = (
+        "parameters under [scenario.over], with encounters = 'ranges', or [scenario.values], so"
+        " that fewer are left"
+    )
     return InputError(
         "scenario", f"{total:,} combinations of {sizes}; at most {MOST_POINTS:,}", legal
     )

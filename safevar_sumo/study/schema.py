@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -19,12 +20,12 @@ from safevar_sumo.study.characteristics import (
     Limit,
     PositiveNumber,
     UnmeasuredValue,
-    check_constraints,
     check_limits,
     check_unmeasured,
     check_variation,
     mistake,
 )
+from safevar_sumo.study.encounters import Encounters, MatrixTest, ModelTable, Parameters
 from safevar_sumo.study.marks import (
     OF_MATRIX,
     OF_SCENARIO,
@@ -38,15 +39,10 @@ from safevar_sumo.study.marks import (
     Table,
     fields_of,
 )
-from safevar_sumo.study.parameters import FreeParameter, searched
+from safevar_sumo.study.parameters import FreeParameter
 
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
-WORST = "worst"
-"""The aggregate of a matrix by which the least safety degree decides."""
-BY_EXCESS = "impact_excess >"
-"""The aggregate of a matrix in which impacts may be allowed."""
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Parameters = dict[str, Any]
 Tables = Mapping[str, Any]
 """A study's tables, as in a file."""
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
@@ -61,63 +57,11 @@ SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
 SAFETY_DEGREE: Final = "safety_degree"
 """Column and key of the safety degree."""
 ORIGINAL_DEGREE: Final = "original_safety_degree"
-"""Column of the original vehicle's safety degree in the same encounter, in a study that searches
-its scenario.
+"""Column of the original vehicle's safety degree in the same encounter, where encounters are
+ranges.
 """
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 """Objectives of the published study."""
-
-
-class ModelTable(Table, frozen=True, kw_only=True):
-    """A `model` by its name, or by `package.module:Name`, and its `parameters`.
-
-    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu`
-    is an FMU, named by its path: `inputs` and `outputs` are the FMU's variables by the quantity
-    they receive or return. `files` are data files, or folders of them, that a model of your own
-    reads, relative to the study's file.
-    """
-
-    model: str
-    parameters: Parameters = {}
-    kind: Literal["", "traci", "fmu"] = ""
-    inputs: dict[str, str] = {}
-    outputs: dict[str, str] = {}
-    files: list[str] = []
-
-    def __post_init__(self) -> None:
-        if self.kind != "fmu" and (self.inputs or self.outputs):
-            raise mistake(
-                f"{self.model!r} is no FMU, but has inputs or outputs",
-                'kind = "fmu", or no such keys',
-            )
-
-
-ORIGINAL_MARGIN = 0.3
-"""Distance that the original vehicle must keep in an encounter that is searched, unless the study
-says another [m].
-"""
-
-
-class ScenarioTable(ModelTable, frozen=True, kw_only=True):
-    """The scenario: its `model` and `parameters`; and those of its parameters, and of the
-    weather's, that are searched together with the vehicle, under `search` by name.
-
-    The original vehicle drives in the same encounter as each variant, and must keep at least
-    `margin` [m] between bodies there: otherwise the encounter does not count, as it shows nothing
-    of the variant. A simulator of the user's own that is not deterministic simulates each setting
-    `repeats` times: the share of unsafe runs, the worst run, and means of metrics count.
-    """
-
-    search: Annotated[dict[str, Domain], ORDERED] = {}
-    margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
-    repeats: Annotated[int, Meta(ge=1, le=1000)] = 1
-
-    def __post_init__(self) -> None:
-        if self.margin != ORIGINAL_MARGIN and not self.search:
-            raise mistake(
-                f"margin = {self.margin:g}, and nothing is searched",
-                "a table search beside it, or no margin",
-            )
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):
@@ -132,36 +76,6 @@ class VehicleTable(Table, frozen=True, kw_only=True):
     characteristics: Annotated[dict[str, CharacteristicTable], ORDERED]
     parameters: Parameters = {}
     files: list[str] = []
-
-
-class Weather(Table, frozen=True, kw_only=True):
-    """Weather as data: its `name`, and its effects on the road and on the sensors.
-
-    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its
-    depth on the road [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as
-    the grip of the same road when dry. `recognition_delay` is the additional time that the sensors
-    need to recognise a road user [s], for every ADS; the reaction time of an ADS is one of its
-    parameters. `light` decides only whether a rating darkens the weather for its tests by night.
-    """
-
-    name: str
-    road_friction: Annotated[
-        float,
-        Meta(gt=0, le=1.5),
-        searched(0.1, 1.2, "-", "road friction, factor on the tyres' friction"),
-    ]
-    visibility: Annotated[
-        float,
-        Meta(gt=0, le=1.5),
-        searched(0.05, 1.5, "-", "visibility, factor on the range of the sensors"),
-    ]
-    recognition_delay: Annotated[
-        float,
-        Meta(ge=0, le=5),
-        searched(0.0, 2.0, "s", "additional time that the sensors need in this weather"),
-    ] = 0.0
-    light: Literal["day", "night"] = "day"
-    water: Annotated[float, Meta(ge=0, le=20)] = 0.0
 
 
 class MetricsTable(Table, frozen=True, kw_only=True):
@@ -226,57 +140,12 @@ def label_of(algorithm: str) -> str:
     )
 
 
-class MatrixTest(Table, frozen=True, kw_only=True):
-    """A test of a matrix: its `name`, and a scenario at every combination of the values in `over`,
-    in each of the `weathers`.
-
-    `parameters` are added to those of the study's scenario; a test with a `model` of its own has
-    only its own parameters. A weather is a name or a table. An impact is allowed up to a relative
-    speed of `allowed_impact_speed` [km/h], by which the metric `impact_excess` counts.
-    """
-
-    name: Annotated[str, Meta(min_length=1)]
-    model: str = ""
-    parameters: Parameters = {}
-    over: Annotated[dict[str, Annotated[list[Any], Meta(min_length=1)]], ORDERED] = {}
-    weathers: list[str | Weather] = []
-    allowed_impact_speed: Annotated[float, Meta(ge=0, le=250)] = 0.0
-
-    def __post_init__(self) -> None:
-        for name in self.parameters.keys() & self.over.keys():
-            raise mistake(f"{name} is in parameters and in over", "one of them")
-
-
 class RatingTable(Table, frozen=True, kw_only=True):
     """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be
     simulated here, such as glare.
     """
 
     claims: dict[str, list[str]] = {}
-
-
-class MatrixTable(Table, frozen=True, kw_only=True):
-    """The test points at which every setting is simulated: those of `tests`, or all cells of a
-    `protocol`, which then rates every setting.
-
-    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree,
-    `drac >` at that with the largest value of this metric, `ttc_min <` with the smallest. With a
-    `point`, by its name, only this one is simulated, and nothing is rated.
-    """
-
-    tests: list[MatrixTest] = []
-    protocol: Literal["", "euro_ncap_2026"] = ""
-    point: str = ""
-    aggregate: Annotated[str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")] = WORST
-
-    def __post_init__(self) -> None:
-        if bool(self.tests) == bool(self.protocol):
-            raise mistake(
-                f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
-            )
-        if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
-            problem = f"aggregate = {self.aggregate!r}, and a test allows an impact"
-            raise mistake(problem, f"{BY_EXCESS!r}, or no allowed_impact_speed")
 
 
 class UnsafeTable(Table, frozen=True, kw_only=True):
@@ -307,18 +176,22 @@ class Origin(Table, frozen=True, kw_only=True):
     """Where a study comes from; results do not depend on it.
 
     `called` is the study's path as given on the command line, empty if the study was given by its
-    name; `point` is the point of the matrix to which the study was reduced, empty for a whole
-    study; `places` are the folders of its file and of the files that it extends, where user code is
-    looked up first; `files` are those of these files that are not shipped.
+    name; `point` is the test, or the point of the matrix, to which the study was reduced, empty for
+    a whole study, `ranges` whether its encounters are ranges by the option of this name, and
+    `up_to` where they end by that option; `places` are the folders of its file and of the files
+    that it extends, where user code is looked up first; `files` are those of these files that are
+    not shipped.
     """
 
     called: str = ""
     point: str = ""
+    ranges: bool = False
+    up_to: str = ""
     places: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
 
 
-class Study(Table, frozen=True, kw_only=True):
+class Study(Encounters, frozen=True, kw_only=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
     `title` is its heading, `weather` a shipped weather by its name, or a table; `matrix` are the
@@ -335,20 +208,17 @@ class Study(Table, frozen=True, kw_only=True):
     are the values, by name, up to which characteristics may wear in service; `unmeasured` are the
     values, by name, of characteristics that were not measured in a vehicle, each a number or a
     table: a study that extends this one does not inherit them; `repair` states what a repair of the
-    ADS may change; `wider` names a study of the same vehicle in a wider scope, in which limits are
-    tried as well; `unsafe` is what the study calls so.
+    ADS may change; `encounters` says what vehicles meet: the listed `tests`, or with `ranges` any
+    encounter in the ranges of the axes, beside the vehicle; `unsafe` is what the study calls so.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
     name: Name
     title: Annotated[str, WITHOUT_EFFECT, OF_SYSTEM]
-    scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
-    weather: Annotated[str | Weather, PART_OF_SYSTEM] = ""
     vehicle: Annotated[VehicleTable, PART_OF_SYSTEM]
     ads: Annotated[ModelTable, PART_OF_SYSTEM] = ModelTable(model="")
     metrics: MetricsTable
     search: SearchTable
-    matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None
     rating: Annotated[RatingTable, OF_SCENARIO, OF_MATRIX] = RatingTable()
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: Annotated[dict[str, float], WITHOUT_EFFECT, OF_SYSTEM, WHOLE] = {}
@@ -361,11 +231,9 @@ class Study(Table, frozen=True, kw_only=True):
     ] = {}
     variation: Annotated[dict[str, Distribution], WITHOUT_EFFECT] = {}
     correlations: Annotated[list[Correlation], WITHOUT_EFFECT] = []
-    constraints: list[Constraint] = []
     limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
     unmeasured: Annotated[dict[str, float | UnmeasuredValue], WITHOUT_EFFECT, OF_STUDY] = {}
     repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
-    wider: Annotated[str, WITHOUT_EFFECT, OF_STUDY] = ""
     unsafe: Annotated[UnsafeTable, WITHOUT_EFFECT] = UnsafeTable()
     origin: Origin = Origin()
 
@@ -377,9 +245,7 @@ class Study(Table, frozen=True, kw_only=True):
             raise InputError(
                 "", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU"
             )
-        self._check_search()
         check_variation(self.domains, self.variation, self.correlations)
-        check_constraints(self.domains, self.constraints)
         check_limits(rows, self.limits, table="limits.")
         check_unmeasured(rows, self.unmeasured_values)
         if len({len(values) for values in self.spread.values()}) > 1 or not all(
@@ -390,35 +256,23 @@ class Study(Table, frozen=True, kw_only=True):
         if 0 in self.published.values():
             raise InputError("", f"published = {self.published}", "numbers other than 0")
 
-    def _check_search(self) -> None:
-        """Refuse searched parameters that something else sets, too."""
-        # Neither a protocol, nor a characteristic, nor a fixed value, nor a test.
-        tests = [] if self.matrix is None else self.matrix.tests
-        for name in self.scenario.search:
-            key = f"scenario.search.{name}"
-            if self.matrix is not None and self.matrix.protocol:
-                raise InputError(
-                    "", f"{key}: the cells of {self.matrix.protocol} are fixed", "matrix.tests"
-                )
-            if name in self.vehicle.characteristics:
-                raise InputError(
-                    "", f"{key}: a characteristic of the vehicle has this name", "a unique name"
-                )
-            if name in self.scenario.parameters:
-                value = self.scenario.parameters[name]
-                legal = "one of the two: a value, or a domain"
-                raise InputError(
-                    "", f"{key}: scenario.parameters.{name} = {value!r} fixes it", legal
-                )
-            for test in tests:
-                if name in (*test.parameters, *test.over):
-                    problem = f"{key}: test {test.name!r} of the matrix sets {name}, too"
-                    raise InputError("", problem, "a domain, or values in the tests")
+    @property
+    def shared_constraints(self) -> list[Constraint]:
+        """The constraints that every setting has to satisfy: those that concern all tests, and no
+        parameter that a setting does not have.
+        """
+        tests = {"" if test is None else test.name for test, _ in self._axes_by_test}
+        known = self.domains.keys()
+        return [
+            constraint
+            for constraint in self.constraints
+            if constraint.sum.keys() <= known and tests <= {*(constraint.tests or tests)}
+        ]
 
     @property
     def domains(self) -> dict[str, Domain]:
-        """What a search varies: the vehicle's characteristics, then parameters of the scenario."""
-        return {**self.vehicle.characteristics, **self.scenario.search}
+        """What a search varies: the vehicle's characteristics, then parameters of encounters."""
+        return {**self.vehicle.characteristics, **self.ranges}
 
     @property
     def unmeasured_values(self) -> dict[str, float]:
@@ -432,6 +286,14 @@ class Study(Table, frozen=True, kw_only=True):
     def source(self) -> str:
         """The study's name in errors: its file, or its own name if it has no file."""
         return self.origin.called or f"study {self.name!r}"
+
+    @property
+    def words(self) -> str:
+        """How a command line names the study, at the point to which it was reduced."""
+        point = f" --point {quote(self.origin.point)}" if self.origin.point else ""
+        ranges = " --ranges" if self.origin.ranges else ""
+        up_to = f" --up-to {quote(self.origin.up_to)}" if self.origin.up_to else ""
+        return f"{quote(self.origin.called or self.name)}{ranges}{point}{up_to}"
 
 
 def tables_of(study: Study) -> Parameters:

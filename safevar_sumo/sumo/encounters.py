@@ -1,5 +1,5 @@
-"""Encounters of a study that searches its scenario: each setting has values of its own for some
-parameters of scenario and weather.
+"""Encounters: those of a test that each setting has, in ranges of parameters of scenario and
+weather, and the worst of those that it meets.
 
 A scenario whose parameters are arrays of N values stands for N scenarios. Its scene is a recorded
 one, in which each vehicle starts elsewhere and meets a target that moves otherwise
@@ -8,15 +8,17 @@ one, in which each vehicle starts elsewhere and meets a target that moves otherw
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.records import Quantity
+from safevar_sumo.metrics import IMPACT_EXCESS
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, Outcome, Quantity
 from safevar_sumo.scenarios import (
     VUT,
     WEATHER_PARAMETERS,
@@ -27,22 +29,26 @@ from safevar_sumo.scenarios import (
     searchable_in,
 )
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.study import PHASE, Study, unit_text
+from safevar_sumo.study import PHASE, WORST, Domain, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
 
+if TYPE_CHECKING:
+    from safevar_sumo.sumo.system import System
+
 
 def check_domains(study: Study, points: tuple[Point, ...]) -> None:
-    """Refuse a searched parameter that a scenario of the study does not have or in which weathers
-    of its matrix differ, a domain that is wider than the scenario's, and domains in which an
-    encounter is impossible.
+    """Refuse a range of a parameter that a test's scenario does not have or in which its weathers
+    differ, a range that is wider than the scenario's, and ranges in which an encounter is
+    impossible.
     """
-    # What the scenarios at all points let vary, in their units and domains.
+    # What the scenarios at all points let vary, in their units and ranges.
     for point in points:
         legal = searchable_in(point.scenario)
-        for name, domain in study.scenario.search.items():
-            key = f"scenario.search.{name}"
+        own = study.ranges if point.ranges is None else point.ranges
+        for name, domain in own.items():
+            key = f"over.{name}"
             where = f"{key}: {point.name} of [matrix]: " if point.name else f"{key}: "
             problem = f"{where}{type(point.scenario).__name__} has no such parameter to search"
             check_name("", problem, name, legal)
@@ -59,41 +65,44 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 problem = (
                     f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
                 )
-                raise InputError("", problem, "a domain, or values in the weathers")
+                raise InputError("", problem, "a range, or values in the weathers")
+        _check_corners(study, point, own)
 
-    # An encounter at every corner of the domains is possible.
-    ends = [(domain.lower, domain.upper) for domain in study.scenario.search.values()]
-    corners = [dict(zip(study.scenario.search, corner, strict=True)) for corner in product(*ends)]
-    corners = [
-        corner
-        for corner in corners
-        if all(constraint.allows(corner) for constraint in study.constraints)
-    ]
-    for point in points:
-        try:
-            scenarios = [encounter(point, corner).scenario for corner in corners]
-            if not isinstance(scenarios[0], Simulator):
-                networks_for(scenarios)
-            for scenario in scenarios:
-                if isinstance(scenario, TrackScenario):
-                    scenario.tracks(np.zeros((1, 1)))
-        except InputError as error:
-            raise InputError(
-                "", f"scenario.search: {error.problem}", error.legal or "narrower domains"
-            ) from None
+
+def _check_corners(study: Study, point: Point, own: Mapping[str, Domain]) -> None:
+    """Refuse ranges of a point in which the encounter at a corner is impossible."""
+    ends = [(domain.lower, domain.upper) for domain in own.values()]
+    corners = [dict(zip(own, corner, strict=True)) for corner in product(*ends)]
+    constraints = (*study.shared_constraints, *point.constraints)
+    corners = [corner for corner in corners if all(one.allows(corner) for one in constraints)]
+    try:
+        scenarios = [encounter(point, corner).scenario for corner in corners]
+        if scenarios and not isinstance(scenarios[0], Simulator):
+            networks_for(scenarios)
+        for scenario in scenarios:
+            if isinstance(scenario, TrackScenario):
+                scenario.tracks(np.zeros((1, 1)))
+    except InputError as error:
+        raise InputError("", f"over: {error.problem}", error.legal or "narrower ranges") from None
 
 
 def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
-    """A point at other values of parameters, numbers, or arrays for N vehicles; its scenario is the
-    same object if only weather and phase vary.
+    """A point at other values of its own parameters, numbers, or arrays for N vehicles; its
+    scenario is the same object if only weather and phase vary.
     """
-    values = dict(values)
+    values = point.own(values)
     phase = values.pop(PHASE, point.phase) if point.scenario.has_phase else point.phase
     of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
     of_scenario = {name: value for name, value in values.items() if name not in of_weather}
     weather = replace_fields(point.weather, **of_weather)
     scenario = point.scenario.at(of_scenario) if of_scenario else point.scenario
     return point._replace(scenario=scenario, weather=weather, phase=phase)
+
+
+def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
+    """A point at the original values of its own ranges, or of all."""
+    own = ranges if point.ranges is None else point.ranges
+    return encounter(point, {name: domain.original for name, domain in own.items()})
 
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:
@@ -127,3 +136,70 @@ def _extended(track: Film, samples: int) -> Film:
     """The track of an actor who stands, for at least this number of samples."""
     missing = max(samples - len(track.motion), 0)
     return track._replace(motion=np.pad(track.motion, ((0, missing), (0, 0)), mode="edge"))
+
+
+def where_met(system: System, setting: FloatArray) -> System:
+    """The system at the points whose encounters a setting, shape (n,), meets.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    settings = setting[np.newaxis]
+    matrix = tuple(point for point in system.matrix if met_at(point, system, settings).all())
+    if system.matrix and not matrix:
+        problem = f"no test has the encounter of {system.characteristics.options(setting)}"
+        raise InputError(system.source, problem, "values in the ranges of one test")
+    return replace(system, matrix=matrix)
+
+
+def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
+    """Which of N settings have an encounter of a point, shape (N,); beyond the ranges of the study
+    those that have one at their ends.
+    """
+    members = system.characteristics.scenario
+    encounters = np.clip(system.cut(settings)[1], members.lower, members.upper)
+    met = point.meets(members.columns(encounters)) if len(members) else True
+    return np.broadcast_to(met, len(settings))
+
+
+def in_place_of_unmet(
+    point: Point, system: System, settings: FloatArray, met: BoolArray
+) -> FloatArray:
+    """Settings, of which those that have no encounter of a point stand in its original one."""
+    members = system.characteristics
+    own = {name: domain.original for name, domain in (point.ranges or {}).items()}
+    original = np.array([own.get(item.name, item.original) for item in members])
+    return np.where(met[:, np.newaxis] | members.of_vehicle, settings, original)
+
+
+def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
+    """The number of each setting's worst point; `at_points` are the evaluations of the settings at
+    all points.
+
+    It is the point with the least safety degree, or for a setting that collides nowhere the one
+    that is worst by the measure of the study's matrix; of equal points, the first by name. A
+    collision in a valid test always counts. Without a collision, a point with an invalid test
+    counts as the worst, because such a test leaves open whether the setting is safe.
+    """
+    # In the order of names, so that ties do not depend on the order of the file.
+    order = np.argsort([point.name for point in system.points])
+    in_order = [at_points[k] for k in order]
+    safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
+    safety_degrees[np.isnan(safety_degrees)] = np.inf
+    is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
+    has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
+    values = safety_degrees
+
+    # By another measure, collisions first.
+    if system.aggregate != WORST:
+        name, direction = system.aggregate.split()  # such as "drac >"
+        measures = np.stack([evaluations.column(name) for evaluations in in_order])
+        measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
+        # An impact may be allowed: then the measure says how bad a collision is.
+        values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
+
+    # An invalid test counts as worst, unless something collides.
+    values[is_invalid & ~has_collided] = -np.inf
+    return np.asarray(order[np.argmin(values, axis=0)])

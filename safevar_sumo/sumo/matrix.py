@@ -6,14 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace as replace_in
 
-from safevar_sumo.errors import InputError, UserCodeError, check_text
-from safevar_sumo.metrics import IMPACT_EXCESS, METRICS, RATING_POINTS, STOPPING_DISTANCE
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.metrics import METRICS, RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import (
     Evaluations,
@@ -26,11 +24,12 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
-from safevar_sumo.study import OBJECTIVES, ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, WORST, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
 from safevar_sumo.sumo.batch import drive_all, needs_no_sumo, score
+from safevar_sumo.sumo.encounters import in_place_of_unmet, met_at, worst_points
 from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 
 MAX_COPIES = 200
 """Largest number of copies of a network in one simulation; with more, the processor's caches
@@ -47,8 +46,6 @@ MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and
 gigabytes.
 """
-N_SIMILAR_POINTS = 4
-"""Number of similar points that the error about an unknown point lists."""
 
 
 class PointResult(NamedTuple):
@@ -298,8 +295,13 @@ def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Ite
     if needs_no_sumo(system, engine) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
-        runs = drive_all(replace(system, matrix=points), settings, engine)
+        here = replace(system, matrix=points)
+        met = met_at(points[0], system, settings)
+        vehicles = settings if met.all() else in_place_of_unmet(points[0], system, settings, met)
+        runs = drive_all(here, vehicles, engine)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
+        if not met.all():
+            evaluations = evaluations.where(met, Outcome.INFEASIBLE)
         for point, start in zip(points, range(0, len(points) * n, n), strict=True):
             rows = slice(start, start + n)
             yield PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(rows))
@@ -311,33 +313,6 @@ def worst_point(system: System, setting: FloatArray) -> Point:
         return system.points[0]
     at_points = [result.evaluations for result in simulate_all_points(system, setting[np.newaxis])]
     return system.points[int(worst_points(system, at_points)[0])]
-
-
-def at_point(study: Study, name: str) -> Study:
-    """The study at a named point of its matrix alone.
-
-    Raises
-    ------
-    InputError
-        If no point has this name.
-    """
-    # A point of the matrix by its name.
-    check_text("point", name)
-    points = [point.name for point in assemble(study).matrix]
-    if study.matrix is None or name not in points:
-        similar = [point for point in points if name in point] or get_close_matches(
-            name, points, N_SIMILAR_POINTS, 0
-        )
-        legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-        raise InputError("point", repr(name), legal if points else "a study with a matrix")
-
-    # The study at this point alone.
-    search = study.search
-    if study.matrix.protocol:  # one point has no rating points to search by
-        search = replace_in(search, objectives=[*OBJECTIVES])
-    matrix = replace_in(study.matrix, point=name)  # decides what is simulated
-    origin = replace_in(study.origin, point=name)  # is what commands name
-    return replace_in(study, matrix=matrix, origin=origin, search=search)
 
 
 def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
@@ -366,34 +341,3 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
         group.sort(key=lambda point: point.scenario.duration)
         for start in range(0, len(group), size):
             yield tuple(group[start : start + size])
-
-
-def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
-    """The number of each setting's worst point; `at_points` are the evaluations of the settings at
-    all points.
-
-    It is the point with the least safety degree, or for a setting that collides nowhere the one
-    that is worst by the measure of the study's matrix; of equal points, the first by name. A
-    collision in a valid test always counts. Without a collision, a point with an invalid test
-    counts as the worst, because such a test leaves open whether the setting is safe.
-    """
-    # In the order of names, so that ties do not depend on the order of the file.
-    order = np.argsort([point.name for point in system.points])
-    in_order = [at_points[k] for k in order]
-    safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
-    safety_degrees[np.isnan(safety_degrees)] = np.inf
-    is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
-    has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
-    values = safety_degrees
-
-    # By another measure, collisions first.
-    if system.aggregate != WORST:
-        name, direction = system.aggregate.split()  # such as "drac >"
-        measures = np.stack([evaluations.column(name) for evaluations in in_order])
-        measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
-        # An impact may be allowed: then the measure says how bad a collision is.
-        values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
-
-    # An invalid test counts as worst, unless something collides.
-    values[is_invalid & ~has_collided] = -np.inf
-    return np.asarray(order[np.argmin(values, axis=0)])

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
-from safevar_sumo.errors import InputError, about, check_name, subject
+from safevar_sumo.errors import InputError, about, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
 from safevar_sumo.records import KMH_PER_MS
@@ -30,7 +30,14 @@ from safevar_sumo.scenarios import (
 )
 from safevar_sumo.scenarios.base import check_fields
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
-from safevar_sumo.study import MatrixTest, ModelTable, Study, VehicleTable, user_code_names
+from safevar_sumo.study import (
+    Constraint,
+    MatrixTest,
+    ModelTable,
+    Study,
+    VehicleTable,
+    user_code_names,
+)
 from safevar_sumo.sumo.network import is_network, is_shipped
 from safevar_sumo.sumo.simulated_study import check_tables
 from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
@@ -99,39 +106,62 @@ def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
     # The points of each test.
     points: list[Point] = []
+    shared = study.shared_constraints
+    constraints = [one for one in study.constraints if one not in shared]
     for test in () if study.matrix is None else study.matrix.tests:
         with about(f"{subject()}: test {test.name!r}"):
-            points += _points_of(test, study, lookup)
+            points += _points_of(test, study, constraints, lookup)
 
-    # Each with a name of its own, of which a study may have only one.
+    # Each with a name of its own.
     for name, count in Counter(point.name for point in points).items():
         if count > 1:
             legal = "unique names of tests, and each value once"
             raise InputError("", f"matrix.tests: {count} points are {name!r}", legal)
-    if study.matrix is None or not study.matrix.point:
-        return tuple(points)
-    by_name = {point.name: point for point in points}
-    check_name("", f"matrix.point = {study.matrix.point!r}", study.matrix.point, by_name)
-    return (by_name[study.matrix.point],)
+    return tuple(points)
 
 
-def _points_of(test: MatrixTest, study: Study, lookup: Lookup) -> Iterator[Point]:
-    """The points of a test of the study's matrix."""
+def _points_of(
+    test: MatrixTest, study: Study, of_tests: Sequence[Constraint], lookup: Lookup
+) -> Iterator[Point]:
+    """The points of a test of the study's matrix; `of_tests` are constraints that not every setting
+    has to satisfy.
+    """
     model = test.model or study.scenario.model
     shared = study.scenario.parameters if model == study.scenario.model else {}
-    for values in product(*test.over.values()):
-        over = dict(zip(test.over, values, strict=True))
+    lists, ranges = study.lists_of(test), study.ranges_of(test)
+    constraints = tuple(one for one in of_tests if test.name in (one.tests or [test.name]))
+    for values in product(*lists.values()):
+        over = dict(zip(lists, values, strict=True))
         table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
         scenario = create_scenario(table, lookup)
-        if not study.scenario.search:
+        if not ranges:
             scenario.check()
+        _check_listed({**table.parameters, **dict.fromkeys(ranges, None)}, constraints)
         for weather in map(weather_of, test.weathers or [study.weather]):
             words = [test.name, *(f"{key} {value}" for key, value in over.items())]
             words += [] if isinstance(scenario, Simulator) else [weather.name]
             name = ", ".join(words)
             parameters = {"test": test.name, **over, "weather": weather.name}
             allowed = test.allowed_impact_speed / KMH_PER_MS
-            yield Point(scenario, weather, name, tuple(parameters.items()), allowed)
+            yield Point(
+                scenario=scenario,
+                weather=weather,
+                name=name,
+                parameters=tuple(parameters.items()),
+                allowed_impact_speed=allowed,
+                ranges=ranges,
+                constraints=constraints if ranges else (),
+            )
+
+
+def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) -> None:
+    """Refuse a listed encounter that violates a constraint."""
+    known = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    for constraint in constraints:
+        if not constraint.allows(known):
+            where = ", ".join(f"{name} = {known[name]:g}" for name in constraint.sum)
+            problem = f"{where} violates the constraint of {constraint.quantity}"
+            raise InputError("", problem, "encounters that the constraints allow")
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:

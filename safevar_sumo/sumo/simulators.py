@@ -213,7 +213,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
 
 def simulations_of_setting(system: System) -> int:
     """How many simulations a setting takes: at each point, as often as it is repeated, and beside
-    the original vehicle in a study that searches its scenario.
+    the original vehicle where encounters are ranges.
     """
     has_pairs = len(system.characteristics.scenario) > 0
     return len(system.points) * system.repeats * (1 + has_pairs)

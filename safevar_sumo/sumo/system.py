@@ -4,7 +4,7 @@ other.
 
 from __future__ import annotations
 
-import shlex
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -29,10 +29,11 @@ from safevar_sumo.scenarios import (
     weather_of,
 )
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WORST, MetricsTable, Study, Weather
+from safevar_sumo.study import WORST, Domain, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
-from safevar_sumo.sumo.encounters import check_domains, encounter
+from safevar_sumo.sumo.encounters import check_domains, encounter, original_encounter
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of, own_criterion
 from safevar_sumo.sumo.models import create_driven, create_scenario, matrix_points
@@ -80,7 +81,7 @@ class System:
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - `allowed_impact_speed` [m/s] and `phase` are those of the only point; see `Point`.
+    - `allowed_impact_speed` [m/s], `phase` and `ranges` are those of the only point; see `Point`.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `criterion` is the study's own.
     - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
@@ -106,6 +107,7 @@ class System:
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
+    ranges: Mapping[str, Domain] | None = None
     repeats: int = 1
     command: str = ""
     skips_failed: bool = False
@@ -123,6 +125,7 @@ class System:
             self.weather,
             allowed_impact_speed=self.allowed_impact_speed,
             phase=self.phase,
+            ranges=self.ranges,
         )
         return (only,)
 
@@ -184,7 +187,7 @@ class System:
     def at_encounters(self, encounters: FloatArray) -> System:
         """The system at encounters, shape (N, n - k): its only point, with arrays as the parameters
         that the study searches, or several points if that is the phase alone; the system itself if
-        it searches none.
+        it has none.
         """
         if not encounters.shape[1]:
             return self
@@ -201,6 +204,7 @@ class System:
             weather=point.weather,
             allowed_impact_speed=point.allowed_impact_speed,
             phase=point.phase,
+            ranges=point.ranges,
             matrix=(),
             rater=None,
         )
@@ -307,9 +311,7 @@ def simulate_command(study: Study) -> str:
     """The command that simulates the original vehicle of a study, at the only point to which it was
     reduced.
     """
-    origin = study.origin
-    point = f" --point {shlex.quote(origin.point)}" if origin.point else ""
-    return f"{PROGRAM_COMMAND} simulate {shlex.quote(origin.called or study.name)}{point}"
+    return f"{PROGRAM_COMMAND} simulate {study.words}"
 
 
 def assemble(study: Study) -> System:
@@ -331,6 +333,18 @@ def _check_speed(scenario: Scenario, nominal: Nominal) -> None:
     if speed > highest:
         problem = f"Ego drives at {speed:.1f} m/s, faster than the study's vehicle can"
         raise InputError("", problem, f"at most {highest:.1f} m/s, or another vehicle")
+
+
+def _original_points(study: Study, lookup: Lookup, only: Point) -> tuple[Point, ...]:
+    """The points in the original encounter, where encounters are ranges; `only` is the one without
+    a matrix. Ranges have to be possible, also where listed encounters alone are met.
+    """
+    in_ranges = with_ranges(study) if study.states_ranges else study
+    points = matrix_points(in_ranges, lookup) or (only,) if in_ranges.ranges else ()
+    check_domains(in_ranges, points)
+    if not study.ranges:
+        return ()
+    return tuple(original_encounter(point, study.ranges) for point in points)
 
 
 def _assemble(study: Study) -> System:
@@ -355,16 +369,13 @@ def _assemble(study: Study) -> System:
     for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
         if network:
             check_network(network)
-    if not (matrix or study.scenario.search):
+    if not (matrix or study.ranges):
         scenario.check()
 
-    # In a study that searches its scenario, the points are the original encounter.
-    if study.scenario.search:
-        points = matrix or (Point(scenario, weather),)
-        check_domains(study, points)
-        original = {name: domain.original for name, domain in study.scenario.search.items()}
-        scenario, weather, *_ = encounter(points[0], original)
-        matrix = tuple(encounter(point, original) for point in matrix)
+    points = _original_points(study, lookup, Point(scenario, weather))
+    if points:
+        scenario, weather, *_ = points[0]
+        matrix = points if matrix else ()
 
     # What the driving system knows of the original vehicle.
     region = region_of(study)
@@ -394,7 +405,7 @@ def _assemble(study: Study) -> System:
         criterion=own_criterion(study),
         skips_failed=study.search.failed == "skip",
     )
-    if not study.scenario.search:
+    if not study.ranges:
         return system
 
     # An encounter counts only if the original vehicle keeps the margin there.

@@ -16,6 +16,7 @@ from safevar_sumo.records import ROUNDING, FloatArray, IntArray, Outcome, Simula
 from safevar_sumo.sumo.batch import drive_all, observer_of, open_points_world, traffic_of
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
+from safevar_sumo.sumo.encounters import met_at
 from safevar_sumo.sumo.engine import Engine, Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size
 from safevar_sumo.sumo.system import System
@@ -97,7 +98,8 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     size = batch_size(system, Engine.RECORDED)
     for number in np.union1d(worst, other):
         at_point = system.at(points[number])
-        of_point = settings[(worst == number) | (other == number)]
+        is_here = (worst == number) | (other == number)
+        of_point = settings[is_here & met_at(points[number], system, settings)]
         for start in range(0, len(of_point), size):
             batch = of_point[start : start + size]
             try:

@@ -207,9 +207,7 @@ class CharacteristicSet:
         return cls(
             tuple(
                 Characteristic(
-                    name=name,
-                    is_scenario=name in study.scenario.search,
-                    **msgspec.structs.asdict(row),
+                    name=name, is_scenario=name in study.ranges, **msgspec.structs.asdict(row)
                 )
                 for name, row in study.domains.items()
             )
@@ -249,6 +247,12 @@ class CharacteristicSet:
     def of_vehicle(self) -> BoolArray:
         """Which members are the vehicle's, shape (n,)."""
         return np.array([not member.is_scenario for member in self.members], dtype=bool)
+
+    def of_others(self, others: CharacteristicSet, settings: FloatArray) -> FloatArray:
+        """Settings of other characteristics, shape (N, m), with those of this set alone, shape
+        (N, n).
+        """
+        return np.asarray(settings[:, [others.names.index(name) for name in self.names]])
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
         """The original vehicle in the encounters of settings, shape (N, n)."""

@@ -175,7 +175,7 @@ def region_of(study: Study) -> FeasibleRegion:
     """
     characteristics = CharacteristicSet.of(study)
     bounds = tuple(
-        _Bounds.of(constraint, study, characteristics) for constraint in study.constraints
+        _Bounds.of(constraint, study, characteristics) for constraint in study.shared_constraints
     )
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:

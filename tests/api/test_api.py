@@ -16,6 +16,7 @@ from pandas.testing import assert_frame_equal
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.study import tables_of
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -114,8 +115,8 @@ def test_a_value_that_is_missing_is_the_originals() -> None:
 
 
 def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() -> None:
-    study = sv.load_study(
-        "euro_ncap_car_to_car", matrix={"point": "CCRm, speed 80, impact_location 50, clear"}
+    study = at_point(
+        sv.load_study("euro_ncap_car_to_car"), "CCRm, speed 80, impact_location 50, clear"
     )
     one = sv.simulate(study, {"tireFric": 1.0})
     closing, own = -one.metrics["safety_degree"], one.collision_speed
@@ -137,7 +138,7 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
         assert vehicle.trace["speed [m/s]"].to_numpy() == pytest.approx(
             comparison.runs.trace.speed[: comparison.moments[row].end + 1, row], abs=0
         )
-    alone = sv.simulate(sv.load_study("wear", matrix={"point": name}), {"brakeTorque": 0.6})
+    alone = sv.simulate(at_point(sv.load_study("wear"), name), {"brakeTorque": 0.6})
     assert (alone.original.numbers, alone.numbers) == (one.original.numbers, one.numbers)
     assert_frame_equal(alone.trace, one.trace)
 

@@ -31,9 +31,9 @@ from safevar_sumo.errors import (
     SimulationError,
     UserCodeError,
 )
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study
-from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import SUN, evaluated

@@ -141,7 +141,9 @@ def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
 @SLOW
 def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
     """Half of its domain has encounters that cannot be driven."""
-    assert run("study", "alks_joint_cut_out", "--dry-run").stdout.startswith("About ")
+    assert run("study", "alks", "--ranges", "--point", "cut_out", "--dry-run").stdout.startswith(
+        "About "
+    )
 
 
 ADS = """

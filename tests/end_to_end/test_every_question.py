@@ -38,6 +38,7 @@ EVERY = [
     if name not in ("metadrive_expert", "euro_ncap_rating") and (name != "wear_rss" or HAS_AD_RSS)
 ]
 """Studies that need no extra, but for the rated one, which is one of the kinds."""
+IN_RANGES = ("wear --ranges", "sun --ranges", "alks --ranges --point cut_in")
 WORN = {"worn": "brakeTorque=0.5", "carla": "tireFric=1", "lgsvl": "tire_friction=0.5"}
 """A car of each vehicle model that may not drive."""
 
@@ -84,19 +85,20 @@ def assert_next_answers(*screens: str) -> None:
 
 @SLOW
 @pytest.mark.usefixtures("in_tmp")
-@pytest.mark.parametrize("name", EVERY)
-def test_every_shipped_study_has_answers_or_reasons(name: str) -> None:
+@pytest.mark.parametrize("words", [*EVERY, *IN_RANGES])
+def test_every_shipped_study_has_answers_or_reasons(words: str) -> None:
+    name, *flags = words.split()
     study = load_study(name)
-    points = assemble(study).matrix
+    points = () if flags else assemble(study).matrix
     at = f" --point {shlex.quote(points[0].name)}" if len(points) > 4 else ""
-    pairs = 1 + bool(study.scenario.search)
+    pairs = 1 + bool(flags)
     item, row = next(iter(study.vehicle.characteristics.items()))
-    drives = f"permit {name} --quick --fits 0 --others new --set"
+    drives = f"permit {words} --quick --fits 0 --others new --set"
     for typed in (
-        f"simulate {name}",
-        f"rules {name} --samples 32{at}",
-        f"explain {name} --simulations {260 * pairs}{at}",
-        f"tolerance {name} --simulations {120 * pairs}{at}",
+        f"simulate {words}",
+        f"rules {words} --samples 32{at}",
+        f"explain {words} --simulations {260 * pairs}{at}",
+        f"tolerance {words} --simulations {120 * pairs}{at}",
         f"{drives} {item}={row.original!r}",
         f"{drives} {WORN.get(study.vehicle.model, 'decel=3')}",
     ):
@@ -138,10 +140,11 @@ def test_the_fastest_questions_answer(typed: str, told: str | None) -> None:
 
 RATED = "euro_ncap_rating"
 """The rated study, about which `tests/rating` asks all questions."""
-KINDS = ("smoke", "autoware_july", RATED, "sun_joint", "stop", "rig", "played")
-"""A published study, one with a matrix, a rated and a searched one, full braking, and studies of a
+KINDS = ("smoke", "autoware_july", RATED, "any_gap", "stop", "rig", "played")
+"""A published study, one with a matrix, a rated one, one in ranges, full braking, and studies of a
 simulator and of a file.
 """
+ANY_GAP = 'extends = "sun"\nname = "any_gap"\nencounters = "ranges"\n'
 PLAYED = 'extends = "wear"\nname = "played"\n[scenario]\nfile = "files/cut_in.xosc"\n'
 KIND = """
 extends = "{}"
@@ -175,11 +178,12 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
     Path("models.py").write_text(MODELS)
     Path("rig.toml").write_text(STUDY.replace("models:Wall", "models:Rig"))
     Path("played.toml").write_text(PLAYED)
+    Path("any_gap.toml").write_text(ANY_GAP)
     copytree(FILES, "files")
     Path("kind.toml").write_text(KIND.format(name if name in study_names() else f"{name}.toml"))
     study = load_study("kind.toml")
     answered("study kind.toml --out results", must=True)
-    few = FEW.format(260 * (4 if study.scenario.search or study.matrix else 1))
+    few = FEW.format(260 * (4 if study.ranges or study.matrix else 1))
     first, row = next(iter(study.vehicle.characteristics.items()))
     values = f"{first}={row.original!r}", WORN.get(study.vehicle.model, f"{first}={row.lower!r}")
     questions = () if name == RATED else QUESTIONS

@@ -64,7 +64,11 @@ def test_what_no_element_has_is_passed_over(tmp_path: Path) -> None:
     staged(tmp_path, minor='2" revMinr="0')
     write(tmp_path, event(speed("$v")), parameters=writing.PARAMETER)
     search = {"v": {"lower": 1.0, "upper": 9.0}}
-    load_study("wear", scenario={"file": str(tmp_path / "scenario.xosc"), "search": search})
+    load_study(
+        "wear",
+        scenario={"file": str(tmp_path / "scenario.xosc"), "over": search},
+        encounters="ranges",
+    )
 
 
 def test_the_guard_names_the_error_and_its_line(caplog: pytest.LogCaptureFixture) -> None:

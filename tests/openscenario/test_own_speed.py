@@ -176,7 +176,9 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
         car=(teleport(at(-1, 250)), speed(0)),
     )
     search = {"v": {"lower": 5.0, "upper": 30.0, "original": 15.0}}
-    system = assemble(load_study("wear", scenario={"file": file, "search": search}))
+    system = assemble(
+        load_study("wear", scenario={"file": file, "over": search}, encounters="ranges")
+    )
     members = system.characteristics
     values = 6.0, 15.0, 22.0, 30.0
     settings = np.tile(members.original, (len(values), 1))

@@ -147,7 +147,9 @@ def test_where_nobody_walks_there_is_no_verdict_and_points_are_left_out_by_name(
         answer = json_of("simulate", str(tmp_path / "mine.toml"))
         search = {"v": {"lower": 0.0, "upper": 99.0, "original": when}}
         searched = why_no_verdict(
-            assemble(load_study("wear", scenario={"file": file, "search": search}))
+            assemble(
+                load_study("wear", scenario={"file": file, "over": search}, encounters="ranges")
+            )
         )
         assert [answer["numbers"]["driven"], searched == "", NO_EVENT not in answer["verdict"]] == [
             when == 3
@@ -165,7 +167,9 @@ def test_searched_encounters_in_which_nothing_happens_do_not_count(tmp_path: Pat
     """
     file = walks_after_v(tmp_path)
     search = {"v": {"lower": 0.0, "upper": 99.0, "original": 3.0}}
-    system = assemble(load_study("wear", scenario={"file": file, "search": search}))
+    system = assemble(
+        load_study("wear", scenario={"file": file, "over": search}, encounters="ranges")
+    )
     members = system.characteristics
     settings = np.tile(members.original, (4, 1))
     settings[:, members.names.index("v")] = 3.0, 50.0, 99.0, 3.0

@@ -21,6 +21,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.protocol.cells import MODELS
+from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
@@ -96,9 +97,12 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     middle = (one.lower + one.upper) / 2
     matrix = {"tests": [{"name": "it", "over": {key: [one.lower, middle]}}]}
     assert_equal(with_scenario(name, name, matrix=matrix), with_scenario(name, own, matrix=matrix))
-    search = {key: {"lower": middle, "upper": one.upper, "original": one.upper, "unit": one.unit}}
+    over = {key: {"lower": middle, "upper": one.upper, "original": one.upper, "unit": one.unit}}
     base = load_study(
-        BASES.get(name, "wear"), matrix=None, scenario={"model": name, "search": search}
+        BASES.get(name, "wear"),
+        matrix=None,
+        scenario={"model": name, "over": over},
+        encounters="ranges",
     )
     assert_equal(base, replace(base, scenario=replace(base.scenario, model=own)))
 
@@ -123,17 +127,19 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
     (in_tmp / "deer.py").write_text(DEER)
     for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
         domain = ("km/h", 40, *((20, 60) if model == "deer:Deer" else (10, 80)))
-        search = {"speed": {}, "visibility": {"lower": 0.5}}
+        over = {"speed": {}, "visibility": {"lower": 0.5}}
         for tables in (
-            {"scenario": {"model": model, "search": search}, "matrix": None},
-            {"scenario": {"search": search}, "matrix": {"tests": [{"name": "it", "model": model}]}},
+            {"scenario": {"model": model, "over": over}, "matrix": None},
+            {"scenario": {"over": over}, "matrix": {"tests": [{"name": "it", "model": model}]}},
         ):
-            found = load_study("wear", **tables).scenario.search
+            found = load_study("wear", **tables, encounters="ranges").ranges
             speed = found["speed"]
             assert (speed.unit, speed.original, speed.lower, speed.upper) == domain, model
             assert (found["visibility"].lower, found["visibility"].upper) == (0.5, 1.5)
-    with pytest.raises(InputError, match=r"scenario\.search\.pace: unit is missing"):
-        load_study("wear", matrix=None, scenario={"model": "deer:Deer", "search": {"pace": {}}})
+    with pytest.raises(
+        InputError, match=r"scenario\.over\.pace: no scenario or weather declares a range of pace"
+    ):
+        load_study("wear", matrix=None, scenario={"model": "deer:Deer", "over": {"pace": {}}})
 
 
 @pytest.mark.parametrize(
@@ -254,11 +260,11 @@ def with_own_models(study: Study, folder: Path) -> Study:
 
 
 @SLOW
-@pytest.mark.parametrize("name", ["smoke", "sun_joint", "alks_joint"])
+@pytest.mark.parametrize(("name", "point"), [("smoke", None), ("sun", None), ("alks", "cut_in")])
 def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
-    name: str, in_tmp: Path
+    name: str, point: str | None, in_tmp: Path
 ) -> None:
-    ours = short(name, "nsga2")
+    ours = part_of_study(short(name, "nsga2"), name != "smoke", point, None)
     assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
 
 

@@ -63,7 +63,7 @@ Region = Callable[[FloatArray], BoolArray]
 
 
 def made_up_study(n: int) -> Study:
-    smoke = load_study("smoke")
+    smoke = load_study("smoke", scenario={"over": False, "margin": 0.3})
     rows = {
         name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
         for name in "abcdefghijkl"[:n]

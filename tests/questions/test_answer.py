@@ -26,7 +26,7 @@ from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
 from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, refused, run
+from tests.in_process import refused
 from tests.manual import files_of
 
 COLUMNS = {
@@ -307,7 +307,7 @@ def test_a_printed_command_asks_the_same() -> None:
         "margin": 0.5,
         "fits": fits,
     }
-    typed = shlex.split(ask.command_line(["its results"], "CPNA, night", values))
+    typed = shlex.split(ask.command_line(["its results"], {"point": "CPNA, night"}, values))
     assert typed[:5] == ["python", "-m", "safevar_sumo", "tolerance", "its results"]
     assert "--fits" not in typed
     command = commands.get_command(None, "tolerance")  # type: ignore[arg-type]
@@ -316,12 +316,7 @@ def test_a_printed_command_asks_the_same() -> None:
     assert {name: given[name] for name in values} == values
 
 
-@pytest.mark.slow
-def test_a_question_takes_the_point_that_its_command_takes() -> None:
-    point = "CPFA, speed 40, wet"
-    typed = ["rules", "wear", "--samples", "64", "--point", point, "--json"]
-    answer = sv.rules("wear", samples=64, point=point, pool=InlinePool()).to_dict()
-    assert json.dumps(answer, indent=2) == run(*typed).stdout.strip()
+def test_a_question_refuses_a_point_as_its_command_does() -> None:
     refused(
         "rules",
         "wear",
@@ -335,7 +330,7 @@ def test_a_question_takes_the_point_that_its_command_takes() -> None:
 
 def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     changes = {"recognition_delay": 0.1, "mass": 2644.4}
-    texts = change_texts(CharacteristicSet.of(load_study("sun_joint")), changes)
+    texts = change_texts(CharacteristicSet.of(load_study("sun", encounters="ranges")), changes)
     assert texts == ["mass 2404 -> 2644 kg (+10.0 %)", "recognition_delay 0 -> 0.100 s"]
 
 

@@ -31,7 +31,6 @@ AHEAD = """
 extends = "wear"
 name = "ahead"
 title = "A pedestrian ahead on a wet road"
-wider = ""
 [[matrix.tests]]
 name = "CPLA"
 model = "along"

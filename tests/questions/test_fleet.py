@@ -15,12 +15,13 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.permit.assumed import assumed_cells, assumed_in_words
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-JOINT = sv.load_study("wear_joint")
+JOINT = with_ranges(sv.load_study("wear"))
 LIMIT = [{"sum": {"payload": 1, "payloadCentre": -100}, "at_most": 200, "unit": "kg"}]
-BOUND = sv.load_study("wear_joint", constraints=LIMIT)
+BOUND = sv.load_study("wear", encounters="ranges", constraints=LIMIT)
 UNMEASURED = ("brakeResponse", "payloadCentre", "sensorRange", "sensorLatency")
 MEASURED = ("treadDepth", "brakeTorque", "payload")
 DIALECTS = [

@@ -22,16 +22,18 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, run, searched
+from tests.in_process import json_of, refused, run, searched
 
 STUDY = """
 extends = "rain"
 name = "tiny"
 title = "Which vehicle, at which gap?"
+encounters = "ranges"
 [scenario]
 margin = 0.4
-[scenario.search]
+[scenario.over]
 distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "gap at the start" }
+walking_speed = false
 [search]
 algorithms = ["nsga2", "rs"]
 population = 10
@@ -83,6 +85,11 @@ def _few_encounters(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_a_question_says_which_encounters_count(typed: str) -> None:
     assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])
+
+
+def test_results_are_asked_about_in_the_encounters_of_their_study() -> None:
+    told = "--ranges: of results, whose encounters are those of their study"
+    refused("risk", "results", "--ranges", message=(told,))
 
 
 def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(
@@ -167,11 +174,11 @@ def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refus
 
 
 WORN = {
-    "wear_joint": {
+    "wear": {
         **{"treadDepth": 5.58, "brakeTorque": 0.88, "brakeResponse": 0.112, "payload": 242},
         **{"payloadCentre": 2.2, "sensorRange": 23.8},
     },
-    "sun_joint": {
+    "sun": {
         **{
             "max_rpm": 6404,
             "dampRateFullT": 0.141,
@@ -196,7 +203,7 @@ small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WORN)
 def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
-    with open_evaluator(load_study(name), jobs=2) as judging:
+    with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
         members, model = judging.characteristics, Model(0, judging, Unsafe())
         vehicle = np.array(
             [{**members.named(members.original), **WORN[name]}[one] for one in members.names]

@@ -75,8 +75,8 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
     ),
     "several parameter sets": ("smoke", {}, {"fits": 4}, 1500, "in 4 of 4 parameter sets"),
     "encounters": (
-        "sun_joint",
-        {},
+        "sun",
+        {"encounters": "ranges"},
         {"fits": 0, "characteristics": ("tireFric,maxBrakeTorque,dampRateZeroT_CE",)},
         4000,
         "All corner cases in 32,768 encounters",

@@ -31,10 +31,11 @@ from tests.in_process import json_of, refused, run
 from tests.questions.conftest import model_of
 
 SHORT = """
-extends = "wear_joint"
+extends = "wear"
 name = "short"
 title = "A child from behind a parked car on a wet road"
-[scenario.search]
+encounters = "ranges"
+[scenario.over]
 speed           = { unit = "km/h", original = 34, lower = 34, upper = 45, meaning = "speed" }
 impact_location = { unit = "%",    original = 50, lower = 25, upper = 75, meaning = "location" }
 [[matrix.tests]]
@@ -90,7 +91,7 @@ def are_unsafe(
 
 @pytest.mark.slow
 def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
-    study = load_study("wear_joint")
+    study = load_study("wear", encounters="ranges")
     members = assemble(study).characteristics.vehicle
     rng = default_rng(5)
     settings = np.vstack(
@@ -98,7 +99,7 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
     )
     frame = pd.DataFrame(settings, columns=[*members.names])
     frame.insert(0, "car", ["new", "a", "b", "c"])
-    answer = permit("wear_joint", cars=frame, fits=6)
+    answer = permit("wear", cars=frame, fits=6)
     sets = answer.tables["sets"].set_index(["car", "fit"])
     up_to = sets["up_to"].unstack()
     assert up_to.loc["new", 0] <= 50
@@ -234,7 +235,6 @@ MATRIX = """
 extends = "wear"
 name = "three"
 title = "Three tests on a wet road"
-wider = ""
 [[matrix.tests]]
 name = "CPFA"
 parameters = { test = "CPFA" }
@@ -271,9 +271,15 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     ends = [(each.test, each.low, each.high) for each in ranges_of(model, span)]
     assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
+    assert answer.numbers["margin"] == 0.3, "no axis states a range"
     assert "CPLA" in answer.verdict
     assert "Above 30 km/h nothing was driven" in answer.verdict
-    assert span_of(load_study("alks_joint"), "lateral_speed").unit == "m/s"
+    assert span_of(load_study("alks"), "lateral_speed").unit == "m/s"
+
+
+def test_a_study_that_states_ranges_keeps_what_searched_encounters_leave() -> None:
+    options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True, "up_to": "speed=12"}
+    assert permit("wear", cars={"a": {}}, **options).numbers["margin"] == 0.1
 
 
 @settings(max_examples=25)
@@ -286,7 +292,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
 def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     begin: float, width: float, place: float, share: float
 ) -> None:
-    study = load_study("wear_joint")
+    study = load_study("wear", encounters="ranges")
 
     def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
         columns = self.model.evaluator.characteristics.columns(self.as_printed(settings))

@@ -20,9 +20,11 @@ from safevar_sumo.questions import phases
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.phases import COUNTS_STEPS, at_worst_phases, in_phases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Track, TrackScenario
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study, study_names
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.engine import Engine
@@ -85,7 +87,7 @@ def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
 
 
 def test_sumo_repeats_a_phase_to_the_bit() -> None:
-    system = assemble(load_study("autoware_july", matrix={"point": "CCRs, speed 60, clear"}))
+    system = assemble(at_point(load_study("autoware_july"), "CCRs, speed 60, clear"))
     system = at_phase(system, 0.3712)
     settings = drawn(system, 3, 4)
     runs = [drive_all(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)]
@@ -93,9 +95,10 @@ def test_sumo_repeats_a_phase_to_the_bit() -> None:
     assert_array_equal(here, there)
 
 
-def ahead(**search: object) -> Study:
+def ahead(**over: object) -> Study:
     """A standing car at 60 km/h, or at the speeds that are searched."""
-    return load_study("autoware_july", matrix=False, scenario={"search": search} if search else {})
+    study = load_study("autoware_july", matrix=False, scenario={"over": over})
+    return with_ranges(study)
 
 
 def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the_speed(
@@ -104,7 +107,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     monkeypatch.setattr(phases, "NEAR", np.inf)  # also where the car stops long before
     speed = {"unit": "km/h", "original": 45, "lower": 40, "upper": 50, "meaning": "speed"}
     evaluator = Evaluator(ahead(speed=speed), InlinePool())
-    model = Model(0, evaluator, Unsafe(below=0.0), points=(0,))
+    model = Model(0, evaluator, Unsafe(below=0.0), all_count=True)
     original = evaluator.characteristics.original
 
     # The tips at phase 0, where the distance ends to brake just one step later.

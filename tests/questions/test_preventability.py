@@ -19,6 +19,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
 from safevar_sumo.questions.explain.robustness import robust_shares
 from safevar_sumo.questions.explain.words import avoided_in_words
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.preventability import (
     DRIVERS,
     assess_collisions,
@@ -267,7 +268,7 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
 
 @SLOW
 def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
-    study = load_study("alks_joint")
+    study = at_point(load_study("alks", encounters="ranges"), "cut_in")
     evaluator = Evaluator(study, InlinePool(), verified=0)
     collisions = evaluator.evaluate(drawn(assemble(study), 24, 3), "settings")
     collisions = collisions.take(collisions.collided)

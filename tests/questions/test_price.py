@@ -130,8 +130,10 @@ def test_shares_of_few_simulations_are_about_those_of_many(rig: str) -> None:
 
 
 def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(rig: str) -> None:
-    searched = "[scenario.search]\ngap = { lower = 38.0 }\n\n[vehicle.ch"
-    Path("searched.toml").write_text(STUDY.replace("[vehicle.ch", searched))
+    searched = "[scenario.over]\ngap = { lower = 38.0 }\n\n[vehicle.ch"
+    Path("searched.toml").write_text(
+        'encounters = "ranges"' + STUDY.replace("[vehicle.ch", searched)
+    )
     answer = sv.tolerance("searched.toml", simulations=800, pool=InlinePool())
     assert answer.tables["limits"][["alone_low", "alone_high"]].isna().all(axis=None)
     assert answer.tables["limits"]["together_low"].notna().all()

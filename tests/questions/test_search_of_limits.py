@@ -13,12 +13,12 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification, falsify, falsify_all
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.search import BoxSearch
 from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
 from safevar_sumo.records import FloatArray
-from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.vehicles import region_of
 from tests.in_process import InlinePool
 from tests.questions.conftest import made_up_study, model_of
@@ -64,7 +64,7 @@ def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() 
 
 @pytest.mark.slow
 def test_a_new_car_needs_no_trial_where_an_encounter_counts_only_if_it_keeps_its_margin() -> None:
-    study = load_study("wear_joint")
+    study = load_study("wear", encounters="ranges")
     evaluator = Evaluator(study, InlinePool(), verified=0)
     members = evaluator.characteristics
     lower = np.where(members.of_vehicle, members.original, members.lower)

@@ -129,7 +129,7 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
 
 
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
-    answer = sv.explain("sun_joint", fits=0, quick=True, pool=InlinePool())
+    answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
     assert "Scope: each combination was simulated in the original encounter" in answer.verdict
 
 

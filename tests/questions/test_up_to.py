@@ -18,8 +18,8 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import SEARCHED_MARGIN
+from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -31,7 +31,6 @@ AHEAD = """
 extends = "wear"
 name = "ahead"
 title = "A pedestrian ahead on a wet road"
-wider = ""
 [[matrix.tests]]
 name = "slow"
 model = "along"
@@ -47,17 +46,19 @@ TINY = """
 extends = "rain"
 name = "tiny"
 title = "Which vehicle, at which gap?"
+encounters = "ranges"
 [scenario]
 margin = 0.4
-[scenario.search]
+[scenario.over]
 distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "gap at the start" }
+walking_speed = false
 """
 ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
 
 def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: Study) -> None:
     def over(study: Study) -> list[Any]:
-        return [test.over["speed"] for test in study.matrix.tests]
+        return [study.lists_of(test)["speed"] for test in study.matrix.tests]
 
     wear, stop = load_study("wear"), load_study("stop")
     assert over(study_up_to(wear, "speed=45")) == [[10, 20, 30, 40]] * 3 + [[10, 20, 30, 40, 45]]
@@ -73,10 +74,8 @@ def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: 
 
 
 def test_a_searched_original_above_the_value_becomes_it() -> None:
-    joint = load_study("wear_joint")
-    low, high = (
-        study_up_to(joint, text).scenario.search["speed"] for text in ("speed=25", "speed=50")
-    )
+    joint = load_study("wear", encounters="ranges")
+    low, high = (study_up_to(joint, text).ranges["speed"] for text in ("speed=25", "speed=50"))
     assert (low.original, low.upper) == (25, 25)
     assert (high.original, high.upper) == (40, 50)
     assert study_up_to(joint, "speed=60") == joint
@@ -107,7 +106,7 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
 
 def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> None:
     """In the study that is cut, a brake torque below 0.7 collides; all three did in the results."""
-    study = study_up_to(load_study("wear_joint"), "speed=40")
+    study = study_up_to(load_study("wear", encounters="ranges"), "speed=40")
     plant = Plant(study, lambda rows: rows[:, 1] < 0.7)
     members = CharacteristicSet.of(study)
     evaluator: Any = SimpleNamespace(
@@ -129,7 +128,7 @@ def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> No
 
 
 def test_limits_up_to_a_value_lie_within_those_up_to_smaller_ones(ahead: Study) -> None:
-    joint = load_study("wear_joint")
+    joint = load_study("wear", encounters="ranges")
     for study, value, steps in ((ahead, 55, (30, 50)), (ahead, 30, ()), (joint, 45, (20, 30, 40))):
         cuts = [study_up_to(study, f"speed={step}") for step in steps]
         assert smaller_cuts(study, f"speed={value}") == cuts

@@ -21,10 +21,10 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study, simulate_with_original
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.results import write_imported
-from safevar_sumo.sumo.matrix import at_point
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import refused, run
 from tests.made_up import made_up_evaluations

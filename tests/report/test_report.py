@@ -190,7 +190,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 )
 def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     question, values = parse_question(text)
-    assert question.command_line([], None, values) == f"python -m safevar_sumo {text}"
+    assert question.command_line([], {}, values) == f"python -m safevar_sumo {text}"
 
 
 def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slippery: Path) -> None:

@@ -12,18 +12,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.ask import parse_question
 from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tolerance.wider import WIDER
+from safevar_sumo.questions.tolerance.in_ranges import RANGES, study_in_ranges
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.sheet import sheet_of, speed_question
-from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.report.test_report import words_of
@@ -215,11 +216,11 @@ def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
     kept: bool, found: str
 ) -> None:
     answer = answer_of()
-    row = ("wear_joint", "CPNCO up to 60 km/h", kept, "A child is hit.", None)
-    answer.tables["wider"] = tabulate("Wider", WIDER, [row])
+    row = ("CPNCO up to 60 km/h", kept, "A child is hit.", None, None)
+    answer.tables["ranges"] = tabulate("Ranges", RANGES, [row])
     foreman, _, engineer = sheet_with(answer).partition("For the manufacturer's engineer")
     assert found in foreman
-    assert "Study wear_jointCPNCO up to 60 km/h" in engineer
+    assert "Ranges of the studyCPNCO up to 60 km/h" in engineer
 
 
 def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_codes() -> None:
@@ -232,10 +233,10 @@ def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_c
     assert "in CPFA. 12 parameter sets; 120,000 simulations that search" in engineer
 
 
-def test_a_failure_in_a_wider_study_lowers_the_greatest_speed() -> None:
+def test_a_failure_in_the_ranges_lowers_the_greatest_speed() -> None:
     answer = answer_of()
-    row = ("wear_joint", "up to 60 km/h", False, "A child is hit.", {"speed": 36.2})
-    answer.tables["wider"] = tabulate("Wider", WIDER, [row])
+    row = ("up to 60 km/h", False, "A child is hit.", {"speed": 36.2}, None)
+    answer.tables["ranges"] = tabulate("Ranges", RANGES, [row])
     sheet = sheet_with(answer, speed=speed_of())
     assert "Greatest speed: 36 km/h (simulated" in sheet
     assert "a vehicle within these limits fails above the greatest speed." in sheet
@@ -260,7 +261,9 @@ def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -
 
 
 def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> None:
-    question, values = parse_question(speed_question(reported(answer_of())))
+    all_measured = replace_in(STUDY, unmeasured={})
+    asked = speed_question(reported(replace(answer_of(), study=all_measured)))
+    question, values = parse_question(asked)
     assert (question.name, values["margin"], values["others"]) == ("permit", 0.3, "new")
     assert values["limits"] == (
         *("treadDepth >= 3.0", "treadDepth <= 8.0", "brakeTorque >= 0.85", "brakeTorque <= 1.0"),
@@ -270,7 +273,7 @@ def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_other
         *("sensorLatency >= 0.05", "sensorLatency <= 0.05"),
     )
     # What the study states of a value that nobody measured stands in place of a limit.
-    joint = replace(answer_of(unsafe="drac > 6", rough=True), study=read_study("wear_joint"))
+    joint = replace(answer_of(unsafe="drac > 6", rough=True), study=with_ranges(STUDY))
     _, values = parse_question(speed_question(reported(joint)))
     assert not [limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))]
     assert (values["unsafe"], values["quick"]) == ("drac > 6", True)
@@ -295,9 +298,9 @@ def sheet_of_shipped(name: str) -> str:
     limits = answer_of(
         rows=rows, scope=scope_of(study), unsafe=study.unsafe.criterion or "collision"
     )
-    if study.wider:
-        row = (study.wider, scope_of(read_study(study.wider)), False, "A child is hit. " * 20, {})
-        limits.tables["wider"] = tabulate("Wider", WIDER, [row])
+    if in_ranges := study_in_ranges(study):
+        row = (scope_of(in_ranges), False, "A child is hit. " * 20, {}, None)
+        limits.tables["ranges"] = tabulate("Ranges", RANGES, [row])
     own = replace(limits, study=study)
     has_speed = speed_question(reported(own))
     return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))

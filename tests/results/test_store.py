@@ -31,6 +31,7 @@ from safevar_sumo.results import (
     solutions_frame,
 )
 from safevar_sumo.results.identity import (
+    evaluation_keys,
     identity_digest,
     manifest_differences,
     manifest_of,
@@ -134,7 +135,11 @@ def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_
 ) -> None:
     def joint(meaning: str = "", upper: float = 20.0, margin: float = 0.3) -> Study:
         distance = {"unit": "m", "original": 12, "lower": 8, "upper": upper, "meaning": meaning}
-        return load_study("smoke", scenario={"search": {"distance": distance}, "margin": margin})
+        return load_study(
+            "smoke",
+            scenario={"over": {"distance": distance}, "margin": margin},
+            encounters="ranges",
+        )
 
     results_directory(tmp_path, joint()).begin(evaluations(2.5))
     results_directory(tmp_path, joint(meaning="gap at the start"))
@@ -158,13 +163,27 @@ def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: S
         )
 
 
+def test_results_of_listed_encounters_do_not_depend_on_ranges() -> None:
+    def keys(encounters: str, **scenario: Any) -> Any:
+        study = load_study("smoke", encounters=encounters, scenario=scenario)
+        return evaluation_keys(tables_of(study))
+
+    friction = {"road_friction": {"lower": 0.5}}
+    assert keys("tests", margin=1, over=friction) == keys("tests")
+    assert keys("ranges") not in (
+        keys("tests"),
+        keys("ranges", margin=1),
+        keys("ranges", over=friction),
+    )
+
+
 def turned(record: Any, key: str) -> Any:
     """A record with the keys of one of its tables in the opposite order."""
     return replace(record, **{key: dict(reversed(getattr(record, key).items()))})
 
 
 def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> None:
-    wear, joint = load_study("wear"), load_study("wear_joint")
+    wear, joint = load_study("wear"), load_study("sun", encounters="ranges")
     matrix = replace(wear.matrix, tests=[turned(test, "over") for test in wear.matrix.tests])
     for study, order, changes in (
         (
@@ -172,7 +191,7 @@ def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it()
             "vehicle.order of characteristics",
             {"vehicle": turned(wear.vehicle, "characteristics")},
         ),
-        (joint, "scenario.order of search", {"scenario": turned(joint.scenario, "search")}),
+        (joint, "scenario.order of over", {"scenario": turned(joint.scenario, "over")}),
         (wear, "matrix.tests", {"matrix": matrix}),
         (wear, "", {"vehicle": turned(wear.vehicle, "parameters")}),
         (wear, "", {"metrics": wear.metrics}),
@@ -460,3 +479,18 @@ def test_a_study_under_way(copied: Path) -> None:
     nsga2.write_bytes(nsga2.read_bytes().partition(b"\n")[0] + b"\n")
     assert status_of(copied)["nsga2"]["simulated"] == 0
     assert load_cases([copied])[0].evaluations.empty
+
+
+def test_results_of_a_study_whose_search_was_a_key_are_read_by_their_release(
+    tmp_path: Path,
+) -> None:
+    """A key that was without effect is passed over."""
+    run("study", "smoke", "--runs", "1", "--evaluations", "50", "--out", str(tmp_path))
+    manifest = read_manifest(tmp_path)
+    file = tmp_path / "manifest.json"
+    file.write_text(json.dumps({**manifest, "study": {**manifest["study"], "wider": "smoke"}}))
+    assert read_manifest(tmp_path) == manifest
+    manifest["study"]["scenario"]["search"] = {"distance": {}}
+    file.write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="release that wrote them"):
+        read_manifest(tmp_path)

@@ -54,8 +54,8 @@ SEARCH = {
 
 def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     folder.joinpath("own.py").write_text(MINE)
-    scenario = {"model": "own:Mine", "search": search}
-    return load_study("wear", matrix=None, scenario=scenario, **tables)
+    scenario = {"model": "own:Mine", "over": search}
+    return load_study("wear", matrix=None, scenario=scenario, encounters="ranges", **tables)
 
 
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
@@ -121,7 +121,9 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     )
     (in_tmp / "own.py").write_text(TRAFFIC + methods)
     search = {"distance": {"unit": "m", "original": 50, "lower": 30, "upper": 60}}
-    system = assemble(load_study("native", scenario={"model": "own:Mine", "search": search}))
+    system = assemble(
+        load_study("native", scenario={"model": "own:Mine", "over": search}, encounters="ranges")
+    )
     assert "by distance" in reason_for_sumo(system)
     settings = drawn(system, 3, 4)
     found = drive_and_score(system, settings)

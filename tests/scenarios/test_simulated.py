@@ -189,7 +189,7 @@ def test_each_setting_alone_gives_the_bytes_of_a_batch(wall: Path) -> None:
 
 def test_one_simulator_is_kept_its_fields_are_set_and_it_is_closed(wall: Path) -> None:
     search = {"speed": {"lower": 10.0, "upper": 20.0}, "gap": {}}
-    system = system_of(wall, scenario={"search": search})
+    system = system_of(wall, scenario={"over": search}, encounters="ranges")
     module = __import__("sys").modules["models"]
     rows = np.array([[8.0, 0.0, 10.0, 40.0], [8.0, 0.0, 20.0, 60.0]])
     found = drive_and_score(system, rows)
@@ -206,7 +206,10 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     rows = np.array([[8.0, 0.0, 10.0], [4.0, 0.2, 20.0]])
     both = [
         drive_and_score(
-            system_of(wall, scenario={"model": f"models:{name}", "search": search}), rows
+            system_of(
+                wall, scenario={"model": f"models:{name}", "over": search}, encounters="ranges"
+            ),
+            rows,
         )
         for name in ("Wall", "Listed")
     ]

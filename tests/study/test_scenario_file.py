@@ -44,7 +44,8 @@ LOGICAL = str(FILES / "cut_in_logical.xosc")
 
 
 def study_of(file: str, **scenario: Any) -> Study:
-    return load_study("wear", scenario={"file": file, **scenario})
+    encounters = "ranges" if "over" in scenario else "tests"
+    return load_study("wear", scenario={"file": file, **scenario}, encounters=encounters)
 
 
 def runs_of(study: Study) -> list[SimulationRuns]:
@@ -84,7 +85,7 @@ def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
     catalogs.
     """
     names = {"cut_in_logical.xosc", "cut_in.xosc", "bodies.xosc", "three_lanes.xodr"}
-    study = study_of(LOGICAL, values={"ego_kmh": 80, "body": "lorry"}, search={"gap_m": {}})
+    study = study_of(LOGICAL, values={"ego_kmh": 80, "body": "lorry"}, over={"gap_m": {}})
     assert {Path(path).name for path in data_files(study).values()} == names
     assert tables_of(load_study(tables_of(study))) == tables_of(study)
     copytree(FILES, tmp_path / "files")
@@ -104,7 +105,7 @@ def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
     study = study_of(
         str(tmp_path / "files/cut_in_logical.xosc"),
         values={"ego_kmh": 80, "body": "lorry"},
-        search={"gap_m": {}},
+        over={"gap_m": {}},
     )
     assert {Path(path).name for path in data_files(study).values()} == {*names, "other.xosc"}
     (tmp_path / "base.toml").write_text(
@@ -121,10 +122,10 @@ def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None
     study = study_of(
         LOGICAL,
         values={"ego_kmh": 80},
-        search={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}},
+        over={"gap_m": {}, "slower_kmh": {"upper": 25, "unit": "km/h"}},
     )
-    gap = study.scenario.search["gap_m"]
-    slower = study.scenario.search["slower_kmh"]
+    gap = study.ranges["gap_m"]
+    slower = study.ranges["slower_kmh"]
     assert (gap.lower, gap.upper, gap.original) == (5, 45, 20)
     assert (slower.lower, slower.upper, slower.original, slower.unit) == (10, 25, 25, "km/h")
     assert len(study.matrix.tests) == 5 * 2
@@ -135,7 +136,7 @@ def test_what_is_not_searched_becomes_points_and_ranges_become_domains() -> None
 def test_constraints_of_a_file_hold_in_the_search() -> None:
     """slower_kmh < ego_kmh - 10 excludes a corner of the two domains."""
     values = {"gap_m": 20, "sideways_mps": 1.5, "side": -1, "body": "hatchback"}
-    study = study_of(LOGICAL, values=values, search={"ego_kmh": {}, "slower_kmh": {}})
+    study = study_of(LOGICAL, values=values, over={"ego_kmh": {}, "slower_kmh": {}})
     (constraint,) = study.constraints
     assert constraint.sum == pytest.approx({"ego_kmh": -1, "slower_kmh": 1})
     assert constraint.at_most == pytest.approx(-10, abs=1e-3)
@@ -148,7 +149,7 @@ def test_constraints_of_a_file_hold_in_the_search() -> None:
 
 def test_encounters_of_a_search_are_those_of_single_files() -> None:
     values = {"sideways_mps": 1.5, "side": -1, "body": "hatchback", "ego_kmh": 80}
-    study = study_of(LOGICAL, values=values, search={"gap_m": {}, "slower_kmh": {}})
+    study = study_of(LOGICAL, values=values, over={"gap_m": {}, "slower_kmh": {}})
     (point,) = assemble(study).points
     gaps = np.array([8.0, 20.0, 33.5])
     slower = np.array([12.0, 25.0, 30.0])
@@ -225,14 +226,16 @@ def test_combinations_that_nobody_can_play_are_left_out_with_a_warning(tmp_path:
 SEARCHED = """
 file = "files/cut_in_logical.xosc"
 values = { ego_kmh = 80, sideways_mps = 1.5, body = "hatchback", side = -1 }
-search = { gap_m = {}, slower_kmh = { upper = 25 } }
+over = { gap_m = {}, slower_kmh = { upper = 25 } }
 """
 
 
 @pytest.mark.slow
 def test_a_pack_of_a_search_over_a_file_has_all_files(in_tmp: Path) -> None:
     copytree(FILES, "files")
-    Path("scene.toml").write_text(f'extends = "wear"\n[scenario]\n{SEARCHED}')
+    Path("scene.toml").write_text(
+        f'extends = "wear"\nencounters = "ranges"\n[scenario]\n{SEARCHED}'
+    )
     budget = ["--runs", "1", "--evaluations", "50", "--algorithms", "rs", "--jobs", "1"]
     run("study", "scene.toml", *budget, "--out", "results")
     run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 50", "--jobs", "1")

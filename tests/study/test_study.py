@@ -145,8 +145,7 @@ def test_what_was_not_measured_changes_no_result_and_is_not_inherited(in_tmp: Pa
     write_study(in_tmp / "mine.toml", study, "")
     assert read_study("mine.toml").unmeasured == study.unmeasured
     assert not read_study({"extends": "mine.toml", "name": "heir"}).unmeasured
-    for name in ("wear_joint", "wear_fleet"):
-        assert all(one.source for one in read_study(name).unmeasured.values())  # type: ignore[union-attr]
+    assert all(one.source for one in read_study("wear").unmeasured.values())  # type: ignore[union-attr]
 
 
 def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
@@ -184,16 +183,22 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
 
 def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit() -> None:
     scenario = {"model": "car_to_car", "parameters": {"vut_length": 4.7, "speed": 30}}
-    _, (remark,) = with_remarks("wear_joint", scenario=scenario)
-    lost = "[matrix], impact_location of [scenario], vut_width of [scenario]"
-    assert remark.endswith(f"has a different scenario than 'wear_joint', so not its {lost}")
+    _, (remark,) = with_remarks("sun", scenario=scenario)
+    lost = "distance of [scenario], recognition_delay of [scenario], road_friction of [scenario]"
+    assert remark.endswith(f"{lost}, walking_speed of [scenario]")
 
 
-@pytest.mark.parametrize(
-    "name", ["alks", "alks_joint", "alks_joint_cut_out", "alks_joint_following"]
-)
-def test_the_worn_car_has_one_size_in_all_studies_of_un_r157(name: str) -> None:
-    for point in assemble(read_study(name)).points:
+def test_a_value_counts_in_tests_and_a_range_of_the_same_parameter_in_its_place() -> None:
+    over = {"impact_location": {"original": 50, "lower": 20, "upper": 80}}
+    scenario = {"model": "crossing", "parameters": {"impact_location": 25}, "over": over}
+    for encounters, place in ("tests", 25), ("ranges", 50):
+        study = read_study("wear", encounters=encounters, scenario=scenario, matrix={"tests": []})
+        assert assemble(study).points[0].scenario.impact_location == place
+
+
+@pytest.mark.parametrize("encounters", ["tests", "ranges"])
+def test_the_worn_car_has_one_size_in_all_tests_of_un_r157(encounters: str) -> None:
+    for point in assemble(read_study("alks", encounters=encounters)).points:
         assert (point.scenario.vut_length, point.scenario.vut_width) == (4.7, 1.85)
 
 
@@ -202,4 +207,4 @@ def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -
     assert study.spread == {}
     assert len(remarks) == 1
     assert remarks[0].endswith("has a different ADS than 'wear', so not its [spread]")
-    assert with_remarks("wear_joint")[1] == [], "a shipped study leaves keys out on purpose"
+    assert with_remarks("wear_rss")[1] == [], "a shipped study leaves keys out on purpose"

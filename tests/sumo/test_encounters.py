@@ -43,32 +43,23 @@ MARGIN = 4.0
 """Distance that the original vehicle has to keep in the planted study [m]."""
 
 
-def domain(lower: float, upper: float, unit: str, original: float | None = None) -> dict[str, Any]:
-    return {
-        "lower": lower,
-        "upper": upper,
-        "unit": unit,
-        "original": lower if original is None else original,
-    }
+def domain(lower: float, upper: float, original: float | None = None) -> dict[str, Any]:
+    return {"lower": lower, "upper": upper, "original": lower if original is None else original}
 
 
-SPEED, PLACE = domain(30, 60, "km/h"), domain(20, 80, "%", 50)
+SPEED, PLACE = domain(30, 60), domain(20, 80, 50)
 WEATHER = {
-    "road_friction": domain(0.6, 1, "-", 1),
-    "visibility": domain(0.5, 1, "-", 1),
-    "recognition_delay": domain(0, 0.3, "s"),
+    "road_friction": domain(0.6, 1, 1),
+    "visibility": domain(0.5, 1, 1),
+    "recognition_delay": domain(0, 0.3),
 }
 CASES = {
     "walker": (
         "sun",
         {"model": "pedestrian_crossing"},
-        {
-            "distance": domain(8, 20, "m"),
-            "walking_speed": domain(1, 2.4, "m/s"),
-            "lateral_start": domain(4, 8, "m"),
-        },
+        {"distance": domain(8, 20), "walking_speed": domain(1, 2.4), "lateral_start": domain(4, 8)},
     ),
-    "parked": ("lgsvl", {"model": "lead_vehicle_stopped"}, {"distance": domain(40, 70, "m")}),
+    "parked": ("lgsvl", {"model": "lead_vehicle_stopped"}, {"distance": domain(40, 70)}),
     "far": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CPFA"}},
@@ -77,38 +68,34 @@ CASES = {
     "child": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CPNCO"}},
-        {"speed": SPEED, "target_speed": domain(4, 7, "km/h")},
+        {"speed": SPEED, "target_speed": domain(4, 7)},
     ),
     "cyclist": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CBNA"}},
-        {"impact_location": PLACE, "target_speed": domain(10, 20, "km/h")},
+        {"impact_location": PLACE, "target_speed": domain(10, 20)},
     ),
     "car": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CCCscp", "heading": 10.0}},
-        {"speed": SPEED, "target_speed": domain(20, 50, "km/h")},
+        {"speed": SPEED, "target_speed": domain(20, 50)},
     ),
     "ahead": (
         "wear",
         {"model": "along"},
-        {"speed": SPEED, "impact_location": PLACE, "target_speed": domain(3, 8, "km/h")},
+        {"speed": SPEED, "impact_location": PLACE, "target_speed": domain(3, 8)},
     ),
     "stopped": (
         "wear",
         {"model": "car_to_car"},
-        {"speed": SPEED, "headway": domain(3, 5, "s"), "impact_location": PLACE},
+        {"speed": SPEED, "headway": domain(3, 5), "impact_location": PLACE},
     ),
     "weather": ("wear", {"model": "crossing", "parameters": {"test": "CPFA"}}, {}),
     "mine": ("sun", {"model": "planted:Slope"}, {}),
     "brakes": (
         "wear",
         {"model": "car_to_car", "parameters": {"test": "CCRb"}},
-        {
-            "speed": SPEED,
-            "headway": domain(1, 2, "s"),
-            "target_deceleration": domain(3, 6, "m/s^2"),
-        },
+        {"speed": SPEED, "headway": domain(1, 2), "target_deceleration": domain(3, 6)},
     ),
 }
 
@@ -118,7 +105,8 @@ def searched_study(case: str) -> Study:
     return load_study(
         base,
         matrix=None,
-        scenario={**scenario, "search": {**search, **WEATHER}},
+        scenario={**scenario, "over": {**search, **WEATHER}},
+        encounters="ranges",
         name=case,
         title=case,
     )
@@ -157,14 +145,15 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
 
 
 def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
-    system = assemble(load_study("sun_joint"))
+    study = load_study("sun", encounters="ranges")
+    system = assemble(study)
     settings = drawn(system, 30, 1)
     together = drive_and_score(system, settings)
     for row in (0, 7, 29):
         alone = drive_and_score(system, settings[[row]])
         for name, values in together.results.items():
             np.testing.assert_array_equal(alone.results[name], values[[row]])
-    beside = simulate("sun_joint", system.characteristics.named(settings[0]))
+    beside = simulate(study, system.characteristics.named(settings[0]))
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )
@@ -179,9 +168,11 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     """In some, a pedestrian has left the road while other copies go on."""
     base, scenario, _ = CASES[case]
     widest = free_parameters(SCENARIOS[scenario["model"]])
-    search = {name: domain(one.lower, one.upper, one.unit) for name, one in widest.items()}
-    system = assemble(load_study(base, matrix=None, scenario={**scenario, "search": search}))
-    corners = product(*((one.lower, one.upper) for one in widest.values()))
+    search = {name: domain(one.lower, one.upper) for name, one in widest.items()}
+    system = assemble(
+        load_study(base, matrix=None, scenario={**scenario, "over": search}, encounters="ranges")
+    )
+    corners = product(*((one.lower, one.upper) for one in system.characteristics.scenario))
     settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
     recorded, in_sumo = (
         drive_and_score(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
@@ -199,8 +190,9 @@ def planted(**changes: Any) -> Study:
         "scenario": {
             "model": "car_to_car",
             "parameters": {"headway": 2.0},
-            "search": {"speed": domain(50, 70, "km/h"), "road_friction": domain(0.5, 1, "-", 1)},
+            "over": {"speed": domain(50, 70), "road_friction": domain(0.5, 1, 1)},
         },
+        "encounters": "ranges",
         "vehicle": {
             "model": "planted:Block",
             "characteristics": {"brakes": {"unit": "-", "original": 1, "lower": 0.2, "upper": 1}},
@@ -246,10 +238,8 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     """In half of the encounters here the original collides; all algorithms simulate them and report
     none.
     """
-    search = {"speed": domain(50, 90, "km/h"), "road_friction": domain(0.5, 1, "-", 1)}
-    study = planted(
-        scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "search": search}
-    )
+    over = {"speed": domain(50, 90), "road_friction": domain(0.5, 1, 1)}
+    study = planted(scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "over": over})
     results = load_runs(searched(study, tmp_path / "out"))
     for algorithm, rows in results.evaluations.groupby("algorithm"):
         assert (rows["original_safety_degree"] < MARGIN).mean() > 0.1, algorithm
@@ -258,13 +248,14 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     assert (results.solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.parametrize("name", ["sun_joint", pytest.param("wear_joint", marks=SLOW)])
+@pytest.mark.parametrize("name", ["sun", pytest.param("wear", marks=SLOW)])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     name: str, tmp_path: Path
 ) -> None:
     """`searched` also verifies all solutions in SUMO."""
     study = load_study(
         name,
+        encounters="ranges",
         search={
             "runs": 1,
             "evaluations": 150,

@@ -13,6 +13,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.protocol.driving_robot import DrivingRobot
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, differences
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
@@ -210,3 +211,31 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     assert touches.age == pytest.approx(contact[1])
     if contact[2] is not None:
         assert touches.behind_front == pytest.approx(contact[2] - 0.2)
+
+
+def names(study: Study) -> list[str]:
+    return [point.name for point in assemble(study).points]
+
+
+def test_one_study_has_listed_encounters_and_ranges_and_is_reduced_to_a_test_or_point() -> None:
+    wear, one = load_study("wear"), "CPNA, speed 20, impact_location 50, wet"
+    points = names(wear)
+    assert (len(points), points[3], points[8]) == (26, "CPFA, speed 40, wet", one)
+    assert names(at_point(wear, one)) == [one]
+    assert names(at_point(wear, "CPFA")) == points[:4]
+    assert [*load_study("wear", encounters="ranges").ranges] == ["speed", "impact_location"]
+
+
+def test_a_setting_meets_only_tests_whose_ranges_and_constraints_have_its_encounter() -> None:
+    """The cut-out takes gaps from 20 m, and at 130 km/h from 69 m."""
+    study = load_study("alks", encounters="ranges")
+    system = assemble(study)
+    settings = np.tile(system.characteristics.original, (3, 1))
+    for name, values in {"gap": (10, 60, 60), "speed": (60, 130, 80), "brakeTorque": 0.6}.items():
+        settings[:, [*system.characteristics.names].index(name)] = values
+    least = np.full(3, np.inf)
+    for name, met in {"cut_in": [0, 1, 2], "cut_out": [2], "following": [0, 1, 2]}.items():
+        alone = assemble(at_point(study, name))
+        own = alone.characteristics.of_others(system.characteristics, settings[met])
+        least[met] = np.minimum(least[met], drive_and_score(alone, own).f_safe)
+    assert drive_and_score(system, settings).f_safe.tolist() == least.tolist()

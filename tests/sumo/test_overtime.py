@@ -9,6 +9,7 @@ import pytest
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Outcome, differences
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.sumo.batch import drive_all
@@ -58,7 +59,7 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, engine: Engine) -
 
 
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
-    system = assemble(load_study("alks_joint"))
+    system = assemble(at_point(load_study("alks", encounters="ranges"), "cut_in"))
     patient = replace(system, scenario=replace_in(system.scenario, duration=60.0))
     population = drawn(system, 300, 1)
     found = drive_and_score(system, population, with_originals=False)

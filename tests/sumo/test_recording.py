@@ -17,6 +17,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import ROUNDING, FloatArray, Observation, differences
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
@@ -26,7 +27,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.matrix import at_point, drive_and_score
+from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import json_of, run, verify_everywhere

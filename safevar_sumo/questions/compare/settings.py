@@ -21,6 +21,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import Limit, Study
 from safevar_sumo.study.characteristics import Domain, check_limits
+from safevar_sumo.study.encounters import Axes, AxisTable
 
 BOTH_STAGE = "settings in both systems"
 """The phase of progress."""
@@ -193,11 +194,7 @@ def in_order_of(a: Study, b: Study) -> Study:
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
         return replace(
-            b,
-            vehicle=replace(b.vehicle, characteristics=characteristics),
-            scenario=replace(
-                b.scenario, search={name: b.domains[name] for name in a.scenario.search}
-            ),
+            _in_order(b, [*a.ranges]), vehicle=replace(b.vehicle, characteristics=characteristics)
         )
 
     def in_words(units: set[tuple[str, str]]) -> str:
@@ -209,6 +206,16 @@ def in_order_of(a: Study, b: Study) -> Study:
         f"of {b.name!r} alone: {in_words(units_b - units_a)}",
         "studies with the same characteristics and searched parameters in the same units",
     )
+
+
+def _in_order(study: Study, names: Sequence[str]) -> Study:
+    """A study whose axes that may have any value stand in the order of their names, the last."""
+    place = {name: number for number, name in enumerate(names)}
+
+    def ordered(axes: dict[str, AxisTable]) -> Axes:
+        return {name: axes[name] for name in sorted(axes, key=lambda name: place.get(name, -1))}
+
+    return study.mapped(ordered)
 
 
 def pairs_of(

@@ -148,7 +148,7 @@ def explain(
     population = gather_failures(subject, evaluator, solution, unsafe, fits)
     runs = population.evaluations
     # Of an unsafe original no change is a cause, but in another encounter it may be safe.
-    is_caused = bool(study.scenario.search or not population.unsafe.of(population.original)[0])
+    is_caused = bool(study.ranges or not population.unsafe.of(population.original)[0])
 
     # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
     # of a smaller one where few simulations are allowed.

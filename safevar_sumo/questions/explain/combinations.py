@@ -89,7 +89,7 @@ def enumerate_causes(
     changes add up to the worst; with `only_fewest` the first size with a cause is the last, and a
     size is simulated as a whole or not at all.
 
-    In a study that searches its scenario a combination is simulated in the original encounter and
+    Where encounters are ranges a combination is simulated in the original encounter and
     in the critical ones, as `Evaluator.evaluate_over_encounters` says.
     """
     # The changes, and what one combination costs.

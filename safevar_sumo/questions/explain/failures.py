@@ -27,7 +27,8 @@ from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray, TextArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points, worst_points
+from safevar_sumo.sumo.encounters import worst_points
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import System
 
 Reasons = dict[int, str]

@@ -92,7 +92,7 @@ CAUSE_COLUMNS: Columns = {
     ),
 }
 OF_ENCOUNTER = ("encounter", "elsewhere")
-"""Columns of a study that searches its scenario."""
+"""Columns of a study whose encounters are ranges."""
 SOLUTION_COLUMNS: Columns = {
     "solution": "handle of the failure",
     "reason": "why this failure was chosen",
@@ -192,7 +192,7 @@ def causes_table(
     limits = find_cause_limits(evaluator, causes, unsafe)
     printed = printed_limits(Model(0, evaluator, unsafe), causes, limits)
     elsewhere = np.zeros(len(causes), dtype=bool)
-    if causes and study.scenario.search:
+    if causes and study.ranges:
         at_original = [cause._replace(encounter={}) for cause in causes]
         settings = settings_of(evaluator.characteristics, at_original)
         elsewhere = unsafe.of(evaluator.evaluate(settings, "causes in the original encounter"))
@@ -221,7 +221,7 @@ def causes_table(
         for index in order.tolist()
     ]
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"holds": "Int64", "fits": "Int64"})
-    omitted = () if study.scenario.search else OF_ENCOUNTER
+    omitted = () if study.ranges else OF_ENCOUNTER
     columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
     table = tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
     table.attrs["lead_rows"] = np.flatnonzero(~frame["boundary"].astype(str).duplicated()).tolist()

@@ -42,7 +42,7 @@ def verdict_on_failures(
     runs = population.evaluations
 
     # Nothing has to change if the original is unsafe.
-    if not evaluator.study.scenario.search and unsafe.of(population.original)[0]:
+    if not evaluator.study.ranges and unsafe.of(population.original)[0]:
         words = unsafe.breach_in_words(population.original)
         yield f"The original vehicle itself {words}: no change is necessary."
         yield unsafe.smaller_demand(population.original)

@@ -38,6 +38,7 @@ from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSea
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study, limits_of, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -114,6 +115,8 @@ def permit(
         A file for the list of cars, in the order of the input and with all its columns as they are
         given, beside those of the answer; `assumed` names the values that were not measured.
     """
+    if evaluator.study.states_ranges:
+        evaluator = evaluator.for_study(with_ranges(evaluator.study))
     study = evaluator.study
     span = span_of(study, by)
     needed = _needed(need, span)

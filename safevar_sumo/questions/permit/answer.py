@@ -12,6 +12,7 @@ import pandas as pd
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.part import study_up_to
 from safevar_sumo.questions.permit.assumed import assumed_cells
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import Fleet
@@ -30,7 +31,6 @@ from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
-from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text

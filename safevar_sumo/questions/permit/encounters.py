@@ -5,7 +5,7 @@ alone, and counts whether or not the original vehicle is safe in it.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import product
 from typing import NamedTuple
@@ -14,15 +14,15 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, SimulationError, check_name
-from safevar_sumo.questions.between import domains_of_axes, without_axes
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import are_numbers, at_values, points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
-from safevar_sumo.study import PHASE, Study, unit_text
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
+from safevar_sumo.scenarios.declared import with_ranges
+from safevar_sumo.study import PHASE, MatrixTest, Study, unit_text
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
@@ -193,23 +193,29 @@ def span_of(study: Study, by: str | None) -> Span:
     InputError
         If the study varies no such speed; those that it varies are named.
     """
+    study = with_ranges(study)
     matrix = study.matrix
     if matrix is not None and matrix.protocol:
         problem = f"study {study.name!r} is rated, and drives each test at speeds of its own"
         raise InputError(study.source, problem, "a study that is not rated")
     points = assemble(study).points
-    tests = [] if matrix is None else points_of_tests(study, points)
-    axes = {
-        test.name: {name: values for name, values in test.over.items() if are_numbers(values)}
-        for test, _ in tests
-    }
+    tests: Sequence[tuple[MatrixTest | None, Sequence[Point]]]
+    tests = [(None, points)] if matrix is None else points_of_tests(study, points)
+
     # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
-    units = {name: domain.unit for name, domain in study.scenario.search.items()}
+    units = {name: domain.unit for name, domain in study.ranges.items()}
+    ends: dict[str, dict[str, tuple[float, float]]] = {}
     for test, own in tests:
         searchable = searchable_in(own[0].scenario)
-        for axis in axes[test.name]:
+        lists = {name: each for name, each in study.lists_of(test).items() if are_numbers(each)}
+        for axis in lists:
             if axis in searchable or SPEED_DIMENSION in axis:
                 units[axis] = searchable[axis].unit if axis in searchable else ""
+        of_test = {axis: (float(min(each)), float(max(each))) for axis, each in lists.items()}
+        domains = study.ranges_of(test)
+        of_test |= {axis: (each.lower, each.upper) for axis, each in domains.items()}
+        for axis, both in of_test.items():
+            ends.setdefault(axis, {})["" if test is None else test.name] = both
     speeds = [name for name, unit in units.items() if unit in SPEED_UNITS]
     name = by or SPEED_DIMENSION
     problem = f"study {study.name!r} varies no {'speed' if by is None or not speeds else by}"
@@ -218,70 +224,49 @@ def span_of(study: Study, by: str | None) -> Span:
         raise InputError("permit", problem, "a study that varies a speed")
     check_name("by", problem, name, speeds)
 
-    # A searched parameter has one range for all tests.
-    domain = study.scenario.search.get(name)
-    if domain is not None:
-        return Span(name, domain.unit, domain.lower, domain.upper)
-
-    # An axis ends at the least of the tests' greatest values.
-    ends = {
-        test: (float(min(over[name])), float(max(over[name])))
-        for test, over in axes.items()
-        if name in over
-    }
-    high = min(last for _, last in ends.values())
-    goes_on = any(last > high for _, last in ends.values())
+    # It ends at the least of the tests' greatest values.
+    high = min(last for _, last in ends[name].values())
+    goes_on = any(last > high for _, last in ends[name].values())
     return Span(
         name=name,
         unit=units[name],
-        low=min(low for low, _ in ends.values()),
+        low=min(low for low, _ in ends[name].values()),
         high=high,
-        ending=tuple(test for test, (_, last) in ends.items() if goes_on and last == high),
-        left_out=tuple(test for test, (low, _) in ends.items() if low > high),
+        ending=tuple(test for test, (_, last) in ends[name].items() if goes_on and last == high),
+        left_out=tuple(test for test, (low, _) in ends[name].items() if low > high),
     )
 
 
 def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
-    for test, alone, fixed in _tests_alone(model.evaluator.study, span.name):
+    for test, alone, fixed in _tests_alone(with_ranges(model.evaluator.study), span.name):
         evaluator = model.evaluator.for_study(in_phases(alone, assemble(alone)), verified=0)
         members = evaluator.characteristics
         low = high = fixed
         column = None
-        if span.name in alone.scenario.search:
+        if span.name in alone.ranges:
             column = members.names.index(span.name)
             low, high = float(members.lower[column]), float(members.upper[column])
         if low <= span.high:
-            # At points that are selected no original decides whether an encounter counts.
-            own = Model(model.fit, evaluator, model.unsafe, points=(0,))
+            own = Model(model.fit, evaluator, model.unsafe, all_count=True)
             ranges.append(EncounterRange(test, own, column, low, min(high, span.high)))
     return ranges
 
 
 def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
-    """Each test of a study at each combination of its axes that do not move, as a study of its own
-    that searches those that do; with its name and its value of a parameter, minus infinity where it
-    has none.
+    """Each test of a study at each combination of its axes that do not move, as a study of its own;
+    with its name and its value of a parameter, minus infinity where it has none.
     """
     matrix = study.matrix
     if matrix is None:
         yield "", study, -np.inf
         return
-    for test, points in points_of_tests(study, assemble(study).points):
-        domains = domains_of_axes(study, test, points[0].scenario)
-        fixed = without_axes(test, domains)
+    for test in matrix.tests:
+        lists = study.lists_of(test)
         weathers = [[weather] for weather in test.weathers] or [[]]
-        for weather, *place in product(weathers, *fixed.over.values()):
-            over = dict(zip(fixed.over, place, strict=True))
-            alone = replace_in(at_values(fixed, over), weathers=weather)
-            searched = {**study.scenario.search, **domains}
-            yield (
-                test.name,
-                replace_in(
-                    study,
-                    matrix=replace_in(matrix, tests=[alone], point=""),
-                    scenario=replace_in(study.scenario, search=searched),
-                ),
-                float(over[by]) if by in over else -np.inf,
-            )
+        for weather, *place in product(weathers, *lists.values()):
+            over = dict(zip(lists, place, strict=True))
+            alone = replace_in(at_values(test, over), weathers=weather)
+            fixed = float(over[by]) if by in over else -np.inf
+            yield test.name, study.with_tests([alone]), fixed

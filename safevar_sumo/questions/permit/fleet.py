@@ -273,7 +273,7 @@ def _columns(
 
         # Each name once, and none that means something else.
         tests = study.matrix.tests if study.matrix else []
-        varied = {*study.scenario.search, *(name for test in tests for name in test.over)}
+        varied = {*study.ranges, *(name for test in tests for name in study.axes_of(test))}
         for column, name in enumerate(names):
             if names.count(name) > 1:
                 raise InputError("", f"the column {name!r} is there twice", "each column once")

@@ -212,9 +212,7 @@ def repair(
     if not len(first):
         kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
         text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
-        raise InputError(
-            study.source, text, "a smaller --margin, or other domains under [scenario.search]"
-        )
+        raise InputError(study.source, text, "a smaller --margin, or narrower ranges of the axes")
     robustness = problem.robustness_with(problem.today, first, "the driving system of today")
     worst_first = np.argsort(robustness, kind="stable")
     vehicles = first[worst_first]

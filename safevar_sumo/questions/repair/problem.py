@@ -326,7 +326,7 @@ class RepairProblem:
         all without any.
         """
         selection = Selection(
-            tuple(parameter.name for parameter in self.parameters), tuple(points), arrays
+            tuple(parameter.name for parameter in self.parameters), tuple(points) or None, arrays
         )
         return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
 

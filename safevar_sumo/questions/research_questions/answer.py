@@ -246,7 +246,7 @@ def _verdict(case: Case) -> str:
     except UnanswerableError:
         return f"{text}."
     of_all = len(case.solutions_of(NSGA2))
-    where = " in the same encounter" if case.study.scenario.search else ""
+    where = " in the same encounter" if case.study.ranges else ""
     less_safe = (
         f"{critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original"
         f" vehicle{where}."
@@ -317,7 +317,7 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
             )
     if table == "rq1":
         known = (
-            {SAFETY_DEGREE} if case.study.scenario.search else {*case.original}
+            {SAFETY_DEGREE} if case.study.ranges else {*case.original}
         )  # in a solution's encounter
         omitted = [
             name for name, value in case.original.items() if math.isnan(value) or name not in known

@@ -148,7 +148,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
 
-    In a study that searches its scenario only the original's safety degree is known in the
+    Where encounters are ranges only the original's safety degree is known in the
     encounter of a solution, so that TET, TIT and aveDece are undefined; the original's value is the
     mean over these encounters.
     """
@@ -160,7 +160,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     )
     degrees = case.original_degrees(solutions)
     original = case.original
-    if case.study.scenario.search:
+    if case.study.ranges:
         original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
 
     # Differences from the original, by quantity.

@@ -271,7 +271,7 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values = _values(case, algorithm, metric, over_runs)
         originals = _originals(case, algorithm, metric, over_runs)
-        original = originals.mean() if case.study.scenario.search else case.original[metric.name]
+        original = originals.mean() if case.study.ranges else case.original[metric.name]
         test = (
             signed_rank_test(values, originals.reindex(values.index))
             if over_runs
@@ -356,7 +356,7 @@ def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> 
     scenario, the safety degree in the same encounters, and undefined for other metrics.
     """
     values = _values(case, algorithm, metric, over_runs)
-    if not case.study.scenario.search:
+    if not case.study.ranges:
         return pd.Series(case.original[metric.name], index=values.index, dtype=float)
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)

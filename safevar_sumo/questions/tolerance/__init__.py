@@ -16,8 +16,10 @@ from safevar_sumo.questions.causes import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion
+from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
+from safevar_sumo.questions.tolerance.in_ranges import RANGES
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
     INTERVALS,
@@ -28,8 +30,6 @@ from safevar_sumo.questions.tolerance.limits import (
     phases_of,
 )
 from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
-from safevar_sumo.questions.tolerance.up_to import names_left_out, smaller_cuts, study_up_to
-from safevar_sumo.questions.tolerance.wider import WIDER
 
 
 @question
@@ -43,7 +43,7 @@ from safevar_sumo.questions.tolerance.wider import WIDER
     fits=FITS,
     points=POINTS,
     nearest=NEAREST,
-    wider=WIDER,
+    ranges=RANGES,
 )
 def tolerance(
     subject: Subject,
@@ -61,7 +61,7 @@ def tolerance(
     """Find how far each characteristic may change: alone, and all at the same time.
 
     The limits hold in every parameter set of the vehicle model, within a scope that is stated. No
-    unsafe solution of results lies within the joint limits. In a study that searches its scenario
+    unsafe solution of results lies within the joint limits. Where encounters are ranges
     they hold in all encounters in which the original vehicle is safe.
 
     Parameters
@@ -75,16 +75,16 @@ def tolerance(
         all.
     margin
         Clearance that every vehicle must keep with the study's own parameter set [m], between
-        bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m in a
-        study that searches its scenario, whose originals keep more.
+        bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m where
+        encounters are ranges, whose originals keep more.
     unsafe
         What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
     fits
         Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
     up_to
-        Limits that hold up to a value of a searched parameter or of an axis of the matrix, such as
-        speed=40: encounters with a larger value do not count.
+        Limits that hold up to a value of an axis, such as speed=40: encounters with a larger value
+        do not count.
     at_tests
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.

@@ -26,7 +26,7 @@ VALUES = 17
 each model.
 """
 FALSIFICATIONS, FALSIFICATION_SHARE, GENERATIONS = 20, 0.1, 5
-"""Largest number of attacks on a limit, in a study that searches its scenario; the share of the
+"""Largest number of attacks on a limit, where encounters are ranges; the share of the
 simulations that search for a counterexample of each, though never less than `LEAST_SIMULATIONS`,
 and its number of generations, the first at the limit itself.
 """
@@ -150,8 +150,8 @@ class AloneSearch:
             models, number = self.models, 2
 
     def attack(self, model: Model, budget: int) -> None:
-        """Move ends in before what a falsification in a model finds in other encounters, in a study
-        that searches its scenario.
+        """Move ends in before what a falsification in a model finds in other encounters, where
+        these are ranges.
         """
         if self.ends and len(model.characteristics.scenario):
             share = max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)

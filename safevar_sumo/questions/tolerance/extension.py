@@ -25,7 +25,7 @@ ORDERS = 31
 SLAB_SIMULATIONS = 512
 """Number of simulations that falsify the room beyond a limit."""
 SLAB_CORNERS = 512
-"""Number of corners of that room, in a study that searches its scenario: the test of the box meets
+"""Number of corners of that room, where encounters are ranges: the test of the box meets
 many more.
 """
 KNOWN_CORNERS = 32

@@ -23,6 +23,13 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Frames, Rows, tabulate
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
+from safevar_sumo.questions.tolerance.in_ranges import (
+    RANGES,
+    RANGES_STAGE,
+    SLOWNESS,
+    rows_in_ranges,
+    usual_settings,
+)
 from safevar_sumo.questions.tolerance.rows import (
     CHARACTERISTIC,
     LIMITS,
@@ -39,13 +46,6 @@ from safevar_sumo.questions.tolerance.scans import (
     scan,
 )
 from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether, budget_of_set
-from safevar_sumo.questions.tolerance.wider import (
-    SLOWNESS,
-    WIDER,
-    WIDER_STAGE,
-    usual_settings,
-    wider_rows,
-)
 from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
@@ -141,8 +141,8 @@ def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None)
     own = USUAL_BOXES * budget / points
     of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
     phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
-    if study.wider:
-        phases[WIDER_STAGE] = SLOWNESS * usual_settings(evaluator, budget, 1 + sets)
+    if there := usual_settings(evaluator, budget, 1 + sets):
+        phases[RANGES_STAGE] = SLOWNESS * there
     return phases
 
 
@@ -248,7 +248,7 @@ def answer_limits(asked: Asked) -> Answer:
     nearest = []
     if rows.broken and together is not None:
         nearest = nearest_limits(models, asked.limits)
-    wider = wider_rows(asked, together) if found.is_safe else []
+    in_ranges = rows_in_ranges(asked, together) if found.is_safe else []
     refusal = demand = ""
     if not found.is_safe:
         breach = asked.unsafe.breach_in_words(asked.original)
@@ -259,7 +259,7 @@ def answer_limits(asked: Asked) -> Answer:
     if is_kept is None and asked.limits:
         failures = ("with --quick, no limit is called kept: ask without it",)
     sentences = verdict_sentences(
-        models, found.alone, together, asked, rows.broken, nearest, wider, demand
+        models, found.alone, together, asked, rows.broken, nearest, in_ranges, demand
     )
     tested = tested_sentences(models, together)
     return Answer(
@@ -276,7 +276,7 @@ def answer_limits(asked: Asked) -> Answer:
             "up_to": None if asked.up_to is None else float(asked.up_to.partition("=")[2]),
             **_numbers(found),
         },
-        tables=_tables(found, rows.rows, nearest, wider),
+        tables=_tables(found, rows.rows, nearest, in_ranges),
         failures=failures,
         draw=draw_bars,
     )
@@ -289,7 +289,7 @@ def _numbers(found: FoundLimits) -> JsonObject:
     return {**found.together.numbers, "fits_tried": len(found.models.members)}
 
 
-def _tables(found: FoundLimits, rows: Rows, nearest: Rows, wider: Rows) -> Frames:
+def _tables(found: FoundLimits, rows: Rows, nearest: Rows, in_ranges: Rows) -> Frames:
     """The tables of an answer, the limits first; those without rows are left out."""
     scans = found.scans
     # Joint limits lead, without those of the whole domain; else those of each alone.
@@ -323,8 +323,8 @@ def _tables(found: FoundLimits, rows: Rows, nearest: Rows, wider: Rows) -> Frame
         tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
     if nearest:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
-    if wider:
-        tables["wider"] = tabulate("The same limits in a wider scope", WIDER, wider)
+    if in_ranges:
+        tables["ranges"] = tabulate("The same limits in the ranges of the study", RANGES, in_ranges)
     return tables
 
 

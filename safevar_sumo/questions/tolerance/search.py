@@ -193,15 +193,18 @@ class BoxSearch(BoxGeometry):
         self.gap = 0.0
         self.search_count = 0
         self.seed = model.evaluator.seed
-        self.batch = max(BATCH // len(model.points or model.evaluator.system.points), LEAST_BATCH)
+        self.batch = max(BATCH // len(model.numbers_of_points), LEAST_BATCH)
 
     def join(self, model: Model) -> None:
         """Take a model into the search, or more points of one that is in it."""
         for number, member in enumerate(self.models):
             is_same = member.at_worst_phase == model.at_worst_phase
             if member.evaluator is model.evaluator and is_same:
-                points = (*member.points, *model.points) if member.points and model.points else ()
-                model = member._replace(points=tuple(sorted({*points})))
+                if member.points is None or model.points is None:
+                    model = member._replace(points=None)
+                else:
+                    points = {*member.points, *model.points}
+                    model = member._replace(points=tuple(sorted(points)))
                 del self.models[number]
                 break
         self.models.insert(0, model)

@@ -106,7 +106,7 @@ class Validator:
     def validate(self, box: Box, attempt: int) -> Validation:
         """Test some corners of a box, and falsify it between the tests and at them.
 
-        In a study that searches its scenario all corners are tested: few encounters break a box,
+        Where encounters are ranges all corners are tested: few encounters break a box,
         and the search of the next one has to know them.
         """
         corners = self._corners(box, attempt)
@@ -146,7 +146,7 @@ class Validator:
                 starts = box.with_ends(STARTS, rng)
                 known = np.concatenate([worst[: KNOWN_BETWEEN // 2], starts[:KNOWN]])
                 validation = self._search(validation, known, starts, rng)
-        # Of a study that searches its scenario there are more corners.
+        # Of a study whose encounters are ranges there are more corners.
         if not validation.failures:
             validation, _ = self._test(validation, corners[MAX_CORNERS:])
         return validation if validation.failures else self._meet_phases(validation)

@@ -33,7 +33,7 @@ def verdict_sentences(
     asked: Asked,
     broken: Sequence[str],
     nearest: Rows,
-    wider: Rows,
+    in_ranges: Rows,
     refusal: str,
 ) -> Iterator[str]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
@@ -62,8 +62,8 @@ def verdict_sentences(
             yield undecidable_in_words(vague)
 
     # What is unsafe elsewhere.
-    for name, _, _, verdict, _ in wider:
-        yield f"In the wider scope of {name} {verdict}"
+    for _, _, verdict, *_ in in_ranges:
+        yield f"In the ranges of the study {verdict}"
     names = [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]
     if len(names) > 1:
         yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
@@ -84,7 +84,7 @@ def verdict_sentences(
 def tested_sentences(models: Models, together: LimitsTogether | None) -> Iterator[str]:
     """How joint limits were tested; nothing without such limits."""
     study = models.own.evaluator.study
-    if together is not None and study.scenario.search:
+    if together is not None and study.ranges:
         share = share_in_words(models.own.evaluator.share_left_out)
         yield (
             f"Of the encounters over the domain {share} do not count, because the original vehicle"

@@ -1,13 +1,7 @@
-"""The same limits in the scope of a wider study about the same car, which the study names by its
-key `wider`.
-"""
+"""The same limits in all encounters in the ranges of the study, which hold its tests."""
 
 from __future__ import annotations
 
-from contextlib import suppress
-from pathlib import Path
-
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
@@ -19,13 +13,12 @@ from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.questions.tolerance.up_to import study_up_to
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION
-from safevar_sumo.scenarios.declared import read_study
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 
-WIDER_STAGE = "attack in the wider scope"
+RANGES_STAGE = "attack in the ranges"
 USUAL_ATTACKS, NEW_SETTINGS = 5, 384
 """Usual number of attacks, until limits hold up to some speed, and number of settings with which
 each begins in a parameter set.
@@ -34,65 +27,41 @@ SLOWNESS = 2.5
 """How much longer a simulation takes there, as benchmarks/progress.py showed for `wear`: fewer of
 them are simulated at a time.
 """
-WIDER: Columns = {
-    "study": "the wider study",
-    "scope": Column("", "what it covers", is_shown=False),
+RANGES: Columns = {
+    "scope": "what they cover",
     "kept": "whether the limits above hold there in every parameter set",
     "verdict": "what a search for counterexamples found there",
     "fails_at": Column("", "the vehicle that fails first, and its encounter", is_shown=False),
+    "simulate": Column("", "the command that simulates it", is_detail=True),
 }
 
 
-def wider_study(study: Study) -> Study:
-    """The study that a study names as its wider one: a file beside its own, or a shipped study.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it varies other characteristics.
-    """
-    paths = [
-        path for folder in study.origin.places if (path := Path(folder, study.wider)).is_file()
-    ]
-    try:
-        wider = read_study(str(paths[0]) if paths else study.wider)
-    except InputError as error:
-        raise InputError(
-            study.source, f"wider = {study.wider!r}: {error.problem}", error.legal
-        ) from None
-    own = study.vehicle.characteristics
-    others = wider.vehicle.characteristics
-    if {name: row.unit for name, row in own.items()} != {
-        name: row.unit for name, row in others.items()
-    }:
-        problem = f"wider = {study.wider!r} varies {', '.join(others)}"
-        raise InputError(
-            study.source, problem, f"a study of the same characteristics: {', '.join(own)}"
-        )
-    return wider
+def study_in_ranges(study: Study) -> Study | None:
+    """The study in its ranges; None if it states none beside its listed encounters."""
+    return None if study.ranges or not study.states_ranges else with_ranges(study)
 
 
 def usual_settings(evaluator: Evaluator, budget: int, sets: int) -> float:
     """Usual number of settings, each at as many points as the evaluator's, that the attack in the
-    wider scope simulates in so many parameter sets.
+    ranges simulates in so many parameter sets.
     """
-    there = evaluator.for_study(wider_study(evaluator.study)).system.points
+    study = study_in_ranges(evaluator.study)
+    if study is None:
+        return 0.0
+    there = evaluator.for_study(study).system.points
     number = USUAL_ATTACKS * (budget + NEW_SETTINGS * sets)
     return number * len(there) / len(evaluator.system.points)
 
 
-def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
-    """The row of `WIDER` for a study that names a wider one: an attack on the limits together in
-    the wider scope, or without such limits on the specified ones.
+def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
+    """The row of `RANGES` for a study that states ranges: an attack on the limits together there,
+    or without such limits on the specified ones.
     """
     evaluator = asked.evaluator
     budget = asked.budget
-    if not evaluator.study.wider or together is None:
+    study = study_in_ranges(evaluator.study)
+    if study is None or together is None:
         return []
-    study = wider_study(evaluator.study)
-    if asked.up_to is not None:
-        with suppress(InputError):  # it ends below this value
-            study = study_up_to(study, asked.up_to)
     other = evaluator.for_study(study)
     unsafe = limit_criterion(other, study, asked.criterion, asked.margin, other.evaluate_original())
     models = models_of(other, unsafe, asked.fits)
@@ -100,13 +69,13 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
         return []
     box = _box_in(models, evaluator, together.specified if together.box is None else together.box)
     seed = study.search.seed
-    judges = judges_of(models.members, WIDER_STAGE)
+    judges = judges_of(models.members, RANGES_STAGE)
     stream = seed, Stream.WIDER_SCOPE
     lowest = None
-    with evaluator.phases.stage(WIDER_STAGE, usual_settings(evaluator, budget, len(judges))):
+    with evaluator.phases.stage(RANGES_STAGE, usual_settings(evaluator, budget, len(judges))):
         found = falsify_limits(box, judges, budget, stream)
-        if found.failures and study.scenario.search:
-            searched = study.scenario.search
+        if found.failures:
+            searched = study.ranges
             leading = SPEED_DIMENSION if SPEED_DIMENSION in searched else next(iter(searched))
             column = other.characteristics.names.index(leading)
             start = float(box.lower[column])
@@ -117,11 +86,12 @@ def wider_rows(asked: Asked, together: LimitsTogether | None) -> Rows:
             lowest = min(failing, key=lambda pair: float(pair[1][column]))
     verdict, failure = _verdict(models, box, found, lowest)
     fails_at = None if failure is None else other.characteristics.named(failure.setting)
-    return [(study.name, scope_of(study), not found.failures, verdict, fails_at)]
+    command = None if failure is None else failure.command
+    return [(scope_of(study), not found.failures, verdict, fails_at, command)]
 
 
 def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
-    """A box of the vehicle's characteristics in all encounters of the wider study."""
+    """A box of the vehicle's characteristics in all encounters of a study in its ranges."""
     members = models.own.characteristics
     own = evaluator.characteristics
     lower = members.lower.copy()

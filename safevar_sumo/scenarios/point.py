@@ -1,0 +1,48 @@
+"""A point: a scenario in a weather, and the ranges of its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from safevar_sumo.records import Quantity
+from safevar_sumo.scenarios.base import Scenario
+from safevar_sumo.study import Constraint, Domain, Weather
+
+SPEED_DIMENSION = "speed"
+"""Keys of a point that are rows and columns where `simulate` tabulates a matrix."""
+
+
+class Point(NamedTuple):
+    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
+    the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
+    All of it begins `phase` steps later, a number or of shape (N,). `ranges` are those of its
+    parameters of which settings have values, by name; None if it takes all of them. Its encounters
+    satisfy the `constraints`.
+    """
+
+    scenario: Scenario
+    weather: Weather
+    name: str = ""
+    parameters: tuple[tuple[str, Any], ...] = ()
+    allowed_impact_speed: float = 0.0
+    phase: Quantity = 0.0
+    ranges: Mapping[str, Domain] | None = None
+    constraints: tuple[Constraint, ...] = ()
+
+    def own(self, values: Mapping[str, Quantity]) -> dict[str, Quantity]:
+        """Those of the values that are of parameters of this point."""
+        known = values if self.ranges is None else self.ranges
+        return {name: value for name, value in values.items() if name in known}
+
+    def meets(self, values: Mapping[str, Quantity]) -> Quantity:
+        """Whether the encounters with these values are some of this point's, of shape (N,), or one
+        truth for all.
+        """
+        found: Quantity = True
+        for name, domain in (self.ranges or {}).items():
+            if name in values:
+                found &= (values[name] >= domain.lower) & (values[name] <= domain.upper)
+        for constraint in self.constraints:
+            found &= constraint.allows(values)
+        return found

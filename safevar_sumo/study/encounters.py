@@ -1,0 +1,326 @@
+"""What the vehicles of a study meet: tests, whose axes list values or are ranges of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Final, Literal, Self
+
+from msgspec import Meta
+from msgspec.structs import replace
+
+from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.study.characteristics import (
+    Constraint,
+    Domain,
+    ShortText,
+    check_constraints,
+    mistake,
+)
+from safevar_sumo.study.marks import OF_SCENARIO, ORDERED, PART_OF_SYSTEM, Table
+from safevar_sumo.study.parameters import searched
+
+Parameters = dict[str, Any]
+WORST = "worst"
+"""The aggregate of a matrix by which the least safety degree decides."""
+TESTS: Final = "tests"
+RANGES: Final = "ranges"
+"""What the vehicles of a study meet: listed encounters, or any in the ranges of its axes."""
+BY_EXCESS = "impact_excess >"
+"""The aggregate of a matrix in which impacts may be allowed."""
+
+
+class ModelTable(Table, frozen=True, kw_only=True):
+    """A `model` by its name, or by `package.module:Name`, and its `parameters`.
+
+    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu`
+    is an FMU, named by its path: `inputs` and `outputs` are the FMU's variables by the quantity
+    they receive or return. `files` are data files, or folders of them, that a model of your own
+    reads, relative to the study's file.
+    """
+
+    model: str
+    parameters: Parameters = {}
+    kind: Literal["", "traci", "fmu"] = ""
+    inputs: dict[str, str] = {}
+    outputs: dict[str, str] = {}
+    files: list[str] = []
+
+    def __post_init__(self) -> None:
+        if self.kind != "fmu" and (self.inputs or self.outputs):
+            raise mistake(
+                f"{self.model!r} is no FMU, but has inputs or outputs",
+                'kind = "fmu", or no such keys',
+            )
+
+
+ORIGINAL_MARGIN = 0.3
+"""Distance that the original vehicle must keep in an encounter that is searched, unless the study
+says another [m].
+"""
+
+
+class AxisTable(Table, frozen=True, kw_only=True):
+    """A parameter of encounters: the values that its test drives, `at`, and the range in which any
+    value may occur, from `lower` to `upper`. A list is short for `at`.
+
+    The range is by default that of `at`, or without `at` the widest that the scenario's class
+    declares. `original` is where the original vehicle drives in a search, by default the first of
+    `at`, else the test's own value. Without `at` a test drives at its own value.
+    """
+
+    at: list[Any] = []
+    lower: float | None = None
+    upper: float | None = None
+    original: float | None = None
+    unit: str = ""
+    meaning: ShortText = ""
+
+    def __post_init__(self) -> None:
+        _ = self.range  # refused with the path of the axis
+
+    @property
+    def range(self) -> Domain | None:
+        """The range; None without one, as of texts and seeds."""
+        if self.lower is None or self.upper is None or self.original is None:
+            return None
+        return Domain(
+            unit=self.unit,
+            original=self.original,
+            lower=self.lower,
+            upper=self.upper,
+            meaning=self.meaning,
+        )
+
+
+def axis_of(domain: Domain) -> AxisTable:
+    """An axis whose range is a domain."""
+    return AxisTable(
+        lower=domain.lower,
+        upper=domain.upper,
+        original=domain.original,
+        unit=domain.unit,
+        meaning=domain.meaning,
+    )
+
+
+Axes = dict[str, Annotated[list[Any], Meta(min_length=1)] | AxisTable]
+"""Axes of encounters by name."""
+
+
+class ScenarioTable(ModelTable, frozen=True, kw_only=True):
+    """The scenario: its `model` and `parameters`; `over` are axes of its encounters, in a matrix of
+    each test that does not state them: parameters of the scenario or of the weather.
+
+    Where encounters are ranges, the original vehicle drives in the same encounter as each variant,
+    and must keep at least `margin` [m] between bodies there: otherwise the encounter does not
+    count, as it shows nothing of the variant. A simulator of the user's own that is not
+    deterministic simulates each setting `repeats` times: the share of unsafe runs, the worst run,
+    and means of metrics count.
+    """
+
+    over: Annotated[Axes, ORDERED] = {}
+    margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
+    repeats: Annotated[int, Meta(ge=1, le=1000)] = 1
+
+
+class Weather(Table, frozen=True, kw_only=True):
+    """Weather as data: its `name`, and its effects on the road and on the sensors.
+
+    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its
+    depth on the road [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as
+    the grip of the same road when dry. `recognition_delay` is the additional time that the sensors
+    need to recognise a road user [s], for every ADS; the reaction time of an ADS is one of its
+    parameters. `light` decides only whether a rating darkens the weather for its tests by night.
+    """
+
+    name: str
+    road_friction: Annotated[
+        float,
+        Meta(gt=0, le=1.5),
+        searched(0.1, 1.2, "-", "road friction, factor on the tyres' friction"),
+    ]
+    visibility: Annotated[
+        float,
+        Meta(gt=0, le=1.5),
+        searched(0.05, 1.5, "-", "visibility, factor on the range of the sensors"),
+    ]
+    recognition_delay: Annotated[
+        float,
+        Meta(ge=0, le=5),
+        searched(0.0, 2.0, "s", "additional time that the sensors need in this weather"),
+    ] = 0.0
+    light: Literal["day", "night"] = "day"
+    water: Annotated[float, Meta(ge=0, le=20)] = 0.0
+
+
+def as_axes(over: Axes) -> dict[str, AxisTable]:
+    """Axes as tables."""
+    return {
+        name: axis if isinstance(axis, AxisTable) else AxisTable(at=axis)
+        for name, axis in over.items()
+    }
+
+
+class MatrixTest(Table, frozen=True, kw_only=True):
+    """A test of a matrix: its `name`, and a scenario at every combination of the values of the axes
+    in `over`, in each of the `weathers`.
+
+    `parameters` are added to those of the study's scenario; a test with a `model` of its own has
+    only its own parameters. A weather is a name or a table. An impact is allowed up to a relative
+    speed of `allowed_impact_speed` [km/h], by which the metric `impact_excess` counts.
+    """
+
+    name: Annotated[str, Meta(min_length=1)]
+    model: str = ""
+    parameters: Parameters = {}
+    over: Annotated[Axes, ORDERED] = {}
+    weathers: list[str | Weather] = []
+    allowed_impact_speed: Annotated[float, Meta(ge=0, le=250)] = 0.0
+
+    def __post_init__(self) -> None:
+        for name in self.parameters.keys() & self.over.keys():
+            if self.axes[name].at:
+                raise mistake(f"{name} is in parameters and in over", "one of them")
+
+    @property
+    def axes(self) -> dict[str, AxisTable]:
+        """The axes of `over`."""
+        return as_axes(self.over)
+
+
+class MatrixTable(Table, frozen=True, kw_only=True):
+    """The test points at which every setting is simulated: those of `tests`, or all cells of a
+    `protocol`, which then rates every setting.
+
+    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree,
+    `drac >` at that with the largest value of this metric, `ttc_min <` with the smallest.
+    """
+
+    tests: list[MatrixTest] = []
+    protocol: Literal["", "euro_ncap_2026"] = ""
+    aggregate: Annotated[str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")] = WORST
+
+    def __post_init__(self) -> None:
+        if bool(self.tests) == bool(self.protocol):
+            raise mistake(
+                f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
+            )
+        if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
+            problem = f"aggregate = {self.aggregate!r}, and a test allows an impact"
+            raise mistake(problem, f"{BY_EXCESS!r}, or no allowed_impact_speed")
+
+
+class Encounters(Table, frozen=True, kw_only=True):
+    """What vehicles meet: a scenario in a weather, or the tests of a matrix; listed encounters, or
+    any in the ranges of the axes.
+    """
+
+    scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
+    encounters: Literal["tests", "ranges"] = TESTS
+    weather: Annotated[str | Weather, PART_OF_SYSTEM] = ""
+    matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None
+    constraints: list[Constraint] = []
+
+    def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
+        """Refuse axes that something else sets, too, and what is about ranges without any."""
+        axes = {name: axis for _, own in self._axes_by_test for name, axis in own.items()}
+        for name, axis in axes.items():
+            if self.matrix is not None and self.matrix.protocol:
+                problem = f"over.{name}: the cells of {self.matrix.protocol} are fixed"
+                raise InputError("", problem, "matrix.tests")
+            if name in characteristics:
+                problem = f"over.{name}: a characteristic of the vehicle has this name"
+                raise InputError("", problem, "a unique name")
+            if not axis.at and axis.range is None:
+                problem = f"over.{name}: no original value, as the test states none"
+                raise InputError("", problem, "original = a value of its range")
+        for name, axis in as_axes(self.scenario.over).items():
+            if axis.at and self.matrix is None:
+                problem = f"scenario.over.{name} lists values, and the study has no tests"
+                raise InputError("", problem, "[[matrix.tests]], or a range alone")
+        if self.encounters == RANGES and not self.states_ranges:
+            problem = f"encounters = {RANGES!r}, and no axis has a range"
+            raise InputError("", problem, "over = { NAME = { lower = X, upper = Y } }, or 'tests'")
+        if self.scenario.margin != ORIGINAL_MARGIN and not self.states_ranges:
+            problem = f"scenario.margin = {self.scenario.margin:g}, and no axis has a range"
+            raise InputError("", problem, "an axis with lower and upper, or no margin")
+        of_axes = {name: axis.range for name, axis in axes.items() if axis.range is not None}
+        check_constraints({**characteristics, **of_axes}, self.constraints)
+        tests = [] if self.matrix is None else [test.name for test in self.matrix.tests]
+        for constraint in self.constraints:
+            for name in constraint.tests:
+                check_name("", f"constraints.tests: there is no test {name!r}", name, tests)
+
+    @property
+    def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
+        """The axes of each test, or of the only one."""
+        tests = [] if self.matrix is None else self.matrix.tests
+        return [(test, self.axes_of(test)) for test in tests] or [(None, self.axes_of(None))]
+
+    def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
+        """The axes of a test, its own first."""
+        own = {} if test is None else test.axes
+        shared = as_axes(self.scenario.over)
+        return own | {name: shared[name] for name in shared if name not in own}
+
+    def lists_of(self, test: MatrixTest | None) -> dict[str, list[Any]]:
+        """The axes of a test whose values are driven one after another."""
+        ranges = self.ranges_of(test)
+        axes = self.axes_of(test).items()
+        return {name: axis.at for name, axis in axes if axis.at and name not in ranges}
+
+    def ranges_of(self, test: MatrixTest | None) -> dict[str, Domain]:
+        """The axes of a test of which any value may occur."""
+        if self.encounters == TESTS:
+            return {}
+        ranges = {name: axis.range for name, axis in self.axes_of(test).items()}
+        return {name: domain for name, domain in ranges.items() if domain is not None}
+
+    @property
+    def states_ranges(self) -> bool:
+        """Whether an axis has a range beside or without listed values."""
+        return any(axis.range for _, own in self._axes_by_test for axis in own.values())
+
+    @property
+    def ranges(self) -> dict[str, Domain]:
+        """Of which parameters of its encounter each setting has a value beside the vehicle: the
+        axes of all tests whose values may be any, each as wide as in its widest test; those of
+        [scenario.over] alone come last.
+        """
+        found: dict[str, Domain] = {}
+        by_test = [(test, self.ranges_of(test)) for test, _ in self._axes_by_test]
+        names = [name for test, own in by_test for name in own if test and name in test.over]
+        names += [name for _, own in by_test for name in own]
+        for name in dict.fromkeys(names):
+            own = [ranges[name] for _, ranges in by_test if name in ranges]
+            lower = min(domain.lower for domain in own)
+            upper = max(domain.upper for domain in own)
+            found[name] = replace(own[0], lower=lower, upper=upper)
+        return found
+
+    def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
+        """The study with other axes of each test, and of all."""
+        matrix = self.matrix
+        if matrix is not None:
+            tests = [replace(test, over=change(test.axes)) for test in matrix.tests]
+            matrix = replace(matrix, tests=tests)
+        scenario = replace(self.scenario, over=change(as_axes(self.scenario.over)))
+        return replace(self, matrix=matrix, scenario=scenario)
+
+    def listed(self) -> Self:
+        """The study without the ranges of axes that list values; itself if any value may occur."""
+        if self.encounters == RANGES:
+            return self
+        return self.mapped(lambda axes: {name: each.at for name, each in axes.items() if each.at})
+
+    def with_tests(self, tests: Sequence[MatrixTest]) -> Self:
+        """The study in these tests alone, with the constraints that concern them."""
+        assert self.matrix is not None
+        names = {test.name for test in tests}
+        constraints = [
+            replace(one, tests=[name for name in one.tests if name in names])
+            for one in self.constraints
+            if not one.tests or names & {*one.tests}
+        ]
+        matrix = replace(self.matrix, tests=[*tests], protocol="")
+        return replace(self, matrix=matrix, constraints=constraints)

@@ -1,0 +1,47 @@
+"""Questions about a part of a study: the commands that they print ask about the same part."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from typing import Any
+
+import pytest
+
+import safevar_sumo as sv
+from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.part import at_point
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool, json_of
+
+
+@pytest.mark.parametrize(
+    ("name", "options"), [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})]
+)
+def test_a_question_about_a_part_prints_commands_about_it(
+    name: str, options: dict[str, Any]
+) -> None:
+    part: dict[str, Any] = {"ranges": True, "point": "CPLA", "up_to": "speed=40"}
+    answer = find_question(name)("wear", pool=InlinePool(), **options, **part)
+    typed = shlex.split(answer.command)[3:]
+    assert json_of(*typed, "--jobs", "1") == json.loads(answer.render("json"))
+    following = shlex.split(answer.next)[4:]
+    assert following == ["wear", "--ranges", "--point", "CPLA", "--up-to", "speed=40"]
+
+
+@pytest.mark.slow
+def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_simulated() -> None:
+    part = {"characteristics": ("brakeTorque",), "point": "CPNCO"}
+    answer = sv.tolerance("wear", quick=True, pool=InlinePool(), **part)
+    (row,) = answer.tables["ranges"].to_dict("records")
+    assert not row["kept"]
+    typed = shlex.split(row["simulate"])[3:]
+    assert {"--ranges", "CPNCO", f"speed={row['fails_at']['speed']}"} <= {*typed}
+    rows = json_of(*typed)["tables"]["results"]["rows"]
+    (left,) = (one["simulated"] for one in rows if one["result"] == "safety_degree")
+    assert left < 0.1
+
+
+def test_a_study_at_one_of_its_points_has_no_constraint_of_its_ranges() -> None:
+    study = at_point(sv.load_study("alks"), "cut_out, speed 60, wet")
+    assert len(assemble(study).matrix) == 1
