@@ -67,14 +67,7 @@ class MovingTest:
 
     def box(self, box: Box) -> Box:
         """A box of vehicles, at all places."""
-        evaluator = self.model.evaluator
-        count = len(evaluator.characteristics.vehicle)
-        ends = evaluator.characteristics.lower, evaluator.characteristics.upper
-        lower, upper = (
-            np.concatenate([own[:count], last[count:]])
-            for own, last in zip((box.lower, box.upper), ends, strict=True)
-        )
-        return Box(evaluator.region, lower, upper)
+        return box.in_encounters_of(self.model.evaluator.region)
 
     def spread(self, vehicles: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Vehicles, shape (K, n), each at `PLACES` random places, shape (K PLACES, n + axes)."""

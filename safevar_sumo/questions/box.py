@@ -42,6 +42,16 @@ class Box:
         ends[side][column] = value
         return Box(self.region, *ends)
 
+    def in_encounters_of(self, region: FeasibleRegion) -> Box:
+        """The box of its vehicles, in all encounters of another region of the same vehicle."""
+        members = region.characteristics
+        count = len(members.vehicle)
+        return Box(
+            region,
+            np.concatenate([self.lower[:count], members.lower[count:]]),
+            np.concatenate([self.upper[:count], members.upper[count:]]),
+        )
+
     def at(self, points: FloatArray) -> FloatArray:
         """The settings at points of the unit cube, shape (M, n)."""
         return self.lower + points * (self.upper - self.lower)

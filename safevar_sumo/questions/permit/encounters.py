@@ -95,17 +95,11 @@ class EncounterRange(NamedTuple):
         """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
         None where there is nothing to search: no such encounter, or one vehicle in one.
         """
-        members = self.model.characteristics
-        count = len(lower)
-        ends = (
-            np.concatenate([lower, members.lower[count:]]),
-            np.concatenate([upper, members.upper[count:]]),
-        )
+        region = self.model.evaluator.region
+        box = Box(region, lower, upper).in_encounters_of(region)
         if self.column is not None:
-            ends[1][self.column] = min(up_to, self.high)
-        if self.low > up_to or (ends[0] == ends[1]).all():
-            return None
-        return Box(self.model.evaluator.region, *ends)
+            box = box.with_end(1, self.column, min(up_to, self.high))
+        return None if self.low > up_to or (box.lower == box.upper).all() else box
 
     def values_in(self, settings: FloatArray) -> FloatArray:
         """The value of the parameter in each of M settings, shape (M,)."""

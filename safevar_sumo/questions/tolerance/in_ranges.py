@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
@@ -63,11 +64,17 @@ def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
     if study is None or together is None:
         return []
     other = evaluator.for_study(study)
-    unsafe = limit_criterion(other, study, asked.criterion, asked.margin, other.evaluate_original())
+    try:
+        original = other.evaluate_original()
+    except InputError as error:
+        warn(f"the limits are not attacked in the ranges of the study: {error.problem}")
+        return []
+    unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)
     models = models_of(other, unsafe, asked.fits)
     if together.box is None and not asked.limits:
         return []
-    box = _box_in(models, evaluator, together.specified if together.box is None else together.box)
+    limits = together.specified if together.box is None else together.box
+    box = limits.in_encounters_of(other.region)
     seed = study.search.seed
     judges = judges_of(models.members, RANGES_STAGE)
     stream = seed, Stream.WIDER_SCOPE
@@ -88,20 +95,6 @@ def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
     fails_at = None if failure is None else other.characteristics.named(failure.setting)
     command = None if failure is None else failure.command
     return [(scope_of(study), not found.failures, verdict, fails_at, command)]
-
-
-def _box_in(models: Models, evaluator: Evaluator, box: Box) -> Box:
-    """A box of the vehicle's characteristics in all encounters of a study in its ranges."""
-    members = models.own.characteristics
-    own = evaluator.characteristics
-    lower = members.lower.copy()
-    upper = members.upper.copy()
-    for item in members.vehicle:
-        column = members.names.index(item.name)
-        column_here = own.names.index(item.name)
-        lower[column] = box.lower[column_here]
-        upper[column] = box.upper[column_here]
-    return Box(models.own.evaluator.region, lower, upper)
 
 
 def _verdict(
