@@ -142,7 +142,7 @@ def study_up_to(study: Study, text: str) -> Study:
         if not low < high <= highest:
             problem = f"{name}={high:g} is outside the domain of study {study.name!r}"
             raise InputError(OPTION, problem, f"a value above {low:g} and up to {highest:g}{unit}")
-    cut = study if study.ranges else _lists_up_to(study, name, high)
+    cut = study if name in study.ranges else _lists_up_to(study, name, high)
     return _ranges_up_to(cut, name, high)
 
 

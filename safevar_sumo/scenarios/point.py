@@ -10,7 +10,7 @@ from safevar_sumo.scenarios.base import Scenario
 from safevar_sumo.study import Constraint, Domain, Weather
 
 SPEED_DIMENSION = "speed"
-"""Keys of a point that are rows and columns where `simulate` tabulates a matrix."""
+"""The parameter by which `permit` asks, and that a scope names first."""
 
 
 class Point(NamedTuple):

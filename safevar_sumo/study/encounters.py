@@ -241,8 +241,8 @@ class Encounters(Table, frozen=True, kw_only=True):
         if self.encounters == RANGES and not self.states_ranges:
             problem = f"encounters = {RANGES!r}, and no axis has a range"
             raise InputError("", problem, "over = { NAME = { lower = X, upper = Y } }, or 'tests'")
-        if self.scenario.margin != ORIGINAL_MARGIN and not self.states_ranges:
-            problem = f"scenario.margin = {self.scenario.margin:g}, and no axis has a range"
+        if self.scenario.margin != ORIGINAL_MARGIN and not axes:
+            problem = f"scenario.margin = {self.scenario.margin:g}, and no encounter has an axis"
             raise InputError("", problem, "an axis with lower and upper, or no margin")
         of_axes = {name: axis.range for name, axis in axes.items() if axis.range is not None}
         check_constraints({**characteristics, **of_axes}, self.constraints)

@@ -53,7 +53,7 @@ ENDED_KEYS = {
     "scenario.search": (
         '[scenario.over] in its place; and encounters = "ranges", or --ranges, to search it'
     ),
-    "wider": "no such key: limits are attacked in the ranges of their own study",
+    "wider": "no such key: limits are tried in the ranges of their own study",
     "matrix.point": "--point",
 }
 """Keys that studies had, and what stands in their place."""

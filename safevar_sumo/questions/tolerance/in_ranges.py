@@ -19,7 +19,7 @@ from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 
-RANGES_STAGE = "attack in the ranges"
+RANGES_STAGE = "counterexamples in the ranges"
 USUAL_ATTACKS, NEW_SETTINGS = 5, 384
 """Usual number of attacks, until limits hold up to some speed, and number of settings with which
 each begins in a parameter set.
@@ -61,18 +61,16 @@ def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
     evaluator = asked.evaluator
     budget = asked.budget
     study = study_in_ranges(evaluator.study)
-    if study is None or together is None:
+    if study is None or together is None or (together.box is None and not asked.limits):
         return []
     other = evaluator.for_study(study)
     try:
         original = other.evaluate_original()
     except InputError as error:
-        warn(f"the limits are not attacked in the ranges of the study: {error.problem}")
+        warn(f"the limits are not tried in the ranges of the study: {error.problem}")
         return []
     unsafe = limit_criterion(other, study, asked.criterion, asked.margin, original)
     models = models_of(other, unsafe, asked.fits)
-    if together.box is None and not asked.limits:
-        return []
     limits = together.specified if together.box is None else together.box
     box = limits.in_encounters_of(other.region)
     seed = study.search.seed
