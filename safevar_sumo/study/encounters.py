@@ -213,6 +213,13 @@ class MatrixTable(Table, frozen=True, kw_only=True):
 class Encounters(Table, frozen=True, kw_only=True):
     """What vehicles meet: a scenario in a weather, or the tests of a matrix; listed encounters, or
     any in the ranges of the axes.
+
+    A setting meets the tests whose ranges and constraints hold its encounter (`Point.meets`), and
+    the worst of them decides (`safevar_sumo.sumo.encounters.worst_points`). Listed encounters
+    always count; with ranges a setting counts where the original vehicle keeps the margin in all
+    tests that it meets (`safevar_sumo.metrics.Scoring.violation`). A claim about each encounter by
+    itself counts all of them (`Selection.all_count`): those of `permit`, and between listed ones
+    those in which the original is not unsafe (`Model.new_car`).
     """
 
     scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
