@@ -47,8 +47,9 @@ from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo import needs_no_sumo, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
+from safevar_sumo.sumo.kept import number_simulated
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.simulators import number_simulated, simulations_of_setting
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle, region_of
 

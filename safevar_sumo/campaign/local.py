@@ -131,7 +131,7 @@ def _end_in_order(*_: object) -> None:
 
 
 def _close_simulators() -> None:
-    if simulators := sys.modules.get("safevar_sumo.sumo.simulators"):
+    if simulators := sys.modules.get("safevar_sumo.sumo.kept"):
         simulators.close_simulator()
 
 

@@ -1,34 +1,23 @@
-"""Runs in a simulator of the user's own, which drives one vehicle after another; a process opens it
-once.
-"""
+"""Runs in a simulator of the user's own, which drives one vehicle after another."""
 
 from __future__ import annotations
 
-import atexit
-import inspect
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from copy import Error, copy, deepcopy
-from dataclasses import replace
+from contextlib import contextmanager
 from hashlib import sha256
-from inspect import getattr_static
-from pathlib import Path
-from random import Random
 from typing import Any
 from weakref import WeakKeyDictionary
 
-import msgspec
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import (
     MARK,
     MAX_DEATHS,
     REPRODUCED_BY,
-    end_children,
     note_work,
     set_variables,
     this_process,
@@ -39,7 +28,6 @@ from safevar_sumo.records import (
     BoolArray,
     Contact,
     Encounter,
-    Evaluations,
     FloatArray,
     Outcome,
     SimulationRuns,
@@ -49,6 +37,7 @@ from safevar_sumo.scenarios import Simulator
 from safevar_sumo.scenarios.simulated import IMPACT_SPEED, OUTCOME, STRUCK_SPEED, TIME
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.encounters import encounter
+from safevar_sumo.sumo.kept import KEPT
 from safevar_sumo.sumo.system import System
 
 NEEDS = {
@@ -60,16 +49,6 @@ NEEDS = {
 """Metrics that a trace without a quantity does not define."""
 NEVER_DEFINED = ("pet",)
 """Metrics of which a trace of a simulator says nothing: it has no lateral distances."""
-SEVERITY = [
-    Outcome.COLLISION,
-    Outcome.INVALID_TEST,
-    Outcome.TIMEOUT,
-    Outcome.NEVER_MOVED,
-    Outcome.PASSED,
-    Outcome.STOPPED,
-]
-"""Outcomes of the rounds of a setting, the worst first."""
-COLLISION = Unsafe()
 NO_TRACE: Mapping[str, FloatArray] = {
     TIME: np.array([0.0, 1.0]),
     "speed": np.zeros(2),
@@ -78,104 +57,8 @@ NO_TRACE: Mapping[str, FloatArray] = {
 """What stands in place of the trace of a run that has none."""
 
 
-ARRAYS = (np.generic, np.ndarray, np.random.Generator, np.random.RandomState)
-PLAIN = (bool, int, float, complex, str, bytes, tuple, list, dict, set, Random, *ARRAYS)
-"""Types of attributes of a simulator that each run has for itself, unlike an open connection."""
-
-
-class _Kept:
-    """What this process keeps of the simulators of the user's own: of each class the handle that
-    its `open_worker` returned, and the object that simulated last.
-    """
-
-    def __init__(self) -> None:
-        self._last = dict[str, Simulator]()
-        self._handles = dict[str, tuple[int, type[Simulator], Any]]()
-        self.simulated = 0
-
-    def at(self, scenario: Simulator) -> Simulator:
-        """An object as `scenario` was when it was created with its fields, with the handle of its
-        class; a new handle if the file of the class was edited.
-        """
-        kind = type(scenario)
-        name = f"{kind.__module__}:{kind.__qualname__}"
-        has_worker = getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
-        file = inspect.getfile(kind.open_worker)
-        edited = Path(file).stat().st_mtime_ns if has_worker else id(kind)
-        if name in self._handles and self._handles[name][0] != edited:
-            self._close(name)
-        if name not in self._handles:
-            handle = kind.open_worker(this_process.worker)
-            self._handles[name] = edited, kind, handle
-        handle = self._handles[name][2]
-
-        # Nothing that a run changes stays in the scenario. Without `open_worker`, what the run
-        # before opened and put into the object is handed on.
-        is_struct = isinstance(scenario, msgspec.Struct)
-        set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
-        simulator = copy(scenario)
-        fields = (
-            msgspec.structs.asdict(scenario)
-            if isinstance(scenario, msgspec.Struct)
-            else _attributes(scenario)
-        )
-        for field, value in fields.items():
-            if has_worker or is_struct or isinstance(value, PLAIN):
-                set_field(simulator, field, _deep_copy(value))
-        if has_worker:
-            try:
-                set_field(simulator, "worker", handle)
-            except AttributeError:  # a Struct has its fields alone
-                kind.worker = property(lambda self: handle)
-        elif not is_struct:
-            for field, value in _attributes(self._last.get(name, simulator)).items():
-                if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
-                    set_field(simulator, field, value)
-        self._last[name] = simulator
-        return simulator
-
-    def close(self) -> None:
-        """End all simulators."""
-        for name in [*self._handles]:
-            self._close(name)
-
-    def _close(self, name: str) -> None:
-        last = self._last.pop(name, None)
-        _, kind, handle = self._handles.pop(name)
-        if last is not None:
-            last.close()
-        kind.close_worker(handle)
-
-
-def _attributes(simulator: Simulator) -> dict[str, Any]:
-    """The attributes of a simulator; none where its class has slots."""
-    return dict(getattr(simulator, "__dict__", {}))
-
-
-def _deep_copy(value: Any) -> Any:
-    """A copy that shares nothing; the value itself, such as a lock, where there is none."""
-    try:
-        return deepcopy(value)
-    except (TypeError, AttributeError, ValueError, RuntimeError, Error):
-        return value
-
-
-_kept = _Kept()
 _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
-
-
-def number_simulated() -> int:
-    """How often this process has simulated in simulators of the user's own."""
-    return _kept.simulated
-
-
-@atexit.register
-def close_simulator() -> None:
-    """End the simulators of this process, also where one fails to end."""
-    with suppress(Exception):
-        _kept.close()
-    end_children(this_process.mark)
 
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
@@ -200,8 +83,8 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
             end_if_longer(system.time_limit),
         ):
             with _end_worker():
-                simulator = _kept.at(scenario)
-                _kept.simulated += 1
+                simulator = KEPT.at(scenario)
+                KEPT.simulated += 1
                 result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
             if TIME in result:
                 _check_step(simulator, result[TIME], point.name)
@@ -255,49 +138,6 @@ def _end_worker() -> Iterator[None]:
         if this_process.last_words is not None:
             os._exit(end.code if isinstance(end.code, int) else 1)
         raise
-
-
-def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION) -> Evaluations:
-    """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
-    safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
-    study's own criterion, and the mean of each other metric over the runs that define it. Metrics
-    by which a run is unsafe are kept of each round, too.
-    """
-    n = len(evaluations) // repeats
-    columns = np.arange(n)
-
-    def mean(values: FloatArray) -> FloatArray:
-        rounds = values.reshape(repeats, n)
-        number = np.count_nonzero(~np.isnan(rounds), axis=0)
-        total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
-        return np.where(number, total / np.maximum(number, 1), np.nan)
-
-    # The worst run.
-    outcomes = evaluations.outcome.reshape(repeats, n)
-    rank = {str(name): number for number, name in enumerate(SEVERITY)}
-    severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
-    degrees = evaluations.f_safe.reshape(repeats, n)
-    worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
-    metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
-    metrics[SAFETY_DEGREE] = degrees[worst, columns]
-
-    # The share of unsafe runs.
-    is_of_shares = criterion.measure == UNSAFE_SHARE.name
-    is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
-    metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
-    means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
-    rounds = {
-        f"{name}_{k + 1}": values
-        for name in evaluations.metrics
-        if name not in means_alone
-        for k, values in enumerate(evaluations.metrics[name].reshape(repeats, n))
-    }
-    return replace(
-        evaluations.take(columns),
-        outcome=outcomes[np.argmin(severity, axis=0), columns],
-        collision_speed=evaluations.collision_speed.reshape(repeats, n)[worst, columns],
-        metrics={**metrics, **rounds},
-    )
 
 
 def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:

@@ -26,8 +26,9 @@ from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import manifest_differences
 from safevar_sumo.study import tables_of
-from safevar_sumo.sumo import simulators
+from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
+from safevar_sumo.sumo.repeats import joined
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, json_of, refused, run
 
@@ -131,7 +132,7 @@ def wall(in_tmp: Path) -> Iterator[Path]:
     (in_tmp / "models.py").write_text(MODELS)
     (in_tmp / "wall.toml").write_text(STUDY)
     yield in_tmp / "wall.toml"
-    simulators.close_simulator()
+    kept.close_simulator()
 
 
 def system_of(study: Path, **changes: object) -> System:
@@ -196,7 +197,7 @@ def test_one_simulator_is_kept_its_fields_are_set_and_it_is_closed(wall: Path) -
     stops = [gap - v * 0.5 - v**2 / 16 for _, _, v, gap in rows]
     assert found.f_safe.tolist() == pytest.approx(stops, abs=0.55)
     assert len(module.OPENED) == 1
-    simulators.close_simulator()
+    kept.close_simulator()
     assert len(module.CLOSED) == 1
 
 
@@ -317,7 +318,7 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
     wall.write_text(STUDY.replace("models:Wall", f"keeps:{name}"))
     assert json_of("check", "wall.toml")["numbers"]["passed"]
     run("simulate", "wall.toml")
-    simulators.close_simulator()
+    kept.close_simulator()
     assert Path("log").read_text().split("\n") == [f"{name} open 0", f"{name} close 0", ""]
     wrong = KEEPS.replace("def open_worker(cls, worker)", "def open_worker(cls)")
     (wall.parent / "keeps.py").write_text(wrong)
@@ -330,7 +331,7 @@ def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> 
     (wall.parent / "keeps.py").write_text(KEEPS)
     wall.write_text(STUDY.replace("models:Wall", "keeps:Dies"))
     run("study", "wall.toml", "--out", "results", "--jobs", "2")
-    simulators.close_simulator()  # of this process
+    kept.close_simulator()  # of this process
     lines = Path("log").read_text().splitlines()
     assert {line for line in lines if "open" in line} == {"Dies open 0", "Dies open 1"}
     assert lines.count("Dies open 0") == lines.count("Dies close 0") + 1  # one died
@@ -534,7 +535,7 @@ def test_the_worst_run_and_the_share_of_unsafe_runs_count() -> None:
     degrees = np.array([2.0, 9.0, 2.0, 5.0, 2.0, 6.0, -6.0, 7.0])
     speeds = np.where(degrees < 0, 8.0, np.nan)
     names = np.array(["stopped", "passed", "passed", "stopped", "stopped"] + 3 * ["timeout"])
-    found = simulators.joined(
+    found = joined(
         replace(
             evaluations,
             outcome=np.where(degrees < 0, "collision", names),
@@ -680,7 +681,7 @@ def with_failures(wall: Path, failure: str, limit: float = 3.2, failed: str = "s
 
 
 def children() -> int:
-    simulators.close_simulator()  # of this process
+    kept.close_simulator()  # of this process
     return sum(
         path.read_bytes() == f"sleep\x00{SECONDS}\x00".encode()
         for path in Path("/proc").glob("[0-9]*/cmdline")
