@@ -45,6 +45,9 @@ SLIPPERY = """
 extends = "smoke"
 name = "slippery"
 title = "Crossing on wet leaves"
+[scenario]
+margin = 0.3
+over = false
 [weather]
 name = "wet leaves"
 road_friction = 0.75

@@ -17,7 +17,7 @@ from safevar_sumo.study.characteristics import (
     mistake,
 )
 from safevar_sumo.study.marks import OF_SCENARIO, ORDERED, PART_OF_SYSTEM, Table
-from safevar_sumo.study.parameters import searched
+from safevar_sumo.study.parameters import free_parameters, searched
 
 Parameters = dict[str, Any]
 WORST = "worst"
@@ -265,10 +265,11 @@ class Encounters(Table, frozen=True, kw_only=True):
         return [(test, self.axes_of(test)) for test in tests] or [(None, self.axes_of(None))]
 
     def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
-        """The axes of a test, its own first."""
+        """The axes of a test, its own first; those of all tests, unless it has values of them."""
         own = {} if test is None else test.axes
         shared = as_axes(self.scenario.over)
-        return own | {name: shared[name] for name in shared if name not in own}
+        stated = free_parameters(Weather) if shared and test and test.weathers else {}
+        return own | {name: shared[name] for name in shared if name not in {*own, *stated}}
 
     def lists_of(self, test: MatrixTest | None) -> dict[str, list[Any]]:
         """The axes of a test whose values are driven one after another."""
