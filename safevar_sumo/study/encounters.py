@@ -259,6 +259,11 @@ class Encounters(Table, frozen=True, kw_only=True):
                 check_name("", f"constraints.tests: there is no test {name!r}", name, tests)
 
     @property
+    def axes(self) -> dict[str, AxisTable]:
+        """An axis of each name that a test has."""
+        return {name: axis for _, own in self._axes_by_test for name, axis in own.items()}
+
+    @property
     def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
         """The axes of each test, or of the only one."""
         tests = [] if self.matrix is None else self.matrix.tests
@@ -286,8 +291,12 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     @property
     def states_ranges(self) -> bool:
-        """Whether an axis has a range beside or without listed values."""
-        return any(axis.range for _, own in self._axes_by_test for axis in own.values())
+        """Whether an axis has a range beside or without listed values; the cells of a protocol are
+        fixed.
+        """
+        is_fixed = self.matrix is not None and bool(self.matrix.protocol)
+        axes = [axis for _, own in self._axes_by_test for axis in own.values()]
+        return not is_fixed and any(axis.range for axis in axes)
 
     @property
     def ranges(self) -> dict[str, Domain]:
@@ -307,12 +316,17 @@ class Encounters(Table, frozen=True, kw_only=True):
         return found
 
     def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
-        """The study with other axes of each test, and of all."""
+        """The study with other axes of each test, and of all; lists alone are written as such."""
+
+        def changed(over: Axes) -> Axes:
+            axes = as_axes(change(as_axes(over))).items()
+            return {name: each.at if each == AxisTable(at=each.at) else each for name, each in axes}
+
         matrix = self.matrix
         if matrix is not None:
-            tests = [replace(test, over=change(test.axes)) for test in matrix.tests]
+            tests = [replace(test, over=changed(test.over)) for test in matrix.tests]
             matrix = replace(matrix, tests=tests)
-        scenario = replace(self.scenario, over=change(as_axes(self.scenario.over)))
+        scenario = replace(self.scenario, over=changed(self.scenario.over))
         return replace(self, matrix=matrix, scenario=scenario)
 
     def listed(self) -> Self:

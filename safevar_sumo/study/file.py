@@ -303,9 +303,8 @@ def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stu
         left_out.update(keys_with(OF_SCENARIO, Study))
     inherited = {key: value for key, value in base.tables.items() if key not in left_out}
     scenario = inherited.get("scenario")
-    if "weather" in overrides and isinstance(scenario, dict) and "over" in scenario:
-        over = {name: axis for name, axis in scenario["over"].items() if name not in WEATHER}
-        inherited["scenario"] = {**scenario, "over": over}
+    if isinstance(scenario, dict) and "over" in scenario:
+        inherited["scenario"] = _with_axes_for(overrides, scenario)
     tables = _merge(inherited, overrides)
 
     # Keys about the parts of the system that differ now.
@@ -337,6 +336,20 @@ def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stu
         of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
         remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
     return StudyTables(source, tables, base.origin, remarks)
+
+
+def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
+    """A table [scenario] that a study inherits: of another weather without the axes of its
+    parameters, and for the cells of a protocol, which are fixed, without any.
+    """
+    matrix = overrides.get("matrix")
+    if isinstance(matrix, dict) and matrix.get("protocol"):
+        return {key: value for key, value in scenario.items() if key not in ("over", "margin")}
+    names = scenario["over"].keys() - (WEATHER if "weather" in overrides else ())
+    return {
+        **scenario,
+        "over": {name: scenario["over"][name] for name in scenario["over"] if name in names},
+    }
 
 
 def _names_scenario(table: object, base_table: object) -> bool:

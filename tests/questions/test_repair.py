@@ -192,9 +192,10 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     longer one.
     """
     monkeypatch.setattr(falsify, "USUAL_BUDGET", 2000)
-    search = 'search.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
+    search = 'over.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
     planted.write_text(
-        STUDY.replace("speed = 72.0, ", "").replace(
+        'encounters = "ranges"'
+        + STUDY.replace("speed = 72.0, ", "").replace(
             'model = "car_to_car"', f'model = "car_to_car"\n{search}'
         )
     )
