@@ -19,12 +19,12 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.scope import are_numbers, at_values, moving_axes, points_of_tests
+from safevar_sumo.questions.scope import at_values, moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Scenario, searchable_in
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
-from safevar_sumo.study.encounters import Axes
+from safevar_sumo.study.encounters import Axes, are_numbers
 from safevar_sumo.sumo.system import System, assemble
 
 DECIMALS = 2
@@ -115,16 +115,12 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
         return []
     tests = list[MovingTest]()
     for test, points in points_of_tests(study, assemble(study).points):
-        domains = domains_of_axes(study, test, points[0].scenario)
+        scenario = points[0].scenario
+        axes = axes_of(study, test, scenario)
+        domains = {name: axes[name] for name in moving_axes(study, test, scenario)}
         if domains:
             tests.append(MovingTest(model, test, domains, new_car))
     return tests
-
-
-def domains_of_axes(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
-    """The axes of a test that move, each from its least to its greatest value."""
-    axes = axes_of(study, test, scenario)
-    return {name: axes[name] for name in moving_axes(study, test, scenario)}
 
 
 def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]) -> Study:

@@ -11,11 +11,11 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name, check_text
 from safevar_sumo.protocol.rater import expand_protocol
-from safevar_sumo.questions.scope import are_numbers, points_of_tests
+from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.scenarios import Point, searchable_in, weather_of
 from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.study import OBJECTIVES, RANGES, MatrixTest, Study, axis_of, unit_text
-from safevar_sumo.study.encounters import Axes, AxisTable
+from safevar_sumo.study.encounters import Axes, AxisTable, are_numbers
 from safevar_sumo.study.scenario_file import MODEL
 from safevar_sumo.sumo.system import assemble
 
@@ -38,7 +38,7 @@ def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | No
     InputError
         If the study has no such part.
     """
-    if ranges:
+    if ranges and study.encounters != RANGES:
         whole = with_ranges(_read_again(study))
         if whole.encounters != RANGES:
             problem = f"no axis of study {study.name!r} has a range"
@@ -128,7 +128,8 @@ def study_up_to(study: Study, text: str) -> Study:
     known = [*dict.fromkeys([*study.ranges, *axes])]
     problem = f"study {study.name!r} does not vary {name!r}"
     if name and not known:
-        raise InputError(OPTION, problem, "a study with an axis of this name")
+        in_ranges = ", with --ranges" if name in study.axes else ""
+        raise InputError(OPTION, problem, f"an axis whose values are listed{in_ranges}")
     try:
         high = float(value)
     except ValueError:

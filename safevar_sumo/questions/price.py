@@ -163,7 +163,7 @@ def print_price_of_list(study: Study, system: System, pool: Pool, simulations: f
     batch = np.repeat(system.characteristics.original_settings, BATCH, axis=0)
     _, seconds = _timed(task, batch, pool)
     price = _price(simulations, seconds / (BATCH * pool.workers))
-    print_text(Console(file=sys.stderr), f"at most {price}; cars that fail early take fewer")
+    print_text(Console(file=sys.stderr), f"{price}; cars that fail early take fewer")
 
 
 def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:

@@ -4,7 +4,7 @@ the light.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import Any
 
@@ -14,12 +14,8 @@ from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Scenario, Simulator, searchable_in
 from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
+from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
-
-
-def are_numbers(values: Iterable[object]) -> bool:
-    """Whether the values of an axis are numbers, none of which is a bool."""
-    return all(type(value) in (int, float) for value in values)
 
 
 def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:

@@ -29,7 +29,7 @@ from safevar_sumo.study import (
     read_tables,
     tables_of,
 )
-from safevar_sumo.study.encounters import Parameters
+from safevar_sumo.study.encounters import Parameters, are_numbers
 
 
 def read_study(study: StudyLike, **changes: Any) -> Study:
@@ -121,7 +121,7 @@ class _Declared:
         table = {"at": axis} if isinstance(axis, list) else axis
         values = table.get("at", [])
         is_listed = isinstance(axis, list) and (
-            len({*map(str, values)}) < 2 or not _are_numbers(values)
+            len({*map(str, values)}) < 2 or not are_numbers(values)
         )
         if is_listed or {"unit", "original", "lower", "upper"} <= table.keys():
             return axis
@@ -141,7 +141,7 @@ class _Declared:
         }
         if isinstance(own, int | float):
             found["original"] = own
-        if values and _are_numbers(values):
+        if values and are_numbers(values):
             found |= {"lower": min(values), "upper": max(values), "original": values[0]}
         return {**found, **table}
 
@@ -160,11 +160,6 @@ class _Declared:
         member = self._lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
         default = stated.get(name, _defaults(member.target).get(name))
         return free_parameters(member.target).get(name), default
-
-
-def _are_numbers(values: Sequence[object]) -> bool:
-    """Whether there are values, all of which are numbers."""
-    return bool(values) and all(type(value) in (int, float) for value in values)
 
 
 def _defaults(model: type) -> Parameters:

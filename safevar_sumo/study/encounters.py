@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, Final, Literal, Self
 
 from msgspec import Meta
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.study.characteristics import (
@@ -74,6 +74,7 @@ class AxisTable(Table, frozen=True, kw_only=True):
     original: float | None = None
     unit: str = ""
     meaning: ShortText = ""
+    short_name: ShortText = ""
 
     def __post_init__(self) -> None:
         _ = self.range  # refused with the path of the axis
@@ -83,24 +84,14 @@ class AxisTable(Table, frozen=True, kw_only=True):
         """The range; None without one, as of texts and seeds."""
         if self.lower is None or self.upper is None or self.original is None:
             return None
-        return Domain(
-            unit=self.unit,
-            original=self.original,
-            lower=self.lower,
-            upper=self.upper,
-            meaning=self.meaning,
-        )
+        fields = asdict(self)
+        del fields["at"]
+        return Domain(**fields)
 
 
 def axis_of(domain: Domain) -> AxisTable:
     """An axis whose range is a domain."""
-    return AxisTable(
-        lower=domain.lower,
-        upper=domain.upper,
-        original=domain.original,
-        unit=domain.unit,
-        meaning=domain.meaning,
-    )
+    return AxisTable(**asdict(domain))
 
 
 Axes = dict[str, Annotated[list[Any], Meta(min_length=1)] | AxisTable]
@@ -151,6 +142,11 @@ class Weather(Table, frozen=True, kw_only=True):
     ] = 0.0
     light: Literal["day", "night"] = "day"
     water: Annotated[float, Meta(ge=0, le=20)] = 0.0
+
+
+def are_numbers(values: Iterable[object]) -> bool:
+    """Whether the values of an axis are numbers, none of which is a bool."""
+    return all(type(value) in (int, float) for value in values)
 
 
 def as_axes(over: Axes) -> dict[str, AxisTable]:
@@ -230,8 +226,8 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
         """Refuse axes that something else sets, too, and what is about ranges without any."""
-        axes = {name: axis for _, own in self._axes_by_test for name, axis in own.items()}
-        for name, axis in axes.items():
+        axes = [pair for _, own in self._axes_by_test for pair in own.items()]
+        for name, axis in axes:
             if self.matrix is not None and self.matrix.protocol:
                 problem = f"over.{name}: the cells of {self.matrix.protocol} are fixed"
                 raise InputError("", problem, "matrix.tests")
@@ -251,7 +247,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         if self.scenario.margin != ORIGINAL_MARGIN and not axes:
             problem = f"scenario.margin = {self.scenario.margin:g}, and no encounter has an axis"
             raise InputError("", problem, "an axis with lower and upper, or no margin")
-        of_axes = {name: axis.range for name, axis in axes.items() if axis.range is not None}
+        of_axes = {name: axis.range for name, axis in axes if axis.range is not None}
         check_constraints({**characteristics, **of_axes}, self.constraints)
         tests = [] if self.matrix is None else [test.name for test in self.matrix.tests]
         for constraint in self.constraints:
@@ -259,9 +255,9 @@ class Encounters(Table, frozen=True, kw_only=True):
                 check_name("", f"constraints.tests: there is no test {name!r}", name, tests)
 
     @property
-    def axes(self) -> dict[str, AxisTable]:
-        """An axis of each name that a test has."""
-        return {name: axis for _, own in self._axes_by_test for name, axis in own.items()}
+    def axes(self) -> set[str]:
+        """The names of the axes that a test has."""
+        return {name for _, own in self._axes_by_test for name in own}
 
     @property
     def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
@@ -295,8 +291,9 @@ class Encounters(Table, frozen=True, kw_only=True):
         fixed.
         """
         is_fixed = self.matrix is not None and bool(self.matrix.protocol)
-        axes = [axis for _, own in self._axes_by_test for axis in own.values()]
-        return not is_fixed and any(axis.range for axis in axes)
+        return not is_fixed and any(
+            axis.range for _, own in self._axes_by_test for axis in own.values()
+        )
 
     @property
     def ranges(self) -> dict[str, Domain]:

@@ -4,7 +4,7 @@ worst one counts.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -210,7 +210,10 @@ def evaluate_matrix(
 
     # The worst point of each setting, and what a rating earns.
     cells = join_cells(quantities)
-    evaluations = evaluations_at_worst_points(system, at_points)
+    numbers = worst_points(system, at_points)
+    rows = numbers * len(settings) + np.arange(len(settings))
+    evaluations = Evaluations.concatenate(at_points).take(rows)
+    evaluations = replace(evaluations, worst_points=numbers)
     if system.rater is not None:
         metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
         evaluations = replace(evaluations, metrics=metrics)
@@ -252,16 +255,6 @@ def batch_size(system: System, engine: Engine) -> int:
         for network in {point.scenario.network for point in system.points}
     )
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
-
-
-def evaluations_at_worst_points(system: System, at_points: Sequence[Evaluations]) -> Evaluations:
-    """The evaluation of each of N settings at its worst point; `at_points` are their evaluations at
-    all points.
-    """
-    numbers = worst_points(system, at_points)
-    n = len(at_points[0])
-    rows = numbers * n + np.arange(n)
-    return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
 def drive_worst(system: System, settings: FloatArray) -> SimulationRuns:

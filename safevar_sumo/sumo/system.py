@@ -344,7 +344,7 @@ def _original_points(study: Study, lookup: Lookup, only: Point) -> tuple[Point, 
     check_domains(in_ranges, points)
     if not study.ranges:
         return ()
-    for name in study.scenario.over.keys() - study.axes.keys():
+    for name in (name for name in study.scenario.over if name not in study.axes):
         problem = f"over.{name}: the weathers of each test set {name}, too"
         raise InputError("", problem, "a range, or values in the weathers")
     return tuple(original_encounter(point, study.ranges) for point in points)

@@ -189,7 +189,7 @@ def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit()
 
 
 def test_a_value_counts_in_tests_and_a_range_of_the_same_parameter_in_its_place() -> None:
-    over = {"impact_location": {"original": 50, "lower": 20, "upper": 80}}
+    over = {"impact_location": {"original": 50, "lower": 20, "upper": 80, "short_name": "place"}}
     scenario = {"model": "crossing", "parameters": {"impact_location": 25}, "over": over}
     for encounters, place in ("tests", 25), ("ranges", 50):
         study = read_study("wear", encounters=encounters, scenario=scenario, matrix={"tests": []})

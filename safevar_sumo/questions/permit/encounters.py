@@ -18,11 +18,12 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
-from safevar_sumo.questions.scope import are_numbers, at_values, points_of_tests
+from safevar_sumo.questions.scope import at_values, points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import PHASE, MatrixTest, Study, unit_text
+from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
