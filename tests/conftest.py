@@ -18,7 +18,6 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions import falsify
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
@@ -138,7 +137,7 @@ SLOW_STUDIES = ("wear_idm", "wear_rss")
     params=[
         pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
         for name in study_names()
-        if not is_rated(load_study(name))
+        if not load_study(name).is_rated
         and (name != "wear_rss" or HAS_AD_RSS)
         and name != "metadrive_expert"
     ]

@@ -42,7 +42,6 @@ from safevar_sumo.campaign.runs import (
 from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import (
     MANIFEST,
@@ -193,7 +192,7 @@ def _remarks(
         yield f"user code reads {files}, which no `files` of the study names: edits go unnoticed"
     if no_verdict:
         yield no_verdict
-    if original.collided[0] and not is_rated(study):
+    if original.collided[0] and not study.is_rated:
         words = Unsafe().breach_in_words(original)
         yield f"the original vehicle itself {words}: no change is needed"
 

@@ -202,11 +202,6 @@ def join_cells(quantities: Sequence[CellResults]) -> CellResults:
     return CellResults(*(np.stack(values, axis=1) for values in zip(*quantities, strict=True)))
 
 
-def is_rated(study: Study) -> bool:
-    """Whether a study's settings are rated: in all cells of a protocol."""
-    return study.matrix is not None and bool(study.matrix.protocol)
-
-
 def rater_of(study: Study) -> Rater | None:
     """The rater of a study with a protocol's matrix; None for other studies.
 
@@ -216,7 +211,7 @@ def rater_of(study: Study) -> Rater | None:
         If a claim names an unknown test, or a layer that does not count for the test or is
         simulated.
     """
-    if study.matrix is None or not is_rated(study):
+    if study.matrix is None or not study.is_rated:
         return None
     protocol = protocol_of(study.matrix.protocol)
     for test, claims in study.rating.claims.items():
@@ -251,7 +246,7 @@ def expand_protocol(study: Study, weather: Weather) -> Study:
     """Give a study with a protocol a test for each of its cells; tests by day have the study's
     weather.
     """
-    if study.matrix is None or not study.matrix.protocol:
+    if study.matrix is None or not study.is_rated:
         return study
     shared_parameters = {
         name: value

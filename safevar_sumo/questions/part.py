@@ -73,7 +73,7 @@ def at_point(study: Study, name: str) -> Study:
     """
     check_text("point", name)
     expanded = expand_protocol(study, weather_of(study.weather))
-    tests = [] if expanded.matrix is None else expanded.matrix.tests
+    tests = expanded.tests
     alone = [test for test in tests if test.name == name]
     points = () if alone else assemble(study).matrix
     alone = alone or _test_at(expanded, points, name)
@@ -86,9 +86,8 @@ def at_point(study: Study, name: str) -> Study:
         raise InputError("point", repr(name), legal if points else "a study with a matrix")
 
     # The study there, and what commands name.
-    assert study.matrix is not None
     search = study.search
-    if study.matrix.protocol:  # one point has no rating points to search by
+    if study.is_rated:  # one point has no rating points to search by
         search = replace(search, objectives=[*OBJECTIVES])
     origin = replace(study.origin, point=name)
     return replace(expanded.with_tests(alone), origin=origin, search=search)
@@ -96,9 +95,8 @@ def at_point(study: Study, name: str) -> Study:
 
 def _test_at(study: Study, points: Sequence[Point], name: str) -> list[MatrixTest]:
     """The test of a point, with the point's values alone; none if there is no such point."""
-    tests = [] if study.matrix is None else study.matrix.tests
     for values in (dict(point.parameters) for point in points if point.name == name):
-        test = next(test for test in tests if test.name == values["test"])
+        test = next(test for test in study.tests if test.name == values["test"])
         over: Axes = {axis: [values[axis]] for axis in study.lists_of(test)}
         free = {axis: axis_of(domain) for axis, domain in study.ranges_of(test).items()}
         weathers = [one for one in test.weathers if weather_of(one).name == values["weather"]]
@@ -120,11 +118,12 @@ def study_up_to(study: Study, text: str) -> Study:
         values that are driven.
     """
     name, _, value = (part.strip() for part in text.partition("="))
-    if study.matrix is not None and study.matrix.protocol:
+    if study.is_rated:
         problem = f"{text!r}: study {study.name!r} is rated, at the points of its protocol"
         raise InputError(OPTION, problem, "a study that is not rated")
-    tests = [] if study.matrix is None else study.matrix.tests
-    axes = [axis for test in tests for axis in study.axes_of(test) if _values(study, test, axis)]
+    axes = [
+        axis for test in study.tests for axis in study.axes_of(test) if _values(study, test, axis)
+    ]
     known = [*dict.fromkeys([*study.ranges, *axes])]
     problem = f"study {study.name!r} does not vary {name!r}"
     if name and not known:
@@ -158,18 +157,14 @@ def smaller_cuts(study: Study, text: str | None) -> list[Study]:
         domain = study.ranges[name]
         values = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:].round(DECIMALS).tolist()
     else:
-        assert study.matrix is not None
-        tests = study.matrix.tests
-        values = sorted({value for test in tests for value in _values(study, test, name)})
+        values = sorted({value for test in study.tests for value in _values(study, test, name)})
     return [study_up_to(study, f"{name}={each}") for each in values if each < float(high)]
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:
     """The names of the tests of a study that are left out where it is cut."""
-    if study.matrix is None or cut.matrix is None:
-        return []
-    left = [test.name for test in cut.matrix.tests]
-    return [test.name for test in study.matrix.tests if test.name not in left]
+    left = [test.name for test in cut.tests]
+    return [test.name for test in study.tests if test.name not in left]
 
 
 def _ranges_up_to(study: Study, name: str, high: float) -> Study:
@@ -189,14 +184,13 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         domain = study.ranges_of(test).get(name)
         return domain is None or domain.lower < high
 
-    if study.matrix is not None:
-        study = study.with_tests([test for test in study.matrix.tests if begins_below(test)])
+    if study.tests:
+        study = study.with_tests([test for test in study.tests if begins_below(test)])
     return study.mapped(cut)
 
 
 def _lists_up_to(study: Study, name: str, high: float) -> Study:
     """The study whose lists of an axis end at a value; without tests that begin above it."""
-    assert study.matrix is not None
     by_test = points_of_tests(study, assemble(study).points)
     driven = [value for test, _ in by_test for value in _values(study, test, name)]
     if not min(driven) <= high <= max(driven):

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -89,7 +88,7 @@ def has_reference_drivers(evaluator: Evaluator) -> bool:
     itself, nor in a rating, where every vehicle collides in some cell, nor where few simulations
     are allowed.
     """
-    drives_itself = is_rated(evaluator.study) or evaluator.system.has_simulator
+    drives_itself = evaluator.study.is_rated or evaluator.system.has_simulator
     return not drives_itself and evaluator.left is None
 
 

@@ -17,7 +17,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
-from safevar_sumo.protocol.rater import Points, Rater, darken, is_rated
+from safevar_sumo.protocol.rater import Points, Rater, darken
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import ValueTexts, question
 from safevar_sumo.questions.case import Subject
@@ -129,7 +129,7 @@ def rating(
             "has ranges of encounters, and the cells of a rating are fixed",
             "a study whose encounters are tests",
         )
-    if not is_rated(study):
+    if not study.is_rated:
         study = msgspec.structs.replace(study, matrix=MatrixTable(protocol=EURO_NCAP_2026))  # type: ignore[arg-type]
 
     # All cells of the protocol.

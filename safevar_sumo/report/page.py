@@ -21,7 +21,6 @@ from safevar_sumo.campaign.cache import keep_simulations
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.output import check_writable
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import (
     SIMULATIONS,
@@ -263,7 +262,7 @@ def usual_questions(case: Case, point: str | None = None) -> list[str]:
     variant that loses some by the fewest changes. A simulator has no time for the smallest changes.
     """
     # A rating of the worst solution.
-    if is_rated(case.study) and point is None:
+    if case.study.is_rated and point is None:
         any_unsafe = case.unsafe.rows(case.solutions).any()
         handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
         return [f"rating --solution {handle}" if handle else "rating"]

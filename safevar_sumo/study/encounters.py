@@ -228,7 +228,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         """Refuse axes that something else sets, too, and what is about ranges without any."""
         axes = [pair for _, own in self._axes_by_test for pair in own.items()]
         for name, axis in axes:
-            if self.matrix is not None and self.matrix.protocol:
+            if self.matrix is not None and self.is_rated:
                 problem = f"over.{name}: the cells of {self.matrix.protocol} are fixed"
                 raise InputError("", problem, "matrix.tests")
             if name in characteristics:
@@ -249,10 +249,20 @@ class Encounters(Table, frozen=True, kw_only=True):
             raise InputError("", problem, "an axis with lower and upper, or no margin")
         of_axes = {name: axis.range for name, axis in axes if axis.range is not None}
         check_constraints({**characteristics, **of_axes}, self.constraints)
-        tests = [] if self.matrix is None else [test.name for test in self.matrix.tests]
+        tests = [test.name for test in self.tests]
         for constraint in self.constraints:
             for name in constraint.tests:
                 check_name("", f"constraints.tests: there is no test {name!r}", name, tests)
+
+    @property
+    def tests(self) -> list[MatrixTest]:
+        """The tests of the matrix; none without one, and in that of a protocol."""
+        return [] if self.matrix is None else self.matrix.tests
+
+    @property
+    def is_rated(self) -> bool:
+        """Whether settings are rated: in all cells of a protocol."""
+        return self.matrix is not None and bool(self.matrix.protocol)
 
     @property
     def axes(self) -> set[str]:
@@ -262,8 +272,7 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
         """The axes of each test, or of the only one."""
-        tests = [] if self.matrix is None else self.matrix.tests
-        return [(test, self.axes_of(test)) for test in tests] or [(None, self.axes_of(None))]
+        return [(test, self.axes_of(test)) for test in [*self.tests] or [None]]
 
     def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
         """The axes of a test, its own first; those of all tests, unless it has values of them."""
@@ -290,10 +299,8 @@ class Encounters(Table, frozen=True, kw_only=True):
         """Whether an axis has a range beside or without listed values; the cells of a protocol are
         fixed.
         """
-        is_fixed = self.matrix is not None and bool(self.matrix.protocol)
-        return not is_fixed and any(
-            axis.range for _, own in self._axes_by_test for axis in own.values()
-        )
+        axes = [axis for _, own in self._axes_by_test for axis in own.values()]
+        return not self.is_rated and any(axis.range for axis in axes)
 
     @property
     def ranges(self) -> dict[str, Domain]:

@@ -178,7 +178,7 @@ def checked_study(raw: StudyTables) -> Study:
     # Records, and what concerns several of them.
     study = convert_table(tables, Study)
     study.check_axes(study.vehicle.characteristics)
-    if study.rating.claims and not (study.matrix and study.matrix.protocol):
+    if study.rating.claims and not study.is_rated:
         raise InputError(
             "", "rating.claims: the study is not rated", "matrix.protocol, or no claims"
         )
@@ -453,7 +453,7 @@ def user_modules(study: Study) -> list[str]:
 
 def user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
-    tests = [] if study.matrix is None else [test.model for test in study.matrix.tests]
+    tests = [test.model for test in study.tests]
     names_by_key = {
         "vehicle.model": [study.vehicle.model],
         "ads.model": [study.ads.model],
@@ -503,7 +503,7 @@ def data_files(study: Study) -> dict[str, str]:
 
     # Files of OpenSCENARIO, at every point of the matrix.
     if study.scenario.model == MODEL:
-        tests = () if study.matrix is None else study.matrix.tests
+        tests = study.tests
         with about(study.source):
             paths |= files_of_scenario(study.scenario.parameters, tests, study.origin.places)
     return paths

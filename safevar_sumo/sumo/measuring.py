@@ -25,7 +25,6 @@ from safevar_sumo.metrics import (
 )
 from safevar_sumo.metrics.unsafe import COLLISION, CriterionLike
 from safevar_sumo.plugins import Lookup
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 
 RESULT_COLUMNS = (
@@ -67,7 +66,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     """
     # Metrics that the study has anyway.
     further = (
-        (RATING_POINTS, is_rated(study)),
+        (RATING_POINTS, study.is_rated),
         (STOPPING_DISTANCE, has_stops),
         (UNSAFE_SHARE, study.scenario.repeats > 1),
     )
@@ -129,7 +128,7 @@ def criterion_of(text: CriterionLike, study: Study) -> Unsafe:
         If it is no criterion, or about points of a study that is not rated.
     """
     criterion = Unsafe.parse(text)
-    if criterion.points is not None and not is_rated(study):
+    if criterion.points is not None and not study.is_rated:
         problem = f"{text!r}: study {study.name!r} is not rated and has no points"
         raise InputError("unsafe", problem, "collision or below=X")
     return criterion

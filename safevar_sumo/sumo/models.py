@@ -108,7 +108,7 @@ def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     points: list[Point] = []
     shared = study.shared_constraints
     constraints = [one for one in study.constraints if one not in shared]
-    for test in () if study.matrix is None else study.matrix.tests:
+    for test in study.tests:
         with about(f"{subject()}: test {test.name!r}"):
             points += _points_of(test, study, constraints, lookup)
 

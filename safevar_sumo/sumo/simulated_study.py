@@ -26,7 +26,7 @@ def check_tables(study: Study, scenario: type) -> None:
     InputError
         With the first such key.
     """
-    tests = [] if study.matrix is None else study.matrix.tests
+    tests = study.tests
     given: dict[str, Any] = {
         "vehicle.model": study.vehicle.model,
         "vehicle.parameters": study.vehicle.parameters,

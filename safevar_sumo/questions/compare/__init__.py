@@ -17,7 +17,6 @@ import pandas as pd
 
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
 from safevar_sumo.questions.case import Subject
@@ -318,7 +317,7 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs,
     over the settings that were drawn on a line.
     """
-    are_rated = all(is_rated(side.study) for side in evaluators)
+    are_rated = all(side.study.is_rated for side in evaluators)
     metric = RATING_POINTS.name if are_rated else SAFETY_DEGREE
     a, b = (run.column(metric) for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])

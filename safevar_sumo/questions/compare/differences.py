@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.compare.settings import within
@@ -257,7 +256,7 @@ def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]
 
 def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
     """The rating points of both original vehicles; empty unless both studies are rated."""
-    if not all(is_rated(side.study) for side in evaluators):
+    if not all(side.study.is_rated for side in evaluators):
         return {}
     return {
         f"{side}_points": float(original.column(RATING_POINTS.name)[0])
@@ -306,7 +305,7 @@ def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
     """
     metres = np.empty(0)
     is_same_scenario = (a.study.scenario, a.study.matrix) == (b.study.scenario, b.study.matrix)
-    if is_same_scenario and not is_rated(a.study):
+    if is_same_scenario and not a.study.is_rated:
         metres = _onset_places(a) - _onset_places(b)
         metres = metres[np.isfinite(metres)]
     if not len(metres):

@@ -11,7 +11,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR, is_rated
+from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.causes import (
     Cause,
@@ -161,7 +161,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     """Settings drawn from a study's whole domain."""
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
-    if is_rated(study):
+    if study.is_rated:
         number = RATED_SAMPLED_SETTINGS
     # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)

@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of, settings_of_line
@@ -85,7 +84,7 @@ class Smallest(NamedTuple):
     @classmethod
     def of(cls, evaluator: Evaluator, unsafe: Unsafe, fits: int) -> Self:
         """Enumerate them within what may be simulated, and see how sure they are."""
-        most = MAX_RATED_SETTINGS if is_rated(evaluator.study) else MAX_SETTINGS
+        most = MAX_RATED_SETTINGS if evaluator.study.is_rated else MAX_SETTINGS
         at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(most, 2))
         steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(most, 3))
         return cls(at_ends, steps, _table(evaluator, unsafe, at_ends.causes, fits))

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     OTHER_SETS,
@@ -145,7 +144,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
     unsafe = population.unsafe
 
     # How they end beside the original, and who would have avoided the collision.
-    if is_rated(study):  # each neighbour is simulated in all cells
+    if study.is_rated:  # each neighbour is simulated in all cells
         factors = STEP_FACTORS[:1]
         comparisons = compare_at_cells(evaluator, settings)
     else:
@@ -273,7 +272,7 @@ def sureness(
     many of the first `sets` parameter sets each is one, and how many sets there are.
     """
     robust = np.full(len(causes), np.nan)
-    if causes and not is_rated(evaluator.study):
+    if causes and not evaluator.study.is_rated:
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
     if not (sets and causes and evaluator.study.spread):

@@ -25,7 +25,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import F_SAFE, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.output import check_writable, whole_file
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.box import Proof
@@ -172,7 +171,7 @@ def repair(
     """
     study = evaluator.study
     evaluator.system.refuse_simulator("nothing of its driving system can be changed here")
-    if is_rated(study):
+    if study.is_rated:
         text = (
             f"{study.name!r} is rated, and its repair would take a whole test matrix for every"
             " vehicle and change"

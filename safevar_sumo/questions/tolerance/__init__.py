@@ -8,7 +8,6 @@ from __future__ import annotations
 from typing import Annotated
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
 from safevar_sumo.questions.case import Subject
@@ -131,7 +130,7 @@ def tolerance(
     is_safe = not asked.unsafe.of(original)[0]
     if evaluator.left is None or not is_safe:
         return answer_limits(asked)
-    if is_rated(study):
+    if study.is_rated:
         problem = "few simulations find no limits of a rating"
         raise InputError("simulations", problem, "no --simulations")
     return answer_roughly(asked)

@@ -10,7 +10,6 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import RATING_POINTS
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
@@ -135,7 +134,7 @@ def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None)
     study = evaluator.study
     points = len(evaluator.system.points)
     phases = {SCAN_STAGE: float(SCAN_VALUES * columns)}
-    if is_rated(study):
+    if study.is_rated:
         return phases
     sets = len(other_sets(study, fits))
     own = USUAL_BOXES * budget / points
@@ -165,7 +164,7 @@ def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
     evaluator = asked.evaluator
     members = evaluator.characteristics
     # A box of a rated study would take thousands of whole test matrices.
-    is_sought = not is_rated(evaluator.study)
+    is_sought = not evaluator.study.is_rated
     if is_sought:
         _check_drawable(evaluator)
     # Around an unsafe original there is nothing to scan, but points that are lost.

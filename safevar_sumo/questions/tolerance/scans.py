@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
-from safevar_sumo.protocol.rater import is_rated
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray
@@ -99,7 +98,7 @@ def scan(
     """
     scanned = [evaluator.characteristics.members[column] for column in columns]
     usual, rounds = (
-        (RATED_SCAN_VALUES, RATED_ROUNDS) if is_rated(evaluator.study) else (SCAN_VALUES, ROUNDS)
+        (RATED_SCAN_VALUES, RATED_ROUNDS) if evaluator.study.is_rated else (SCAN_VALUES, ROUNDS)
     )
     if evaluator.left is not None:  # a rough answer
         rounds = 0
