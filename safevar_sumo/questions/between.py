@@ -6,9 +6,8 @@ has the vehicle's characteristics, then a place on each axis.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,11 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.scope import at_values, moving_axes, points_of_tests
+from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
-from safevar_sumo.scenarios import Scenario, searchable_in
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
-from safevar_sumo.study.encounters import Axes, are_numbers
+from safevar_sumo.study.encounters import Axes, at_values
 from safevar_sumo.sumo.system import System, assemble
 
 DECIMALS = 2
@@ -111,14 +109,15 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
     unsafe by `new_car` in it.
     """
     study = model.evaluator.study
-    if study.matrix is None or study.matrix.protocol:
-        return []
     tests = list[MovingTest]()
     for test, points in points_of_tests(study, assemble(study).points):
-        scenario = points[0].scenario
-        axes = axes_of(study, test, scenario)
-        domains = {name: axes[name] for name in moving_axes(study, test, scenario)}
-        if domains:
+        axes = moving_axes(study, test, points)
+        domains = {
+            name: axes[name]
+            for name, at in study.lists_of(test).items()
+            if len(at) > 1 and name in axes
+        }
+        if test and domains:
             tests.append(MovingTest(model, test, domains, new_car))
     return tests
 
@@ -132,43 +131,24 @@ def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]
     return replace_in(study.listed().with_tests(moving), encounters=RANGES)
 
 
-def axes_of(study: Study, test: MatrixTest, scenario: Scenario) -> dict[str, Domain]:
-    """The listed axes of a test that its scenario can move, each from its least to its greatest
-    value; one with a single value as far as is legal.
-    """
-    searchable = searchable_in(scenario)
-    return {
-        name: Domain(
-            unit=searchable[name].unit,
-            original=float(values[0]),
-            lower=float(min(values) if len(values) > 1 else searchable[name].lower),
-            upper=float(max(values) if len(values) > 1 else searchable[name].upper),
-        )
-        for name, values in study.lists_of(test).items()
-        if name in searchable and are_numbers(values)
-    }
-
-
 def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
     """A model at further tests beside those of its matrix, or at these `alone`; a point that the
     matrix has counts once.
     """
     study = model.evaluator.study.listed()
-    assert study.matrix is not None
-    known = [] if alone else study.matrix.tests
-    points = dict(point for test in tests for point in _points_of(study, test))
-    for name, _ in (point for test in known for point in _points_of(study, test)):
-        points.pop(name, None)
+    known = [] if alone else study.tests
+    points = {_point_key(study, point): point for test in tests for point in study.points_of(test)}
+    for test in known:
+        for point in study.points_of(test):
+            points.pop(_point_key(study, point), None)
     further = study.with_tests([*known, *points.values()])
     return model._replace(evaluator=model.evaluator.for_study(further, verified=0), points=None)
 
 
-def _points_of(study: Study, test: MatrixTest) -> Iterator[tuple[tuple[Any, ...], MatrixTest]]:
-    """The test at each of its points alone, with what tells it from others."""
-    lists = study.lists_of(test)
-    for place in product(*lists.values()):
-        over = dict(zip(lists, place, strict=True))
-        yield (test.name, *over.items()), at_values(test, over)
+def _point_key(study: Study, point: MatrixTest) -> tuple[Any, ...]:
+    """What tells a test at one point from others."""
+    weather = [*map(repr, point.weathers)]
+    return (point.name, *((name, *at) for name, at in study.lists_of(point).items()), *weather)
 
 
 def with_encounters(study: Study, system: System, changes: Collection[str]) -> tuple[Study, System]:
@@ -203,11 +183,10 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
     """A study in which those of the names that are listed axes, which a scenario can move, may have
     any value, in the tests that have all of them.
     """
-    if study.matrix is None or study.matrix.protocol or study.ranges:
-        return study
     moving = [
-        (test, axes_of(study, test, own[0].scenario))
+        (test, moving_axes(study, test, own))
         for test, own in points_of_tests(study, system.points)
+        if test
     ]
     axes = names & {name for _, domains in moving for name in domains}
     if not axes:

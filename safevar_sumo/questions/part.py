@@ -12,9 +12,9 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError, check_name, check_text
 from safevar_sumo.protocol.rater import expand_protocol
 from safevar_sumo.questions.scope import points_of_tests
-from safevar_sumo.scenarios import Point, searchable_in, weather_of
+from safevar_sumo.scenarios import searchable_in, weather_of
 from safevar_sumo.scenarios.declared import read_study, with_ranges
-from safevar_sumo.study import OBJECTIVES, RANGES, MatrixTest, Study, axis_of, unit_text
+from safevar_sumo.study import OBJECTIVES, RANGES, MatrixTest, Study, unit_text
 from safevar_sumo.study.encounters import Axes, AxisTable, are_numbers
 from safevar_sumo.study.scenario_file import MODEL
 from safevar_sumo.sumo.system import assemble
@@ -76,7 +76,11 @@ def at_point(study: Study, name: str) -> Study:
     tests = expanded.tests
     alone = [test for test in tests if test.name == name]
     points = () if alone else assemble(study).matrix
-    alone = alone or _test_at(expanded, points, name)
+    if not alone:  # a listed encounter has no ranges
+        expanded = expanded.listed()
+        at_points = [each for test in expanded.tests for each in expanded.points_of(test)]
+        pairs = zip(points, at_points, strict=True)
+        alone = [test for point, test in pairs if point.name == name]
     if not alone:
         names = [*{test.name: 0 for test in tests} | {point.name: 0 for point in points}]
         similar = [one for one in names if name in one] or get_close_matches(
@@ -91,17 +95,6 @@ def at_point(study: Study, name: str) -> Study:
         search = replace(search, objectives=[*OBJECTIVES])
     origin = replace(study.origin, point=name)
     return replace(expanded.with_tests(alone), origin=origin, search=search)
-
-
-def _test_at(study: Study, points: Sequence[Point], name: str) -> list[MatrixTest]:
-    """The test of a point, with the point's values alone; none if there is no such point."""
-    for values in (dict(point.parameters) for point in points if point.name == name):
-        test = next(test for test in study.tests if test.name == values["test"])
-        over: Axes = {axis: [values[axis]] for axis in study.lists_of(test)}
-        free = {axis: axis_of(domain) for axis, domain in study.ranges_of(test).items()}
-        weathers = [one for one in test.weathers if weather_of(one).name == values["weather"]]
-        return [replace(test, over=over | free, weathers=weathers)]
-    return []
 
 
 def study_up_to(study: Study, text: str) -> Study:
@@ -191,7 +184,8 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
 
 def _lists_up_to(study: Study, name: str, high: float) -> Study:
     """The study whose lists of an axis end at a value; without tests that begin above it."""
-    by_test = points_of_tests(study, assemble(study).points)
+    all_points = assemble(study).points
+    by_test = [(test, own) for test, own in points_of_tests(study, all_points) if test]
     driven = [value for test, _ in by_test for value in _values(study, test, name)]
     if not min(driven) <= high <= max(driven):
         units = [searchable_in(points[0].scenario) for _, points in by_test]

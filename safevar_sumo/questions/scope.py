@@ -4,50 +4,44 @@ the light.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import islice
-from typing import Any
-
-from msgspec.structs import replace as replace_in
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Scenario, Simulator, searchable_in
-from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Simulator, searchable_in
+from safevar_sumo.study import Domain, MatrixTest, Study, Weather, unit_text
 from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
 
 
-def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
-    """A test with one value of each of these axes."""
-    return replace_in(test, over={**test.over, **{name: [values[name]] for name in values}})
-
-
-def points_of_tests(study: Study, points: Sequence[Point]) -> list[tuple[MatrixTest, list[Point]]]:
-    """The tests of a study's matrix, each with its points."""
-    assert study.matrix is not None
+def points_of_tests(
+    study: Study, points: Sequence[Point]
+) -> Sequence[tuple[MatrixTest | None, Sequence[Point]]]:
+    """The tests of a study, each with its points; all points of one without tests of its own."""
+    if not study.tests:
+        return [(None, points)]
     rest = iter(points)
-    tests = []
-    for test in study.matrix.tests:
-        count = max(len(test.weathers), 1)
-        for values in study.lists_of(test).values():
-            count *= len(values)
-        tests.append((test, [*islice(rest, count)]))
-    return tests
+    return [(test, [*islice(rest, len(study.points_of(test)))]) for test in study.tests]
 
 
-def moving_axes(study: Study, test: MatrixTest, scenario: Scenario) -> list[str]:
-    """The axes of a test that its scenario can move between their values; none where encounters are
-    ranges.
+def moving_axes(
+    study: Study, test: MatrixTest | None, points: Sequence[Point]
+) -> dict[str, Domain]:
+    """The listed axes of a test that its scenario can move, each from its least to its greatest
+    value, or with a single value as far as is legal; none where encounters are ranges.
     """
-    if study.ranges:
-        return []
-    searchable = searchable_in(scenario)
-    return [
-        name
+    searchable = {} if study.ranges else searchable_in(points[0].scenario)
+    return {
+        name: Domain(
+            unit=searchable[name].unit,
+            original=float(values[0]),
+            lower=float(min(values) if len(values) > 1 else searchable[name].lower),
+            upper=float(max(values) if len(values) > 1 else searchable[name].upper),
+        )
         for name, values in study.lists_of(test).items()
-        if name in searchable and len(values) > 1 and are_numbers(values)
-    ]
+        if name in searchable and are_numbers(values)
+    }
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:
@@ -58,24 +52,15 @@ def scope_of(study: Study, *, between: bool = True) -> str:
     """
     # What drives in each test.
     points = assemble(study).points
-    if study.matrix is None or study.matrix.protocol:
-        name = "" if study.matrix is None else str(study.matrix.protocol)
-        drives = [
-            (
-                _model_in_words(study.scenario.model),
-                name,
-                _parameters_in_words(study, None, points, between),
-            )
-        ]
-    else:
-        drives = [
-            (
-                _model_in_words(test.model or study.scenario.model),
-                test.name,
-                _parameters_in_words(study, test, own, between),
-            )
-            for test, own in points_of_tests(study, points)
-        ]
+    protocol = "" if study.matrix is None else str(study.matrix.protocol)
+    drives = [
+        (
+            _model_in_words((test and test.model) or study.scenario.model),
+            test.name if test else protocol,
+            _parameters_in_words(study, test, own, between),
+        )
+        for test, own in points_of_tests(study, points)
+    ]
 
     # Tests with the same scenario and parameters share a phrase.
     phrases = []
@@ -104,7 +89,7 @@ def _parameters_in_words(
     # Axes that are listed, and those of which any value may occur.
     over = study.lists_of(test)
     searchable = searchable_in(points[0].scenario)
-    moving = moving_axes(study, test, points[0].scenario) if test and between else []
+    moving = moving_axes(study, test, points) if between else {}
     phrases = {}
     for name, values in over.items():
         unit = unit_text(searchable[name].unit) if name in searchable else ""
@@ -126,7 +111,7 @@ def _parameters_in_words(
 
 
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
-    if is_range:
+    if is_range and len(values) > 1:
         return f"{min(values):g} to {max(values):g}"
     return join_phrases(
         f"{value:g}" if isinstance(value, float) else str(value) for value in values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from typing import Annotated, Any, Final, Literal, Self
 
 from msgspec import Meta
@@ -184,6 +185,11 @@ class MatrixTest(Table, frozen=True, kw_only=True):
         return as_axes(self.over)
 
 
+def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
+    """A test with one value of each of these axes."""
+    return replace(test, over={**test.over, **{name: [value] for name, value in values.items()}})
+
+
 class MatrixTable(Table, frozen=True, kw_only=True):
     """The test points at which every setting is simulated: those of `tests`, or all cells of a
     `protocol`, which then rates every setting.
@@ -272,7 +278,8 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
         """The axes of each test, or of the only one."""
-        return [(test, self.axes_of(test)) for test in [*self.tests] or [None]]
+        tests: list[MatrixTest | None] = [*self.tests] or [None]
+        return [(test, self.axes_of(test)) for test in tests]
 
     def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
         """The axes of a test, its own first; those of all tests, unless it has values of them."""
@@ -318,6 +325,18 @@ class Encounters(Table, frozen=True, kw_only=True):
             upper = max(domain.upper for domain in own)
             found[name] = replace(own[0], lower=lower, upper=upper)
         return found
+
+    def points_of(self, test: MatrixTest) -> list[MatrixTest]:
+        """A test at each of its points alone: at each combination of its listed values, in each of
+        its weathers.
+        """
+        lists = self.lists_of(test)
+        weathers = [[weather] for weather in test.weathers] or [[]]
+        return [
+            replace(at_values(test, dict(zip(lists, values, strict=True))), weathers=weather)
+            for values in product(*lists.values())
+            for weather in weathers
+        ]
 
     def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
         """The study with other axes of each test, and of all; lists alone are written as such."""

@@ -8,7 +8,6 @@ import inspect
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -130,28 +129,27 @@ def _points_of(
     shared = study.scenario.parameters if model == study.scenario.model else {}
     lists, ranges = study.lists_of(test), study.ranges_of(test)
     constraints = tuple(one for one in of_tests if test.name in (one.tests or [test.name]))
-    for values in product(*lists.values()):
-        over = dict(zip(lists, values, strict=True))
-        table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
-        scenario = create_scenario(table, lookup)
-        if not ranges:
-            scenario.check()
-        _check_listed({**table.parameters, **dict.fromkeys(ranges, None)}, constraints)
-        for weather in map(weather_of, test.weathers or [study.weather]):
-            words = [test.name, *(f"{key} {value}" for key, value in over.items())]
-            words += [] if isinstance(scenario, Simulator) else [weather.name]
-            name = ", ".join(words)
-            parameters = {"test": test.name, **over, "weather": weather.name}
-            allowed = test.allowed_impact_speed / KMH_PER_MS
-            yield Point(
-                scenario=scenario,
-                weather=weather,
-                name=name,
-                parameters=tuple(parameters.items()),
-                allowed_impact_speed=allowed,
-                ranges=ranges,
-                constraints=constraints if ranges else (),
-            )
+    for number, alone in enumerate(study.points_of(test)):
+        over = {name: alone.axes[name].at[0] for name in lists}
+        if number % max(len(test.weathers), 1) == 0:  # the same scenario in all weathers
+            table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
+            scenario = create_scenario(table, lookup)
+            if not ranges:
+                scenario.check()
+            _check_listed({**table.parameters, **dict.fromkeys(ranges, None)}, constraints)
+        (weather,) = map(weather_of, alone.weathers or [study.weather])
+        words = [test.name, *(f"{key} {value}" for key, value in over.items())]
+        words += [] if isinstance(scenario, Simulator) else [weather.name]
+        parameters = {"test": test.name, **over, "weather": weather.name}
+        yield Point(
+            scenario=scenario,
+            weather=weather,
+            name=", ".join(words),
+            parameters=tuple(parameters.items()),
+            allowed_impact_speed=test.allowed_impact_speed / KMH_PER_MS,
+            ranges=ranges,
+            constraints=constraints if ranges else (),
+        )
 
 
 def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) -> None:

@@ -5,24 +5,23 @@ alone, and counts whether or not the original vehicle is safe in it.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, SimulationError, check_name
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
-from safevar_sumo.questions.scope import at_values, points_of_tests
+from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.study import PHASE, MatrixTest, Study, unit_text
+from safevar_sumo.study import PHASE, Study, unit_text
 from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
 
@@ -189,13 +188,10 @@ def span_of(study: Study, by: str | None) -> Span:
         If the study varies no such speed; those that it varies are named.
     """
     study = with_ranges(study)
-    matrix = study.matrix
-    if matrix is not None and matrix.protocol:
+    if study.is_rated:
         problem = f"study {study.name!r} is rated, and drives each test at speeds of its own"
         raise InputError(study.source, problem, "a study that is not rated")
-    points = assemble(study).points
-    tests: Sequence[tuple[MatrixTest | None, Sequence[Point]]]
-    tests = [(None, points)] if matrix is None else points_of_tests(study, points)
+    tests = points_of_tests(study, assemble(study).points)
 
     # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
     units = {name: domain.unit for name, domain in study.ranges.items()}
@@ -253,15 +249,9 @@ def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
     """Each test of a study at each combination of its axes that do not move, as a study of its own;
     with its name and its value of a parameter, minus infinity where it has none.
     """
-    matrix = study.matrix
-    if matrix is None:
+    if not study.tests:
         yield "", study, -np.inf
-        return
-    for test in matrix.tests:
-        lists = study.lists_of(test)
-        weathers = [[weather] for weather in test.weathers] or [[]]
-        for weather, *place in product(weathers, *lists.values()):
-            over = dict(zip(lists, place, strict=True))
-            alone = replace_in(at_values(test, over), weathers=weather)
-            fixed = float(over[by]) if by in over else -np.inf
-            yield test.name, study.with_tests([alone]), fixed
+    for test in study.tests:
+        for alone in study.points_of(test):
+            listed = study.lists_of(alone).get(by)
+            yield test.name, study.with_tests([alone]), float(listed[0]) if listed else -np.inf
