@@ -29,8 +29,8 @@ STUDY_OF_AN_ADS = "smoke"
 """The study in which `check` lets an ADS drive that is given by its name."""
 CHECKS: Mapping[str, str] = {
     "contract": (
-        "return what the base class documents, leave arguments as they are, and guard divisions and"
-        " roots where the domain ends"
+        "return what the base class documents, leave arguments as they are, state what a metric"
+        " reads in its needs, and guard divisions and roots where the domain ends"
     ),
     "repetition": (
         "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing"

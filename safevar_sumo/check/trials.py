@@ -12,10 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import default_rng
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.plugins.contract import user_errors
-from safevar_sumo.records import FloatArray, IntArray, ResultColumns, differences
+from safevar_sumo.records import (
+    QUANTITIES,
+    FloatArray,
+    IntArray,
+    ResultColumns,
+    SimulationRuns,
+    differences,
+)
 from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
@@ -89,11 +96,9 @@ def try_simulations(
         vehicles = left // (each * (1 if system.repeats > 1 else 4))
         if vehicles < 1:
             return
-    if system.has_simulator:
-        runs = drive_all(system.at(system.points[0]), settings[:1])
-        if contradiction := unit_contradiction(runs.trace):
-            expected = "speeds in m/s, and distances in m"
-            yield FailedCheck("contract", contradiction, expected, "the original vehicle")
+    own_metrics = [name for name in (*study.metrics.also, *study.search.objectives) if ":" in name]
+    if system.has_simulator or own_metrics:
+        yield from try_original(system, drive_all(system.at(system.points[0]), settings[:1]))
     number, seconds = (1, 0.0) if most is not None else _affordable(system, settings)
     if vehicles is not None:
         vehicles = min(vehicles, len(settings))
@@ -124,6 +129,30 @@ def try_simulations(
             found, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
             yield FailedCheck("contract", found, reacts, setting)
+
+
+def try_original(system: System, runs: SimulationRuns) -> Iterator[FailedCheck]:
+    """What is wrong in the run of the original vehicle: units of a simulator of the user's own, and
+    metrics that change with a quantity that they do not state.
+    """
+    if system.has_simulator and (contradiction := unit_contradiction(runs.trace)):
+        expected = "speeds in m/s, and distances in m"
+        yield FailedCheck("contract", contradiction, expected, "the original vehicle")
+    for measure in system.measuring.measures.values():
+        if measure.of == "settings":
+            continue
+        with user_errors(system.source):
+            values = measure.of_runs(runs, system.metrics_table)
+        for quantity in (name for name in QUANTITIES if name not in measure.quantities):
+            try:
+                with user_errors(system.source):
+                    others = measure.of_runs(runs.without(quantity), system.metrics_table)
+            except UserCodeError:  # it reads the quantity all the same
+                others = np.full_like(values, np.inf)
+            if not np.array_equal(values, others, equal_nan=True):
+                got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
+                expected = f"needs = {(*measure.quantities, quantity)}"
+                yield FailedCheck("contract", got, expected, "the original vehicle")
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:

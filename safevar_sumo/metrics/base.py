@@ -6,19 +6,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import replace
 
-from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.errors import InputError, UserCodeError, check_name
 from safevar_sumo.plugins import FINITE, Legal, UserCode, quoted
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.study import ORIGINAL_DEGREE
+from safevar_sumo.records import QUANTITIES, BoolArray, Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.study import ORIGINAL_DEGREE, MetricsTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
+OF_EVERY_TRACE = "speed", "separation"
+"""Quantities that every trace has."""
 
 
 def sampling_stride(step: float, interval: float | None) -> int:
@@ -81,6 +83,9 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         characteristics; returns shape (N,), of runs NaN where it is undefined. Element i depends
         only on run or setting i, bit for bit. None in results, and for columns that all results
         have.
+    needs
+        Quantities that the function of runs reads, of `QUANTITIES`; without them `OF_EVERY_TRACE`.
+        It is not called with runs that lack one, where the metric is undefined. Not in results.
     """
 
     name: MeasureName
@@ -91,6 +96,12 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     description: str = ""
     of: Literal["runs", "settings"] = "runs"
     function: Any = None
+    needs: tuple[str, ...] | UnsetType = UNSET
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """The quantities that it needs, by default those of every trace."""
+        return OF_EVERY_TRACE if self.needs is UNSET else self.needs
 
     @property
     def sign(self) -> float:
@@ -99,8 +110,21 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def facts(self) -> Measure:
-        """The record without the function, for results."""
-        return replace(self, function=None)
+        """The record without the function and its needs, for results."""
+        return replace(self, function=None, needs=UNSET)
+
+    def of_runs(self, runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+        """The metric of N runs, shape (N,): what a run states itself, or else what the function
+        says; NaN where a run lacks what it needs.
+        """
+        rows = np.flatnonzero(~runs.lacking(*self.quantities))
+        values = np.full(len(runs.outcome), np.nan)
+        if len(rows) == len(values):
+            values = self.function(runs, thresholds)
+        elif len(rows):
+            values[rows] = self.function(runs.of(rows), thresholds)
+        own = runs.stated.get(self.name, values)
+        return np.where(np.isnan(own), values, own)
 
 
 def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
@@ -121,15 +145,16 @@ def checked_measure(code: UserCode) -> Measure:
     if not (isinstance(measure, Measure) and callable(measure.function)):
         raise UserCodeError("", f"{code.name} is {quoted(measure)}", expected, code.definition())
     try:
-        facts = msgspec.convert(msgspec.to_builtins(measure.facts), Measure)
+        facts = msgspec.convert(msgspec.to_builtins(replace(measure, function=None)), Measure)
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError("", f"{code.name}: {error}", expected) from None
+    for need in facts.quantities:
+        check_name("", f"{code.name}: needs = {measure.needs!r}", need, QUANTITIES)
     is_of_runs = facts.of == "runs"
     count = (lambda runs: len(runs.outcome)) if is_of_runs else len
     legal = Legal(undefined=True) if is_of_runs else FINITE
-    return replace(
-        facts, function=code.checked_function(measure.function, facts.name, legal, count)
-    )
+    function = code.checked_function(measure.function, facts.name, legal, count)
+    return replace(facts, function=function)
 
 
 class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):

@@ -51,6 +51,7 @@ STOPPING_DISTANCE = Measure(
     unit="m",
     more_is_unsafe=True,
     function=stopping_distance,
+    needs=("speed", "position", "brake", "pedal"),
     description=(
         "Distance from the first brake force to standstill; every study of the scenario stop"
         " has it."
@@ -80,6 +81,7 @@ STOP_FROM_PEDAL = Measure(
     unit="m",
     more_is_unsafe=True,
     function=stop_from_pedal,
+    needs=("speed", "position", "brake"),
     description="Distance from the first command to brake to standstill, with the brake's delay.",
 )
 
@@ -110,6 +112,7 @@ MFDD = Measure(
     title="MFDD",
     unit="m/s^2",
     function=mean_fully_developed_deceleration,
+    needs=("speed", "position"),
     description="Mean fully developed deceleration, between 80 and 10 % of the first speed.",
 )
 

@@ -11,6 +11,9 @@ from safevar_sumo.metrics.conflicts import conflict
 from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
+OF_APPROACH = "speed", "gap", "obstacle_speed"
+"""What times to collision need."""
+
 
 def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Least separation during the encounter [m, > 0], or minus the closing speed of the collision
@@ -29,6 +32,7 @@ SAFETY_DEGREE_METRIC = Measure(
     title="SD",
     unit="m, or -m/s",
     function=safety_degree,
+    needs=("separation",),
     description=(
         "Least separation during the encounter [m, > 0], or minus a collision's closing speed [m/s,"
         " < 0]."
@@ -83,6 +87,7 @@ TET = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=time_exposed,
+    needs=OF_APPROACH,
     description=(
         "TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; TTC(t) = L_s / v_L, "
         "the distance between both over the speed at which it shrinks; another TTC than that of "
@@ -96,6 +101,7 @@ TIT = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=time_integrated,
+    needs=OF_APPROACH,
     description=(
         "TIT* = sum of (TTC* - TTC(t)) dt over the same samples [s^2], with the TTC of TET."
     ),
@@ -134,6 +140,7 @@ TTC_MIN = Measure(
     more_is_unsafe=False,
     over_collisions=False,
     function=least_time_to_collision,
+    needs=OF_APPROACH,
     description=(
         "Least TTC_p(t) = gap / (v - u) [s], both along the vehicle's path, to a body that is in "
         "it or comes into it; another TTC than that of TET and TIT; without a collision."
@@ -146,6 +153,7 @@ DRAC = Measure(
     more_is_unsafe=True,
     over_collisions=False,
     function=largest_deceleration_rate,
+    needs=OF_APPROACH,
     description=(
         "Largest deceleration rate to avoid the crash, (v - u)^2 / (2 gap) [m/s^2], with the gap "
         "and the speeds of ttc_min; without a collision."
@@ -211,6 +219,7 @@ PET = Measure(
     unit="s",
     over_collisions=False,
     function=post_encroachment_time,
+    needs=("speed", "gap"),
     description=(
         "Post-encroachment time of a vehicle that passes who crosses; without a collision or a"
         " stop."
@@ -222,6 +231,7 @@ REACTION_TIME = Measure(
     unit="s",
     more_is_unsafe=True,
     function=reaction_time,
+    needs=("brake",),
     description="Time from the first sight of the body ahead to the first brake command.",
 )
 
@@ -251,6 +261,7 @@ AVE_DECE = Measure(
     title="aveDece",
     unit="m/s^2",
     function=average_deceleration,
+    needs=("speed", "brake"),
     description=(
         "Mean loss of speed per time over the samples in which the brake is commanded and the"
         " vehicle moves."

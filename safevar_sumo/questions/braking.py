@@ -15,7 +15,7 @@ REGULATION_SHARE = 0.05
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is
-    nearest; None if it does not brake.
+    nearest; None if it does not brake, or if its simulator does not say.
 
     A braking manoeuvre has brake commands of at least `REGULATION_SHARE` times the largest one. It
     begins where the command starts to rise towards that, and ends where the throttle or a smaller
@@ -28,6 +28,8 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     3. otherwise none if the vehicle collides, and its last one if it does not.
     """
     # Speed and brake until the obstacle is nearest.
+    if runs.lacking("brake")[column]:
+        return None
     trace = runs.trace
     nearest_sample = runs.nearest(column)
     active = trace.active[: None if nearest_sample is None else nearest_sample + 1, column]

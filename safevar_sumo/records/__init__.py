@@ -7,7 +7,6 @@ from safevar_sumo.records.driving import (
     GRAVITY as GRAVITY,
     KMH_PER_MS as KMH_PER_MS,
     LEAST_CLOSING_SPEED as LEAST_CLOSING_SPEED,
-    NO_CONTACT as NO_CONTACT,
     STANDSTILL as STANDSTILL,
     TIME_DECIMALS as TIME_DECIMALS,
     TIME_ROUNDING as TIME_ROUNDING,
@@ -15,8 +14,6 @@ from safevar_sumo.records.driving import (
     ZERO as ZERO,
     BoolArray as BoolArray,
     Command as Command,
-    Contact as Contact,
-    Encounter as Encounter,
     FloatArray as FloatArray,
     FloatOrArray as FloatOrArray,
     IntArray as IntArray,
@@ -24,12 +21,9 @@ from safevar_sumo.records.driving import (
     NamedValues as NamedValues,
     Nominal as Nominal,
     Observation as Observation,
-    Outcome as Outcome,
     PedalTables as PedalTables,
     Quantity as Quantity,
-    SimulationRuns as SimulationRuns,
     TextArray as TextArray,
-    Trace as Trace,
     finite_or_none as finite_or_none,
 )
 from safevar_sumo.records.evaluations import (
@@ -38,4 +32,13 @@ from safevar_sumo.records.evaluations import (
     Evaluations as Evaluations,
     ResultColumns as ResultColumns,
     differences as differences,
+)
+from safevar_sumo.records.runs import (
+    NO_CONTACT as NO_CONTACT,
+    QUANTITIES as QUANTITIES,
+    Contact as Contact,
+    Encounter as Encounter,
+    Outcome as Outcome,
+    SimulationRuns as SimulationRuns,
+    Trace as Trace,
 )

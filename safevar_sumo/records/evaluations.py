@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records.driving import BoolArray, FloatArray, Outcome, TextArray
+from safevar_sumo.records.driving import BoolArray, FloatArray, TextArray
+from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")

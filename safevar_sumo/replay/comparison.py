@@ -101,7 +101,7 @@ class Comparison:
         """Whether positions of the vehicles are known: a simulator of the user's own may have
         none.
         """
-        return not np.isnan(self.runs.trace.position).any()
+        return not self.runs.lacking("position").any()
 
     def refuse_without_position(self) -> None:
         """Refuse to draw runs without positions."""
@@ -216,7 +216,8 @@ def comparison_of(simulation: Simulation) -> Comparison:
     # any more.
     trace = pair.runs.trace
     pedals = np.stack([trace.throttle, trace.brake])
-    for row in np.flatnonzero(~np.isnan(pair.runs.collision_speed)).tolist():
+    has_collided = ~np.isnan(pair.runs.collision_speed) & trace.active.any(axis=0)
+    for row in np.flatnonzero(has_collided).tolist():
         end = int(np.flatnonzero(trace.active[:, row])[-1])
         pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
     return Comparison(

@@ -134,6 +134,8 @@ def unit_contradiction(trace: Trace) -> str:
     m/s; "" if it does not, or has neither a position nor the gap to one standing body.
     """
     here = trace.active[:, 0]
+    if not here.any():
+        return ""
     speed, gap = trace.speed[here, 0], trace.gap[here, 0]
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
     stands = (trace.obstacle_speed[here, 0] == 0).all() and (np.diff(gap) <= 0).all()

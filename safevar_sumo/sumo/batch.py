@@ -45,10 +45,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
             if measure.of == "settings":
                 metrics[name] = measure.function(settings, system.characteristics)
             else:
-                values = measure.function(runs, system.metrics_table)
-                if name in runs.stated:
-                    is_stated, own_values = runs.stated[name]
-                    values = np.where(is_stated, own_values, values)
+                values = measure.of_runs(runs, system.metrics_table)
                 metrics[name] = np.where(is_invalid, np.nan, values)
     found = Evaluations(
         settings=settings,

@@ -25,7 +25,7 @@ from safevar_sumo.plugins.process import (
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
-    BoolArray,
+    QUANTITIES,
     Contact,
     Encounter,
     FloatArray,
@@ -39,23 +39,6 @@ from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.kept import KEPT
 from safevar_sumo.sumo.system import System
-
-NEEDS = {
-    "gap": ("tet", "tit", "ttc_min", "drac"),
-    "obstacle_speed": ("tet", "tit", "ttc_min", "drac"),
-    "brake": ("ave_dece", "reaction_time"),
-    "position": ("mfdd", "stopping_distance", "stop_from_pedal"),
-}
-"""Metrics that a trace without a quantity does not define."""
-NEVER_DEFINED = ("pet",)
-"""Metrics of which a trace of a simulator says nothing: it has no lateral distances."""
-NO_TRACE: Mapping[str, FloatArray] = {
-    TIME: np.array([0.0, 1.0]),
-    "speed": np.zeros(2),
-    "separation": np.full(2, np.inf),
-}
-"""What stands in place of the trace of a run that has none."""
-
 
 _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
@@ -174,11 +157,10 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
 def _runs_of(
     results: Sequence[Mapping[str, Any]], system: System, allowed_impact_speed: float
 ) -> SimulationRuns:
-    """The runs of N results, each with its own number of samples."""
-    traces = [{**NO_TRACE, **result} if TIME not in result else result for result in results]
-    logged = [result[TIME] for result in results if TIME in result] or [NO_TRACE[TIME]]
-    step = float(np.diff(logged[0][:2])[0])
-    lengths = np.array([len(trace[TIME]) for trace in traces])
+    """The runs of N results, each with its own number of samples; 0 without a trace."""
+    traces = [result if TIME in result else {} for result in results]
+    step = next((float(np.diff(trace[TIME][:2])[0]) for trace in traces if trace), 0.0)
+    lengths = np.array([len(trace.get(TIME, ())) for trace in traces])
     samples = np.arange(lengths.max())
 
     def column(name: str) -> FloatArray:
@@ -191,18 +173,20 @@ def _runs_of(
                 values[:, row] = trace[name][np.minimum(samples, lengths[row] - 1)]
         return values
 
-    # Metrics that a run states itself, and those that it leaves undefined.
-    stated = {name: _stated(name, results) for name in (*NEVER_DEFINED, *system.measuring.measures)}
+    def number(name: str, of: Sequence[Mapping[str, Any]] = results) -> FloatArray:
+        """What results state, shape (N,), NaN where they do not."""
+        return np.array([result.get(name, np.nan) for result in of], dtype=float)
 
-    # The collisions.
+    # How hard the collisions were, and other metrics that a run without a trace states.
     collided = np.array([result[OUTCOME] == Outcome.COLLISION for result in results])
-    struck = np.array([result.get(STRUCK_SPEED, 0.0) for result in results])
-    impact = np.array(
-        [result.get(IMPACT_SPEED, -result.get(SAFETY_DEGREE, np.nan)) for result in results]
-    )
+    struck = np.nan_to_num(number(STRUCK_SPEED))
+    impact = np.where(np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED))
     closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
-    stated["impact_speed"] = collided, closing_speed
-    stated["impact_excess"] = collided, closing_speed - allowed_impact_speed
+    rigs = [{} if TIME in result else result for result in results]
+    stated = {name: number(name, rigs) for name in system.measuring.measures}
+    stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
+    excess = closing_speed - allowed_impact_speed
+    stated["impact_excess"] = np.where(collided, excess, number("impact_excess", rigs))
 
     # One batch, as of SUMO.
     speed, gap, obstacle_speed = map(column, ("speed", "gap", "obstacle_speed"))
@@ -231,23 +215,6 @@ def _runs_of(
             np.full(len(results), "", dtype="U5"), np.full(len(results), np.nan), struck
         ),
         allowed_impact_speed=np.full(len(results), allowed_impact_speed),
+        lacks={name: np.array([name not in trace for trace in traces]) for name in QUANTITIES},
         stated=stated,
     )
-
-
-def _stated(name: str, results: Sequence[Mapping[str, Any]]) -> tuple[BoolArray, FloatArray]:
-    """Which of N results state a metric, shape (N,), and its values: all without a trace, and those
-    whose trace does not define it.
-    """
-    has_trace = np.array([TIME in result for result in results])
-    is_defined = np.array(
-        [
-            name not in NEVER_DEFINED
-            and all(quantity in result for quantity in NEEDS if name in NEEDS[quantity])
-            for result in results
-        ]
-    )
-    values = np.array(
-        [np.nan if TIME in result else result.get(name, np.nan) for result in results]
-    )
-    return ~(has_trace & is_defined), values

@@ -177,6 +177,14 @@ DEFECTS = {
         "    jerk = jerk - np.mean(jerk)\n    return np.max(",
         ALONE,
     ),
+    "metric without a need": planted(
+        "metric",
+        "contract",
+        METRIC,
+        "trace.speed, axis=0)",
+        "np.minimum(trace.speed, trace.gap), axis=0)",
+        "the metric jerk reads gap, which its needs do not state",
+    ),
     "objective no number": planted(
         "objective",
         "contract",

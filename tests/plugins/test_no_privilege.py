@@ -18,6 +18,7 @@ from numpy.testing import assert_array_equal
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.check import trials
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.protocol.cells import MODELS
@@ -27,6 +28,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, free_parameters
+from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
@@ -234,6 +236,7 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     assert_array_equal(found.column("own_f_diff"), found.f_diff)
     values = system.measuring.scoring.values(found)
     assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
+    assert not [*trials.try_original(system, drive_all(system, drawn(system, 8, 2)))]
 
 
 @SLOW

@@ -168,6 +168,28 @@ def test_metrics_that_a_trace_does_not_define_are_undefined(wall: Path) -> None:
     assert found.f_safe[0] > 0
 
 
+NEEDS_GAP = """
+from safevar_sumo.metrics import Measure
+
+
+def first(runs, thresholds):
+    assert (runs.trace.gap > -1).all()
+    return runs.trace.gap[0]
+
+
+FIRST = Measure(name="first", title="first", unit="m", function=first, needs=("gap",))
+"""
+
+
+def test_a_metric_gets_the_runs_alone_that_have_what_it_needs(wall: Path) -> None:
+    (wall.parent / "needing.py").write_text(NEEDS_GAP)
+    change = "lambda r: r if r['time'][-1] > 3 else {k: r[k] for k in r if k != 'gap'}"
+    system = wrong_system(wall, change, metrics={"also": ["needing:FIRST"]})
+    found = simulators.simulate_each(system, np.array([[8.0, 0.0], [4.0, 0.0]]))
+    measure = system.measuring.measures["first"]
+    assert str(measure.of_runs(found, system.metrics_table)) == "[nan 40.]"
+
+
 def test_a_rig_states_its_metrics_itself(wall: Path) -> None:
     system = system_of(wall, scenario={"model": "models:Rig"})
     found = drive_and_score(system, np.array([[5.0, 0.0], [3.0, 0.5]]))

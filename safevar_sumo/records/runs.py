@@ -1,0 +1,303 @@
+"""What a simulation leaves: outcomes, traces, geometry of encounters, contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safevar_sumo.records.driving import (
+    ALL_TRUE,
+    LEAST_CLOSING_SPEED,
+    LENGTH_DECIMALS,
+    STANDSTILL,
+    TOUCH_OVERLAP,
+    UNDEFINED,
+    ZERO,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    TextArray,
+)
+
+
+class Outcome(StrEnum):
+    """How a simulation ended."""
+
+    STOPPED = "stopped"
+    PASSED = "passed"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+    NEVER_MOVED = "never-moved"
+    INVALID_TEST = "invalid-test"
+    SIMULATOR_ERROR = "simulator-error"
+    INFEASIBLE = "infeasible"
+
+
+class Encounter(NamedTuple):
+    """The geometry of N vehicles and their obstacle at T samples; shape (T, N).
+
+    The safety degree uses `separation`, the time to collision `distance` and `closing_speed`
+    [m, m, m/s]; both metrics count only samples `in_conflict`.
+    """
+
+    separation: FloatArray
+    distance: FloatArray
+    closing_speed: FloatArray
+    in_conflict: BoolArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
+
+    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with
+    the rest of the batch.
+
+    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m,
+      all speeds in m/s.
+    - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its
+      extent along the lane and `obstacle_width` its extent across it, 0 where the scenario does not
+      state them [m].
+    - `visible`: nothing hides the obstacle.
+    """
+
+    step: float
+    vehicle_length: float
+    time: FloatArray
+    position: FloatArray
+    speed: FloatArray
+    gap: FloatArray
+    lateral: FloatArray
+    lateral_speed: FloatArray
+    throttle: FloatArray
+    brake: FloatArray
+    gear: FloatArray
+    active: BoolArray
+    obstacle_speed: FloatArray = field(default_factory=lambda: ZERO)
+    obstacle_length: FloatArray = field(default_factory=lambda: ZERO)
+    obstacle_width: FloatArray = field(default_factory=lambda: ZERO)
+    visible: BoolArray = field(default_factory=lambda: ALL_TRUE)
+    vehicle_width: float = 0.0
+    pedal: FloatArray = field(default_factory=lambda: ZERO)
+
+    @property
+    def last_active(self) -> IntArray:
+        """The last active sample of each of N vehicles, shape (N,)."""
+        return np.asarray(len(self.time) - 1 - np.argmax(self.active[::-1], axis=0))
+
+    def of(self, vehicles: slice | IntArray) -> Trace:
+        """The trace of some of the vehicles."""
+        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
+        return replace(
+            self,
+            **{
+                name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2
+            },
+        )
+
+
+QUANTITIES: Mapping[str, tuple[str, ...]] = {
+    "gap": ("gap", "lateral", "lateral_speed", "distance"),
+    "obstacle_speed": ("obstacle_speed", "closing_speed"),
+    **{name: (name,) for name in ("speed", "separation", "position")},
+    **{name: (name,) for name in ("throttle", "brake", "pedal", "gear")},
+}
+"""What a metric may need of a run, and the columns of its trace and its encounter that have it. A
+run with a `gap` alone meets who is ahead in its path: `lateral` is 0.
+"""
+
+
+class Contact(NamedTuple):
+    """The position of the first contact on the outline of each of N vehicles, shape (N,).
+
+    `side` is front, left, right or rear; empty without a contact. `place` is the position of the
+    obstacle's middle, 0 to 100; NaN without a contact. At the front or rear it is in % of the
+    vehicle's width, from the side on which `lateral` is negative; at the left or right in % of its
+    length, from the front. `speed` is the obstacle's along the vehicle's lane at that sample [m/s];
+    0 without a contact.
+    """
+
+    side: TextArray
+    place: FloatArray
+    speed: FloatArray
+
+
+NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan), np.array(0.0))
+"""No contact of N vehicles."""
+for _array in NO_CONTACT:
+    _array.flags.writeable = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationRuns:
+    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`,
+    `collision_speed` is NaN without a collision [m/s].
+
+    `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
+    `test_speed_error` is the largest deviation from the test's speed before the driving system
+    acted, NaN if no speed is prescribed [m/s]; `acted_early` the time at which the system acted
+    while the motion of others still depended on the vehicle, NaN otherwise [s]; `warning_ttc` the
+    time to collision at which the system first warned its driver, NaN if it never did [s].
+    `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
+    `allowed_impact_speed` is the relative speed up to which the test case allows an impact [m/s].
+    `lacks` says of quantities which runs do not have them, shape (N,): a run without a trace has
+    none; others are there in all runs. `stated` are values of metrics that runs state themselves,
+    shape (N,), NaN where they do not.
+    """
+
+    trace: Trace
+    encounter: Encounter
+    outcome: TextArray
+    collision_speed: FloatArray
+    contact: Contact = NO_CONTACT
+    test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
+    acted_early: FloatArray = field(default_factory=lambda: UNDEFINED)
+    warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
+    centre_to_centre: bool = False
+    allowed_impact_speed: FloatArray = field(default_factory=lambda: ZERO)
+    lacks: Mapping[str, BoolArray] = field(default_factory=dict)
+    stated: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @cached_property
+    def is_approach(self) -> BoolArray:
+        """Whether a sample is in the encounter, before the vehicle has stopped after moving; shape
+        (T, N).
+        """
+        trace = self.trace
+        has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
+        has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
+        return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
+
+    @cached_property
+    def time_to_collision(self) -> FloatArray:
+        """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
+        _, distance, closing_speed, _ = self.encounter
+        is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
+        return np.divide(
+            distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted
+        )
+
+    def of(self, vehicles: slice | IntArray) -> SimulationRuns:
+        """The runs of some of the vehicles."""
+
+        def select(values: np.ndarray) -> np.ndarray:
+            return values[vehicles] if values.ndim else values
+
+        return SimulationRuns(
+            trace=self.trace.of(vehicles),
+            encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
+            outcome=self.outcome[vehicles],
+            collision_speed=self.collision_speed[vehicles],
+            contact=Contact._make(map(select, self.contact)),
+            test_speed_error=select(self.test_speed_error),
+            acted_early=select(self.acted_early),
+            warning_ttc=select(self.warning_ttc),
+            centre_to_centre=self.centre_to_centre,
+            allowed_impact_speed=select(self.allowed_impact_speed),
+            lacks={name: select(values) for name, values in self.lacks.items()},
+            stated={name: select(values) for name, values in self.stated.items()},
+        )
+
+    def lacking(self, *quantities: str) -> BoolArray:
+        """Which runs lack one of these quantities, shape (N,)."""
+        none = np.zeros(len(self.outcome), dtype=bool)
+        lacks = [self.lacks.get(name, none) for name in quantities]
+        return np.asarray(np.any([none, *lacks], axis=0))
+
+    def without(self, quantity: str) -> SimulationRuns:
+        """The runs with NaN for a quantity, and with 0 where they did not have it; how hard a
+        collision is stays.
+        """
+
+        def changed(record: Trace | Encounter) -> dict[str, Any]:
+            names = [name for name in QUANTITIES[quantity] if hasattr(record, name)]
+            columns = {name: getattr(record, name) for name in names}
+            return {name: np.where(np.isnan(columns[name]), 0.0, np.nan) for name in names}
+
+        trace = replace(self.trace, **changed(self.trace))
+        encounter = Encounter(**{**self.encounter._asdict(), **changed(self.encounter)})
+        runs = replace(self, trace=trace, encounter=encounter)
+        vars(runs)["relative_speed"] = self.relative_speed
+        return runs
+
+    def nearest(self, vehicle: int) -> int | None:
+        """The sample of a vehicle's impact or, without a collision, of its smallest separation in
+        conflict, if any.
+        """
+        active = self.trace.active[:, vehicle]
+        if np.isfinite(self.collision_speed[vehicle]):
+            return int(np.flatnonzero(active)[-1])
+        in_conflict = active & self.encounter.in_conflict[:, vehicle]
+        if not in_conflict.any():
+            return None
+        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
+
+    @property
+    def middles_apart(self) -> float:
+        """How far the middles of bodies that touch are apart [m], in a scenario that measures
+        between middles; else 0.
+        """
+        if not self.centre_to_centre:
+            return 0.0
+        length = float(np.max(self.trace.obstacle_length))
+        return round((self.trace.vehicle_length + length) / 2, LENGTH_DECIMALS)
+
+    @property
+    def closing_speed(self) -> FloatArray:
+        """Severity of a collision: `collision_speed` minus the struck body's speed along the lane
+        at that sample [m/s], shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
+        """
+        return np.maximum(self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED)
+
+    @cached_property
+    def relative_speed(self) -> FloatArray:
+        """Speed of a collision relative to the obstacle along the vehicle's path at the moment of
+        contact, as rated by Euro NCAP [m/s], shape (N,); NaN without a collision.
+
+        A gap d that closes within a time step, from the relative speed v at the relative
+        acceleration a, closes at sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of
+        the step counts: `collision_speed` minus the obstacle's speed. Without a trace it is NaN.
+        """
+        trace = self.trace
+        if not len(trace.time):
+            return np.full(len(self.outcome), np.nan)
+
+        # In the last active sample and the one before.
+        vehicles = np.arange(len(self.collision_speed))
+        last_sample = trace.last_active
+        sample_before = np.maximum(last_sample - 1, 0)
+        obstacle_speed = np.broadcast_to(trace.obstacle_speed, trace.speed.shape)
+        speed = trace.speed - obstacle_speed
+        speed_before = speed[sample_before, vehicles]
+        speed_after = speed[last_sample, vehicles]
+        gap_before = trace.gap[sample_before, vehicles]
+        gap_after = trace.gap[last_sample, vehicles]
+
+        # Contact within the step, at the speed that an even deceleration leads to there.
+        gap_closes = (
+            (gap_before > -TOUCH_OVERLAP)
+            & np.isfinite(gap_before)
+            & (gap_after <= 0)
+            & (speed_before > 0)
+        )
+        distance = np.where(gap_closes, np.maximum(gap_before, 0.0), 0.0)
+        squared_speed = (
+            speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
+        )
+        min_speed = np.minimum(speed_before, speed_after)
+        max_speed = np.maximum(speed_before, speed_after)
+        at_contact = np.minimum(
+            np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed
+        )
+
+        # Otherwise the speed at the end of the step.
+        at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
+        return np.asarray(
+            np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
+        )
