@@ -41,8 +41,8 @@ _first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Restricts a task to some points of a study, and varies parameters of its ADS; every encounter
-    counts, so that no original vehicle drives beside a setting.
+    """Restricts a task to some points of a study, or varies parameters of its ADS; every encounter
+    counts then, so that no original vehicle drives beside a setting.
 
     Attributes
     ----------
@@ -54,15 +54,12 @@ class Selection(msgspec.Struct, frozen=True):
         Whether one ADS drives all rows, with arrays as parameters.
     each
         Whether the evaluations have the rated results at each point of a matrix, `cells`.
-    all_count
-        Whether every encounter counts, where nothing else is selected.
     """
 
     parameters: tuple[str, ...] = ()
     points: tuple[int, ...] | None = None
     arrays: bool = True
     each: bool = False
-    all_count: bool = False
 
     def of(self, system: System) -> System:
         """The system at the selected points."""

@@ -7,7 +7,6 @@ has the vehicle's characteristics, then a place on each axis.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,7 @@ class MovingTest:
         moving = in_ranges(study, [(self.test, domains)])
         evaluator = model.evaluator.for_study(moving, verified=0)
         # Originals drive beside failures alone.
-        self.model = Model(model.fit, evaluator, model.unsafe, all_count=True, new_car=new_car)
+        self.model = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
 
     @property
     def original(self) -> FloatArray:
@@ -123,12 +122,14 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
 
 
 def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]) -> Study:
-    """A study of some tests alone, of which some axes may have any value of a domain."""
+    """A study of some tests alone, of which some axes may have any value of a domain; all of its
+    encounters count.
+    """
     moving = []
     for test, domains in tests:
         over: Axes = {**study.lists_of(test), **{name: axis_of(domains[name]) for name in domains}}
         moving.append(replace_in(test, over=over))
-    return replace_in(study.listed().with_tests(moving), encounters=RANGES)
+    return replace_in(study.listed().all_count.with_tests(moving), encounters=RANGES)
 
 
 def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
@@ -170,13 +171,7 @@ def with_encounters(study: Study, system: System, changes: Collection[str]) -> t
             expected = "a study whose actors move on tracks, and react to nobody"
             raise InputError("", problem, expected)
         found = phased
-    if found == study:
-        return study, system
-
-    # Whether an encounter counts does not become a question by this.
-    scoring = system.measuring.scoring
-    searched = assemble(found)
-    return found, replace(searched, measuring=searched.measuring._replace(scoring=scoring))
+    return found, system if found == study else assemble(found)
 
 
 def _with_axes(study: Study, system: System, names: set[str]) -> Study:

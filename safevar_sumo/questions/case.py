@@ -157,9 +157,10 @@ class Case:
         # The settings that a search may return, as far as there are any.
         feasible = self.evaluations[self.scoring.feasible_rows(self.evaluations)]
         if feasible.empty:
+            margin = self.study.scenario.margin or 0.0
             return (
                 f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
-                f" keeps at least {self.study.scenario.margin:g} m of clearance (scenario.margin)"
+                f" keeps at least {margin:g} m of clearance (scenario.margin)"
             )
         valid = feasible.dropna(subset=[objective.name for objective in self.scoring.objectives])
         return (

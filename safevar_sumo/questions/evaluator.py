@@ -237,9 +237,10 @@ class Evaluator:
         """Evaluations whose results are undefined where the original vehicle is not safe in the
         same encounter.
         """
-        if not len(self.characteristics.scenario):
+        scoring = self.system.measuring.scoring
+        if scoring.safe_original is None:
             return evaluations
-        is_left_out = self.system.measuring.scoring.violation(evaluations) > 0
+        is_left_out = scoring.violation(evaluations) > 0
         metrics = {
             name: np.where(is_left_out, np.nan, values)
             for name, values in evaluations.metrics.items()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import EVERYTHING, Selection
+from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.metrics.unsafe import COLLISION
@@ -41,10 +41,8 @@ class Model(NamedTuple):
         Its number among the sets of [spread]; the study's own is 0.
     points
         Numbers of the points of the study's matrix that count; None for all.
-    all_count
-        Whether every encounter counts, whatever the original vehicle does in it.
     new_car
-        What the original must not be in an encounter that counts, where it has not been tried.
+        What the original must not be in an encounter that counts, beside the rule of the study.
     at_worst_phase
         Whether each setting meets its encounter at the worst phase, where encounters have one.
     """
@@ -53,7 +51,6 @@ class Model(NamedTuple):
     evaluator: Evaluator
     unsafe: Unsafe
     points: tuple[int, ...] | None = None
-    all_count: bool = False
     new_car: Unsafe | None = None
     at_worst_phase: bool = False
 
@@ -73,14 +70,11 @@ class Model(NamedTuple):
     def in_phases(self) -> Model | None:
         """The model of settings that end with the phase of their encounter; None without phases,
         and for points of a rating.
-
-        All points of a study with listed encounters count, whatever the original does.
         """
         evaluator = self.evaluator.in_phases
         if evaluator is None or self.unsafe.is_of_points:
             return None
-        all_count = self.all_count or not len(self.characteristics.scenario)
-        return self._replace(evaluator=evaluator, all_count=all_count, at_worst_phase=False)
+        return self._replace(evaluator=evaluator, at_worst_phase=False)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
         """The evaluations of M settings, shape (M, n), at the points that count; at their worst
@@ -90,10 +84,9 @@ class Model(NamedTuple):
         if claim is not None:
             judge = partial(claim.robustness, stage=stage)
             return claim.evaluate(at_worst_phases(claim, judge, settings)[0], stage)
-        selection = Selection(points=self.points, all_count=self.all_count)
-        if selection == EVERYTHING:
+        if self.points is None:
             return self.evaluator.evaluate(settings, stage)
-        return self.evaluator.evaluate_selection(settings, selection, stage)
+        return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite

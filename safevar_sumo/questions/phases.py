@@ -45,7 +45,7 @@ def in_phases(study: Study, system: System) -> Study:
     has_phases = system.rater is None and all(point.scenario.has_phase for point in system.points)
     if not has_phases or reason_for_sumo(system) or PHASE in system.characteristics.names:
         return study
-    base = study.listed()
+    base = study if study.ranges else study.listed().all_count
     over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
     return replace_in(base, encounters=RANGES, scenario=replace_in(base.scenario, over=over))
 

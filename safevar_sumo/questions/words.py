@@ -183,7 +183,7 @@ def demanded_in_words(study: Study) -> list[str]:
     """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
     other study.
     """
-    margin = f"at least {study.scenario.margin:g} m of clearance (scenario.margin)"
+    margin = f"at least {study.scenario.margin or 0:g} m of clearance (scenario.margin)"
     sentence = f"Only encounters count in which the original vehicle keeps {margin}."
     return [sentence] if study.ranges else []
 

@@ -105,13 +105,13 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
 
     Where encounters are ranges, the original vehicle drives in the same encounter as each variant,
     and must keep at least `margin` [m] between bodies there: otherwise the encounter does not
-    count, as it shows nothing of the variant. A simulator of the user's own that is not
-    deterministic simulates each setting `repeats` times: the share of unsafe runs, the worst run,
-    and means of metrics count.
+    count, as it shows nothing of the variant. Without a margin all of them count. A simulator of
+    the user's own that is not deterministic simulates each setting `repeats` times: the share of
+    unsafe runs, the worst run, and means of metrics count.
     """
 
     over: Annotated[Axes, ORDERED] = {}
-    margin: Annotated[float, Meta(ge=0, le=100)] = ORIGINAL_MARGIN
+    margin: Annotated[float, Meta(ge=0, le=100)] | None = ORIGINAL_MARGIN
     repeats: Annotated[int, Meta(ge=1, le=1000)] = 1
 
 
@@ -217,11 +217,12 @@ class Encounters(Table, frozen=True, kw_only=True):
     any in the ranges of the axes.
 
     A setting meets the tests whose ranges and constraints hold its encounter (`Point.meets`), and
-    the worst of them decides (`safevar_sumo.sumo.encounters.worst_points`). Listed encounters
-    always count; with ranges a setting counts where the original vehicle keeps the margin in all
-    tests that it meets (`safevar_sumo.metrics.Scoring.violation`). A claim about each encounter by
-    itself counts all of them (`Selection.all_count`): those of `permit`, and between listed ones
-    those in which the original is not unsafe (`Model.new_car`).
+    the worst of them decides (`safevar_sumo.sumo.encounters.worst_points`).
+
+    Which encounters count: listed ones always; with ranges a setting counts where the original
+    vehicle keeps the `margin` in all tests that it meets, and `all_count` gives the encounters
+    without a margin, which all count. So do those of `permit`, phases of listed encounters, and
+    what lies between them, unless the original is unsafe there (`Model.new_car`).
     """
 
     scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
@@ -250,7 +251,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         if self.encounters == RANGES and not self.states_ranges:
             problem = f"encounters = {RANGES!r}, and no axis has a range"
             raise InputError("", problem, "over = { NAME = { lower = X, upper = Y } }, or 'tests'")
-        if self.scenario.margin != ORIGINAL_MARGIN and not axes:
+        if self.scenario.margin not in (None, ORIGINAL_MARGIN) and not axes:
             problem = f"scenario.margin = {self.scenario.margin:g}, and no encounter has an axis"
             raise InputError("", problem, "an axis with lower and upper, or no margin")
         of_axes = {name: axis.range for name, axis in axes if axis.range is not None}
@@ -357,6 +358,11 @@ class Encounters(Table, frozen=True, kw_only=True):
         if self.encounters == RANGES:
             return self
         return self.mapped(lambda axes: {name: each.at for name, each in axes.items() if each.at})
+
+    @property
+    def all_count(self) -> Self:
+        """The study whose encounters all count, whatever the original vehicle does in them."""
+        return replace(self, scenario=replace(self.scenario, margin=None))
 
     def with_tests(self, tests: Sequence[MatrixTest]) -> Self:
         """The study in these tests alone, with the constraints that concern them."""

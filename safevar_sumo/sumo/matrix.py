@@ -127,12 +127,12 @@ def drive_and_score(
     """Simulate settings, shape (N, n), as they are given, in one batch and score them.
 
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
-    matrix, row i holds the result of setting i at its worst point. In a study that searches its
-    scenario, row i also holds the safety degree of the original vehicle in the encounter of setting
-    i, unless `with_originals` is false.
+    matrix, row i holds the result of setting i at its worst point. Where an encounter counts by
+    what the original vehicle does in it, row i also holds the safety degree of that, unless
+    `with_originals` is false.
     """
     # Large batches are cut; beside each setting drives the original in its encounter.
-    takes_pairs = with_originals and len(system.characteristics.scenario) > 0
+    takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
     size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
     if len(settings) > size:
         starts = range(0, len(settings), size)

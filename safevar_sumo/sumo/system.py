@@ -408,7 +408,7 @@ def _assemble(study: Study) -> System:
         criterion=own_criterion(study),
         skips_failed=study.search.failed == "skip",
     )
-    if not study.ranges:
+    if not study.ranges or study.scenario.margin is None:
         return system
 
     # An encounter counts only if the original vehicle keeps the margin there.

@@ -107,7 +107,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     monkeypatch.setattr(phases, "NEAR", np.inf)  # also where the car stops long before
     speed = {"unit": "km/h", "original": 45, "lower": 40, "upper": 50, "meaning": "speed"}
     evaluator = Evaluator(ahead(speed=speed), InlinePool())
-    model = Model(0, evaluator, Unsafe(below=0.0), all_count=True)
+    model = Model(0, evaluator, Unsafe(below=0.0))
     original = evaluator.characteristics.original
 
     # The tips at phase 0, where the distance ends to brake just one step later.

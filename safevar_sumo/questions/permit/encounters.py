@@ -231,7 +231,7 @@ def span_of(study: Study, by: str | None) -> Span:
 def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
-    for test, alone, fixed in _tests_alone(with_ranges(model.evaluator.study), span.name):
+    for test, alone, fixed in _tests_alone(with_ranges(model.evaluator.study).all_count, span.name):
         evaluator = model.evaluator.for_study(in_phases(alone, assemble(alone)), verified=0)
         members = evaluator.characteristics
         low = high = fixed
@@ -240,7 +240,7 @@ def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
             column = members.names.index(span.name)
             low, high = float(members.lower[column]), float(members.upper[column])
         if low <= span.high:
-            own = Model(model.fit, evaluator, model.unsafe, all_count=True)
+            own = Model(model.fit, evaluator, model.unsafe)
             ranges.append(EncounterRange(test, own, column, low, min(high, span.high)))
     return ranges
 

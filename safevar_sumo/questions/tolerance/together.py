@@ -175,7 +175,8 @@ def _keeps_its_margin(specified: Box, model: Model) -> bool:
     is_original = (specified.lower == members.original) & (specified.upper == members.original)
     if not len(members.scenario) or not is_original[members.of_vehicle].all():
         return False
-    return model.unsafe.is_collision and model.unsafe.keep <= model.evaluator.study.scenario.margin
+    margin = model.evaluator.study.scenario.margin
+    return model.unsafe.is_collision and margin is not None and model.unsafe.keep <= margin
 
 
 class JointSearch:

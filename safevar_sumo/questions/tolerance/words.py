@@ -88,7 +88,7 @@ def tested_sentences(models: Models, together: LimitsTogether | None) -> Iterato
         share = share_in_words(models.own.evaluator.share_left_out)
         yield (
             f"Of the encounters over the domain {share} do not count, because the original vehicle"
-            f" itself keeps less than {study.scenario.margin:g} m in them."
+            f" itself keeps less than {study.scenario.margin or 0:g} m in them."
         )
     if together is not None and together.box is not None:
         yield validation_in_words(together)
