@@ -94,7 +94,7 @@ class MovingTest:
         places = settings[:, -len(self.axes) :].tolist()
         first = [list(place) for place in [*dict.fromkeys(map(tuple, places))][:MOST_ENCOUNTERS]]
         settings = settings[[place in first for place in places]]
-        model = with_tests(self._base, self.encounters(settings), alone=True)
+        model = meeting(self._base, self.encounters(settings), alone=True)
         return model, settings[:, : -len(self.axes)]
 
     def encounters(self, settings: FloatArray) -> list[MatrixTest]:
@@ -132,7 +132,7 @@ def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]
     return replace_in(study.listed().all_count.with_tests(moving), encounters=RANGES)
 
 
-def with_tests(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
+def meeting(model: Model, tests: Sequence[MatrixTest], *, alone: bool = False) -> Model:
     """A model at further tests beside those of its matrix, or at these `alone`; a point that the
     matrix has counts once.
     """

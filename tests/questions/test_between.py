@@ -13,7 +13,7 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.between import moving_tests, with_tests
+from safevar_sumo.questions.between import meeting, moving_tests
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import falsify
@@ -67,7 +67,7 @@ def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study
     assert there.are_unsafe(vehicles, "").all(), "as points of a matrix"
     speeds = [dict(point.parameters)["speed"] for point in there.evaluator.system.points]
     assert all(50 < speed < 60 and speed == round(speed, 2) for speed in speeds)
-    with_them = with_tests(own, there.evaluator.study.matrix.tests)
+    with_them = meeting(own, there.evaluator.study.matrix.tests)
     assert len(with_them.evaluator.system.points) == 2 + len(speeds)
     assert with_them.are_unsafe(vehicles, "").all()
 
@@ -138,7 +138,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
     speeds = {"speed": [float(speed) for speed in range(50, 61)]}
     for number, of_set in enumerate(studies_of_sets(study)[:fits]):
         model = Model(number, Evaluator(of_set, InlinePool(), verified=0), Unsafe())
-        denser = with_tests(model, [msgspec.structs.replace(test, over=speeds)])
+        denser = meeting(model, [msgspec.structs.replace(test, over=speeds)])
         for result in simulate_all_points(denser.evaluator.system, cars):
             least = 0.0 if number else 0.3
             kept = result.evaluations.f_safe

@@ -19,7 +19,7 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
-from safevar_sumo.questions.permit.encounters import EncounterRange, ranges_of, span_of
+from safevar_sumo.questions.permit.encounters import EncounterRange, encounters_of, span_of
 from safevar_sumo.questions.permit.search import PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.phases import in_phases
@@ -268,7 +268,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
     assert (span.ending, span.left_out) == (("CPFA",), ("CPLA",))
     model = model_of(study)
-    ends = [(each.test, each.low, each.high) for each in ranges_of(model, span)]
+    ends = [(each.test, each.low, each.high) for each in encounters_of(model, span)]
     assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
     assert answer.numbers["margin"] == 0.3, "no axis states a range"

@@ -228,7 +228,7 @@ def span_of(study: Study, by: str | None) -> Span:
     )
 
 
-def ranges_of(model: Model, span: Span) -> list[EncounterRange]:
+def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
     for test, alone, fixed in _tests_alone(with_ranges(model.evaluator.study).all_count, span.name):

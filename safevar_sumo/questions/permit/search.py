@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.models import Models
-from safevar_sumo.questions.permit.encounters import EncounterRange, Span, ranges_of
+from safevar_sumo.questions.permit.encounters import EncounterRange, Span, encounters_of
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
 from safevar_sumo.records import BoolArray, FloatArray
 
@@ -126,7 +126,7 @@ class PermitSearch:
             if not waiting:
                 break
             if model.fit not in self._ranges:
-                self._ranges[model.fit] = ranges_of(model, self._span)
+                self._ranges[model.fit] = encounters_of(model, self._span)
             name = stage or self._stage(model.fit)
             search = SpeedSearch(
                 self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name

@@ -18,7 +18,7 @@ from safevar_sumo.questions.models import limit_criterion
 from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
-from safevar_sumo.questions.tolerance.in_ranges import RANGES
+from safevar_sumo.questions.tolerance.in_ranges import IN_RANGES
 from safevar_sumo.questions.tolerance.limits import (
     FITS,
     INTERVALS,
@@ -42,7 +42,7 @@ from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
     fits=FITS,
     points=POINTS,
     nearest=NEAREST,
-    ranges=RANGES,
+    ranges=IN_RANGES,
 )
 def tolerance(
     subject: Subject,

@@ -28,7 +28,7 @@ SLOWNESS = 2.5
 """How much longer a simulation takes there, as benchmarks/progress.py showed for `wear`: fewer of
 them are simulated at a time.
 """
-RANGES: Columns = {
+IN_RANGES: Columns = {
     "scope": "what they cover",
     "kept": "whether the limits above hold there in every parameter set",
     "verdict": "what a search for counterexamples found there",
@@ -55,8 +55,8 @@ def usual_settings(evaluator: Evaluator, budget: int, sets: int) -> float:
 
 
 def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
-    """The row of `RANGES` for a study that states ranges: an attack on the limits together there,
-    or without such limits on the specified ones.
+    """The row of `IN_RANGES` for a study that states ranges: an attack on the limits together
+    there, or without such limits on the specified ones.
     """
     evaluator = asked.evaluator
     budget = asked.budget

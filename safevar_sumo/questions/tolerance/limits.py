@@ -23,7 +23,7 @@ from safevar_sumo.questions.tables import Column, Columns, Frames, Rows, tabulat
 from safevar_sumo.questions.tolerance.alone import VALUES, AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.in_ranges import (
-    RANGES,
+    IN_RANGES,
     RANGES_STAGE,
     SLOWNESS,
     rows_in_ranges,
@@ -323,7 +323,9 @@ def _tables(found: FoundLimits, rows: Rows, nearest: Rows, in_ranges: Rows) -> F
     if nearest:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
     if in_ranges:
-        tables["ranges"] = tabulate("The same limits in the ranges of the study", RANGES, in_ranges)
+        tables["ranges"] = tabulate(
+            "The same limits in the ranges of the study", IN_RANGES, in_ranges
+        )
     return tables
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.between import MovingTest, with_tests
+from safevar_sumo.questions.between import MovingTest, meeting
 from safevar_sumo.questions.box import MAX_CORNERS, Box, Judgement, Proof, prove
 from safevar_sumo.questions.falsify import Falsification, falsify
 from safevar_sumo.questions.models import Model
@@ -226,7 +226,7 @@ class Validator:
                 model, vehicles = test.failures(failing[0])
                 matrix = model.evaluator.study.matrix
                 assert matrix is not None
-                self.model = with_tests(self.model, matrix.tests)
+                self.model = meeting(self.model, matrix.tests)
                 self._judge.model = self.model
                 validation = validation._replace(
                     failures=(*validation.failures, Failures(model, vehicles))
