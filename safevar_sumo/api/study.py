@@ -187,7 +187,7 @@ def study(
     keys = _select_runs(all_runs(loaded), shard)
     if not keys:
         warn(f"--shard {shard} selects none of the runs")
-    if system.has_simulator and not dry_run:
+    if system.mover.takes_long and not dry_run:
         fewer = f"{PROGRAM_COMMAND} explain {loaded.words}"
         warn(f"{fewer} --simulations N looks for the smallest changes with N simulations alone")
 
@@ -197,7 +197,7 @@ def study(
             return _measured(loaded, system, len(keys), engine, pool)
     try:
         with open_progress(not quiet) as show:
-            parts = Parts(show, [0, FEW if system.has_simulator else VERDICT_COST])
+            parts = Parts(show, [0, FEW if system.mover.takes_long else VERDICT_COST])
             results = run(
                 loaded,
                 directory,

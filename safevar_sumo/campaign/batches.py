@@ -423,7 +423,7 @@ def find_in_new_process(study: Study) -> list[Finding]:
     """
     study = without_skipping(study)
     system = system_of(study)
-    if not system.has_simulator or system.repeats > 1:
+    if system.mover.is_exact or system.repeats > 1:
         return []
     members = system.characteristics
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))

@@ -121,7 +121,7 @@ def run_campaign(
     use = check_code(study, pool)
     is_new = not (directory / MANIFEST).exists()
     read: Iterable[str] = ()
-    if system.has_simulator:
+    if not system.mover.is_exact:
         read = use.opened if is_new else read_manifest(directory).get("files", ())
     manifest = manifest_now(study, system, [*use.modules, *read])
     wanted = [*map(str, keys)]
@@ -148,7 +148,7 @@ def run_campaign(
     for remark in _remarks(study, undeclared, no_verdict, original):
         warn(f"study {study.name!r}: {remark}")
     results.begin(original)
-    if is_new and system.has_simulator and system.repeats == 1:
+    if is_new and not system.mover.is_exact and system.repeats == 1:
         repeat_elsewhere(study, pool)
 
     # Each worker carries out a share of the runs.
@@ -303,7 +303,7 @@ def choose_engine(system: System, name: str) -> tuple[Engine, str]:
     if name not in ENGINES:
         raise InputError("engine", repr(name), one_of(ENGINES))
     if name == Engine.LIBSUMO:
-        system.refuse_simulator("it takes no other engine")
+        system.require("SUMO", f"the engine {name}")
         return Engine.LIBSUMO, "requested"
     reason = reason_for_sumo(system)
     return (

@@ -126,8 +126,7 @@ def carry_out(
         work = work or "the check of user code"
         problem = f"two workers were lost at the same work, {work}: {error}"
         if names:
-            method = "simulate of " if system_of(task.study).has_simulator else ""
-            where = f", probably in {method}{' and '.join(names)}"
+            where = f", probably in {' and '.join(names)}"
             raise UserCodeError(f"study {task.study.name!r}", f"{problem}{where}") from None
         raise SafevarError(f"study {task.study.name!r}: {problem}") from None
 
@@ -184,9 +183,9 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     """
     system = system_of(task.study)
     system.vehicle.compile()  # outside the time limit
-    # Each run in a simulator of the user's own has the time limit.
+    # Of runs that take long, each has the time limit.
     limit = end_if_longer(task.study.search.time_limit)
-    with nullcontext() if system.has_simulator else limit:
+    with nullcontext() if system.mover.takes_long else limit:
         if task.selection != EVERYTHING:
             evaluations = _evaluate_parameters(task.selection.of(system), task, rows)
         else:

@@ -15,7 +15,6 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Files, code_files, digests, digests_by_name, files_in
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS, manifest_differences, manifest_of
-from safevar_sumo.scenarios import Simulator
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
 from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
@@ -32,12 +31,10 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     the inputs.
     """
     identity = {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
-    # Versions of the user's simulators, and of the distributions that they name.
+    # Versions of the scenarios' simulators, and of the distributions that they name.
     versions = {}
     libraries = set[str]()
     for scenario in (point.scenario for point in system.points):
-        if not isinstance(scenario, Simulator):
-            continue
         if scenario.version:
             versions[f"version of {type(scenario).__name__}"] = str(scenario.version)
         for name in scenario.LIBRARIES:

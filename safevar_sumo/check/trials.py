@@ -89,7 +89,7 @@ def try_simulations(
     many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(many))
     system = _system(study)
-    if system.has_simulator and most is not None:
+    if system.mover.takes_long and most is not None:
         # Each vehicle in four runs, and both ends of the list alone.
         each = simulations_of_setting(system)
         left = most - system.repeats - 2 * each
@@ -97,7 +97,7 @@ def try_simulations(
         if vehicles < 1:
             return
     own_metrics = [name for name in (*study.metrics.also, *study.search.objectives) if ":" in name]
-    if system.has_simulator or own_metrics:
+    if not system.mover.is_exact or own_metrics:
         yield from try_original(system, drive_all(system.at(system.points[0]), settings[:1]))
     number, seconds = (1, 0.0) if most is not None else _affordable(system, settings)
     if vehicles is not None:
@@ -116,7 +116,7 @@ def try_simulations(
         return lambda rows: drive_and_score(system, settings[rows]).results
 
     expected = "the same, to the bit"
-    if system.has_simulator:
+    if not system.mover.is_exact:
         expected += "; or repeats = N in [scenario], where the share of unsafe runs counts"
     yield from _try(load, region.characteristics, settings, progress, expected)
 
@@ -135,7 +135,7 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[FailedCheck]:
     """What is wrong in the run of the original vehicle: units of a simulator of the user's own, and
     metrics that change with a quantity that they do not state.
     """
-    if system.has_simulator and (contradiction := unit_contradiction(runs.trace)):
+    if not system.mover.is_exact and (contradiction := unit_contradiction(runs.trace)):
         expected = "speeds in m/s, and distances in m"
         yield FailedCheck("contract", contradiction, expected, "the original vehicle")
     for measure in system.measuring.measures.values():
@@ -159,9 +159,9 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     """The number of settings whose simulations take at most `LONGEST`, by the time of a few, or of
     one in a simulator of the user's own; and the time that they take [s].
     """
-    timed = settings[: 1 if system.has_simulator else TIMED]
+    timed = settings[: system.mover.at_once or TIMED]
     # The first simulation loads what any does, and ends a driving system that does not end.
-    if not system.has_simulator:  # which has simulated once
+    if not system.mover.takes_long:  # which has simulated once
         short = replace(system, time_limit=min(system.time_limit, LONGEST))
         drive_and_score(short, timed[:1])
     start = time.perf_counter()

@@ -24,7 +24,6 @@ from safevar_sumo.scenarios import (
     WEATHER_PARAMETERS,
     WEATHERS,
     Scenario,
-    Simulator,
     TrackScenario,
     WorldScenario,
     equals_clear,
@@ -268,7 +267,7 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
             if models[name].brakes_fully
             else {
                 **free_parameters(models[name]),
-                **({} if issubclass(models[name], Simulator) else WEATHER_PARAMETERS),
+                **(WEATHER_PARAMETERS if models[name].mover.has("weather") else {}),
             }
         )
         domains = (

@@ -149,9 +149,9 @@ class Evaluator:
         expected = sum(settings.values())
         if self.account.is_question:
             account = self.account
-            needed = (least + MEASURED * self.system.has_simulator) * self._each
+            needed = (least + MEASURED * self.system.mover.takes_long) * self._each
             account.require(account.spent + needed)
-            if self.system.has_simulator:
+            if self.system.mover.takes_long:
                 if account.asked is not None:
                     self._pool.spare = spare(account.asked, account.least)
                 check_simulator(self.study, self._pool)
@@ -176,7 +176,7 @@ class Evaluator:
         """Let the question do so many simulations, with those that check a simulator's class."""
         self.account.asked = self.account.most = simulations
         self.account.is_question = True
-        limits = simulations is not None and self.system.has_simulator
+        limits = simulations is not None and self.system.mover.takes_long
         self._pool.spare = spare(simulations or 0, 0) if limits else None
         self._pool.checked = 0
 
@@ -370,7 +370,7 @@ class Evaluator:
         study = case.study
         if not case.has_runs or study.scenario.repeats > 1 or study.origin.point:
             return
-        if self.system.has_simulator:
+        if not self.system.mover.is_exact:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
             self.account.spend(self._each)
             now = record(carry_out(evaluate_settings, jobs, self._pool)[0], 0)  # nothing kept

@@ -88,8 +88,8 @@ def has_reference_drivers(evaluator: Evaluator) -> bool:
     itself, nor in a rating, where every vehicle collides in some cell, nor where few simulations
     are allowed.
     """
-    drives_itself = evaluator.study.is_rated or evaluator.system.has_simulator
-    return not drives_itself and evaluator.left is None
+    has_driver = evaluator.system.mover.has("a driving system") and not evaluator.study.is_rated
+    return has_driver and evaluator.left is None
 
 
 def assess_sample(

@@ -146,7 +146,7 @@ def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | N
     simulated `MEASURED` times, and must do what it did when an interrupted command began; None
     where it takes milliseconds, as in SUMO.
     """
-    if not system.has_simulator:
+    if not system.mover.takes_long:
         return None
     settings = CharacteristicSet.of(study).original_settings
     original, seconds = _timed(Task(study=study), settings, pool)

@@ -119,7 +119,7 @@ def rating(
         further.
     """
     # The vehicles, in a study that is rated.
-    evaluator.system.refuse_simulator("SUMO drives the tests of a rating")
+    evaluator.system.require("a robot", "rating")
     study = evaluator.study
     original = evaluator.characteristics.original
     settings = {"original": original, **_variant(subject, evaluator, set, solution)}

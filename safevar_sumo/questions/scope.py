@@ -9,7 +9,7 @@ from itertools import islice
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, Simulator, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
 from safevar_sumo.study import Domain, MatrixTest, Study, Weather, unit_text
 from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
@@ -70,7 +70,7 @@ def scope_of(study: Study, *, between: bool = True) -> str:
         ]
         tests = f" ({join_phrases(names)})" if names else ""
         phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
-    if isinstance(points[0].scenario, Simulator):  # in a weather of its own
+    if not points[0].scenario.mover.has("weather"):
         return "; ".join(phrases)
     weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
     return f"{'; '.join(phrases)}; {' or '.join(weathers)}"

@@ -106,7 +106,7 @@ class Comparison:
     def refuse_without_position(self) -> None:
         """Refuse to draw runs without positions."""
         if not self.has_position:
-            self.system.refuse_simulator("a picture needs the position in its trace")
+            self.system.require("a picture", "this figure or animation")
 
     @property
     def network(self) -> NetworkFiles:
@@ -116,7 +116,7 @@ class Comparison:
     @cached_property
     def road(self) -> tuple[DrawnLane, ...]:
         """The lanes of the network; of a simulator of the user's own, a straight one."""
-        if self.system.has_simulator:
+        if not self.system.mover.has("roads"):
             return (lane_below(self.runs.trace),)
         return read_road(self.network)
 
@@ -127,7 +127,7 @@ class Comparison:
         Samples after the end of a run are meaningless: SUMO continues with the other run. What a
         simulator of the user's own moves is drawn along a straight line.
         """
-        if self.system.has_simulator:
+        if not self.system.mover.has("roads"):
             return films_along(self.runs.trace)
         tracks = dict[str, Film]()
         samples = count()
@@ -160,7 +160,8 @@ class Comparison:
             return collision_in_words(runs.closing_speed[row], runs.collision_speed[row], digits=1)
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
-            distance = runs.encounter.separation if self.system.has_simulator else runs.trace.gap
+            has_gap = self.system.mover.has("roads")
+            distance = runs.trace.gap if has_gap else runs.encounter.separation
             ending = f"{ending} with {distance[nearest, row]:.2f} m to spare"
 
         # And the metrics that the search minimises.

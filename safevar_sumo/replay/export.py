@@ -293,7 +293,7 @@ def export(
         raise InputError("out", f"{out} exists", "a new directory")
     target = load_target(directory, solution, as_it_is_now, point)
     system = assemble(target.study)
-    system.refuse_simulator("it has no road to export")
+    system.require("roads", "export")
     setting = target.setting(system)
     if system.characteristics.named(setting).get(PHASE):
         problem = f"solution {solution} has a {PHASE}, which another simulator does not have"

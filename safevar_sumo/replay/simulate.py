@@ -208,7 +208,7 @@ def show_simulation(
     if trace is not None:
         check_writable(trace, "trace", (".csv",), but=SOLUTIONS)
     if gui:
-        system.refuse_simulator("it has no scene for sumo-gui")
+        system.require("sumo-gui", "simulate --gui")
     if animate is not None:
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
@@ -228,6 +228,8 @@ def show_simulation(
     if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
+        if simulation.pair.runs.lacking("speed").any():
+            system.require("a trace", "simulate --trace")
         with whole_file(trace, "trace") as file:
             simulation.trace.to_csv(file, index=False, lineterminator="\n")
     comparison = comparison_of(simulation)

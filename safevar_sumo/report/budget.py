@@ -30,7 +30,7 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
         If the simulations do not suffice for all questions.
     """
     own, others, known = list[str](), list[str](), set[tuple[str, ...]]()
-    replays = simulations // PART_OF_REPLAYS if system.has_simulator else 0
+    replays = simulations // PART_OF_REPLAYS if system.mover.takes_long else 0
     left = simulations - replays
     for text in dict.fromkeys(texts):
         name, *options = text.split()
@@ -38,7 +38,8 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
             left -= int(options[options.index(SIMULATIONS.flag) + 1])
             continue
         key = tuple(options) if name in ONE_SAMPLE else (text,)
-        is_free = system.has_simulator and (key in known or name == "repair")  # which it refuses
+        is_refused = name == "repair" and not system.mover.has("a driving system")
+        is_free = is_refused or (system.mover.takes_long and key in known)
         (others if is_free else own).append(text)
         known.add(key)
 

@@ -189,7 +189,7 @@ def _pack_study(
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
     show_part = Parts(progress).begin(study.name)
     with open_pool(**how) as pool:
-        pool.shared = {} if simulations and assemble(study).has_simulator else None
+        pool.shared = {} if simulations and assemble(study).mover.takes_long else None
         packed = Packed(described, files, study.origin.places, how["jobs"], show_part, pool)
         answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
         packed.ask_speed()

@@ -216,11 +216,11 @@ def _pool_of(
     """The pool that the questions of a page share, with what simulators have simulated, where they
     take long; None if each opens its own.
     """
-    has_simulator = any(assemble(case.study).has_simulator for case in cases)
-    if not (has_simulator or cluster or counts):
+    take_long = any(assemble(case.study).mover.takes_long for case in cases)
+    if not (take_long or cluster or counts):
         return None
     pool = stack.enter_context(open_pool(jobs, cluster))
-    if has_simulator and counts:
+    if take_long and counts:
         pool.shared = {}
     return pool
 
@@ -268,7 +268,7 @@ def usual_questions(case: Case, point: str | None = None) -> list[str]:
         return [f"rating --solution {handle}" if handle else "rating"]
 
     can_repair = case.study.repair.promise or case.study.limits
-    left_out = SMALLEST if assemble(case.study).has_simulator else ""
+    left_out = SMALLEST if assemble(case.study).mover.takes_long else ""
     questions = [text for text in USUAL_QUESTIONS if text != left_out]
     return [*questions, *(["repair"] if can_repair else [])]
 

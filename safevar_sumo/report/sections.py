@@ -233,7 +233,7 @@ def _conditions(study: ReportedStudy) -> str:
             f"only the test case {study.point} of its matrix, in which all solutions were simulated"
             " again"
         )
-    if study.system.has_simulator:
+    if not study.system.mover.has("weather"):
         where = f", in {number_of(len(points), 'test case')}" if points else ""
         return f"the simulator of the scenario moves and drives the vehicle{where}"
     if not points:
@@ -339,7 +339,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
     # The fewest changes, as `study` names them, and the chosen solutions.
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
-    most = study.simulations if study.system.has_simulator else None
+    most = study.simulations if study.system.mover.takes_long else None
     fewest = fewest_changes(study.case, jobs=1) if most is None else None
     if fewest is not None:
         settings["Fewest changes"] = fewest.settings[0]

@@ -71,12 +71,10 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     """Parameters of a scenario and its weather that a study may search; none without an
     encounter.
     """
-    if isinstance(scenario, Simulator):
-        return scenario.free()
     if scenario.brakes_fully:
         return {}
-    phases = PHASES if scenario.has_phase else {}
-    return {**scenario.free(), **WEATHER_PARAMETERS, **phases}
+    of_weather = WEATHER_PARAMETERS if scenario.mover.has("weather") else {}
+    return {**scenario.free(), **of_weather, **(PHASES if scenario.has_phase else {})}
 
 
 def weather_of(choice: str | Weather) -> Weather:

@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
+from safevar_sumo.scenarios.mover import SUMO, Mover
 from safevar_sumo.scenarios.roads import Roads, World
 from safevar_sumo.study import FreeParameter, free_parameters
 
@@ -148,8 +149,14 @@ class Scenario:
 
     Attributes
     ----------
+    mover
+        Who moves the vehicles.
+    LIBRARIES
+        Distributions on whose versions results depend, such as `metadrive-simulator`.
+    version
+        A version of the class itself on which they depend, such as its simulator's.
     network
-        A folder of `sumo_nets/`, or the path of a folder with the same files.
+        A folder of `sumo_nets/`, or the path of a folder with the same files; "" without roads.
     duration
         Length of a run [s].
     reactive_actors
@@ -195,6 +202,9 @@ class Scenario:
     """
 
     __slots__ = ()
+    mover: ClassVar[Mover] = SUMO
+    LIBRARIES: ClassVar[tuple[str, ...]] = ()
+    version: ClassVar[str] = ""
     is_user_code: ClassVar[bool] = False
     network: str
     reactive_actors: bool = True

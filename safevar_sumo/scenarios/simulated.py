@@ -13,6 +13,7 @@ import numpy as np
 from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import FloatArray, NamedValues, Outcome, Trace
 from safevar_sumo.scenarios.base import Scenario
+from safevar_sumo.scenarios.mover import OWN_SIMULATOR, Mover
 from safevar_sumo.study import SAFETY_DEGREE
 
 SPEED = Legal(0.0, 1000.0)
@@ -179,20 +180,15 @@ class Simulator(Scenario):
         Units of the vehicle's characteristics by name.
     OPTIONAL
         Characteristics that a study may leave out, and whose original value may be 0.
-    LIBRARIES
-        Distributions on whose versions results depend, such as `metadrive-simulator`.
-    version
-        The simulator's own version, if no distribution has it.
     worker
         What `open_worker` returned in this process.
     """
 
     __slots__ = ()
     RETURNS: ClassVar[Mapping[str, Returned]] = {"simulate": Returned(then=check_result)}
+    mover: ClassVar[Mover] = OWN_SIMULATOR
     UNITS: ClassVar[Mapping[str, str]]
     OPTIONAL: ClassVar[tuple[str, ...]] = ()
-    LIBRARIES: ClassVar[tuple[str, ...]] = ()
-    version: ClassVar[str] = ""
     worker: ClassVar[Any] = None
     network: str = ""
     duration: float = 60.0

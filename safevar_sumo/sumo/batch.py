@@ -4,7 +4,7 @@ SUMO.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -14,6 +14,7 @@ from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario
+from safevar_sumo.scenarios.mover import OWN_SIMULATOR
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
@@ -30,6 +31,11 @@ from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import OVERTIME, Traffic
 from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
 from safevar_sumo.sumo.world import Api, SumoWorld
+
+OF_MOVERS: Mapping[str, Callable[[System, FloatArray], SimulationRuns]] = {
+    OWN_SIMULATOR.kind: simulate_each
+}
+"""How movers other than SUMO simulate N settings, shape (N, n), at every point, by their kind."""
 
 
 @np.errstate(all="ignore")
@@ -61,8 +67,8 @@ def reason_for_sumo(system: System) -> str:
     """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded
     scenes suffice.
     """
-    if system.has_simulator:
-        return "its own simulator moves the vehicle"
+    if reason := system.mover.lacks.get("recorded scenes"):
+        return reason
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
@@ -98,8 +104,8 @@ def drive_all(
     InputError
         If a user's ADS fails, or takes longer than the time limit.
     """
-    if system.has_simulator:
-        return simulate_each(system, settings)
+    if simulate := OF_MOVERS.get(system.mover.kind):
+        return simulate(system, settings)
     vehicles, encounters = system.cut(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario

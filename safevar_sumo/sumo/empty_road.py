@@ -56,7 +56,7 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     the obstacle is not what keeps it from a collision. Neither is it where nothing happens to a
     vehicle that keeps its speed.
     """
-    if system.has_simulator:  # whose scenario cannot be emptied
+    if not system.mover.has("a driving system"):  # that sees nobody
         return {}
     original = system.characteristics.original_settings
     try:

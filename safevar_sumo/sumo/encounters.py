@@ -23,7 +23,6 @@ from safevar_sumo.scenarios import (
     VUT,
     WEATHER_PARAMETERS,
     Point,
-    Simulator,
     TrackScenario,
     WorldScenario,
     searchable_in,
@@ -77,7 +76,7 @@ def _check_corners(study: Study, point: Point, own: Mapping[str, Domain]) -> Non
     corners = [corner for corner in corners if all(one.allows(corner) for one in constraints)]
     try:
         scenarios = [encounter(point, corner).scenario for corner in corners]
-        if scenarios and not isinstance(scenarios[0], Simulator):
+        if scenarios and scenarios[0].mover.has("roads"):
             networks_for(scenarios)
         for scenario in scenarios:
             if isinstance(scenario, TrackScenario):

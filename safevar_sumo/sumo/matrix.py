@@ -157,7 +157,7 @@ def drive_and_score(
         else:
             found = score(system, vehicles, drive_all(system, vehicles, engine))
     except UserCodeError as error:
-        if not (system.skips_failed and system.has_simulator):
+        if not system.skips_failed:
             raise
         reason = " ".join(f"{error.source}: {error.problem}".split())
         metrics = dict.fromkeys((*METRICS, *system.measuring.measures))
@@ -222,8 +222,8 @@ def evaluate_matrix(
 
 def settings_per_batch(system: System, engine: Engine) -> int:
     """Number of settings in an efficient batch."""
-    if system.has_simulator:  # each result is journaled at once
-        return 1
+    if system.mover.at_once:  # each result is journaled at once
+        return system.mover.at_once
     if not needs_no_sumo(system, engine):
         return MAX_COPIES
     if len(
@@ -246,8 +246,8 @@ def batch_size(system: System, engine: Engine) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
     network.
     """
-    if system.has_simulator:
-        return 1
+    if system.mover.at_once:
+        return system.mover.at_once
     if needs_no_sumo(system, engine):
         return largest_batch(system)
     lanes = max(

@@ -23,7 +23,6 @@ from safevar_sumo.scenarios import (
     SCENARIOS,
     Point,
     Scenario,
-    Simulator,
     TrackScenario,
     weather_of,
 )
@@ -56,7 +55,7 @@ def create_shipped_models(study: Study) -> None:
     with about(study.source):
         lookup = Lookup.of(study)
         if study.scenario.model in SCENARIOS:
-            check_tables(study, SCENARIOS[study.scenario.model])
+            check_tables(study, SCENARIOS[study.scenario.model].mover)
         for kind, shipped, table in (
             ("vehicle", VEHICLES, study.vehicle),
             ("ads", ADS, study.ads),
@@ -139,7 +138,7 @@ def _points_of(
             _check_listed({**table.parameters, **dict.fromkeys(ranges, None)}, constraints)
         (weather,) = map(weather_of, alone.weathers or [study.weather])
         words = [test.name, *(f"{key} {value}" for key, value in over.items())]
-        words += [] if isinstance(scenario, Simulator) else [weather.name]
+        words += [weather.name] if scenario.mover.has("weather") else []
         parameters = {"test": test.name, **over, "weather": weather.name}
         yield Point(
             scenario=scenario,
@@ -170,7 +169,7 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     same name.
     """
     paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
-    if not paths or is_shipped(scenario.network):
+    if not (paths and scenario.mover.has("roads")) or is_shipped(scenario.network):
         return scenario
     with_sources = [path for path in paths if path.is_file() or any(path.glob("*.xml"))]
     network = str((with_sources or paths)[0])
@@ -216,8 +215,6 @@ def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
     scenario.read_files(lookup.folders)
-    if isinstance(scenario, Simulator):
-        return scenario
     return _locate_network(scenario, lookup.folders)
 
 
@@ -250,8 +247,8 @@ def create_driven(study: Study, lookup: Lookup, scenario: Scenario) -> tuple[Veh
     """The vehicle of a study and its driving system; in a simulator of the user's own, only the
     vehicle's characteristics. Raises an InputError.
     """
-    check_tables(study, type(scenario))
-    if not isinstance(scenario, Simulator):
+    check_tables(study, scenario.mover)
+    if scenario.mover.has("a driving system"):
         vehicle = create_vehicle(study.vehicle, lookup).seeded(study.search.seed)
         return vehicle, create_ads(study.ads, lookup)
     units = getattr(scenario, "UNITS", None)
@@ -260,4 +257,4 @@ def create_driven(study: Study, lookup: Lookup, scenario: Scenario) -> tuple[Veh
         legal = "UNITS: units of the vehicle's characteristics by name"
         raise code.wrong("__init__", "an object without UNITS", legal)
     # Neither moves nor drives anything.
-    return SimulatedVehicle(units, tuple(scenario.OPTIONAL)), Ads()  # type: ignore[abstract]
+    return SimulatedVehicle(units, tuple(getattr(scenario, "OPTIONAL", ()))), Ads()  # type: ignore[abstract]

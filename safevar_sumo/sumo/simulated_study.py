@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.scenarios import Point, Scenario, Simulator
+from safevar_sumo.scenarios import Point, Scenario
+from safevar_sumo.scenarios.mover import Mover
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -17,9 +18,9 @@ SEED = "seed"
 IN_SIMULATOR = "nothing: the simulator moves and drives the vehicle, in a weather of its own"
 
 
-def check_tables(study: Study, scenario: type) -> None:
-    """Refuse tables that a simulator of the user's own would not use, or those that are missing
-    beside any other scenario.
+def check_tables(study: Study, mover: Mover) -> None:
+    """Refuse tables that a mover would not use, as it drives the vehicle itself, or those that are
+    missing beside any other.
 
     Raises
     ------
@@ -33,7 +34,7 @@ def check_tables(study: Study, scenario: type) -> None:
         "ads.model": study.ads.model,
         "weather": study.weather,
     }
-    if not issubclass(scenario, Simulator):
+    if mover.has("a driving system"):
         if study.scenario.repeats > 1:
             problem = f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit"
             raise InputError("", problem, "no repeats, or a simulator of the user's own")
@@ -64,7 +65,7 @@ def check_tables(study: Study, scenario: type) -> None:
 
 
 def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
-    """Refuse a matrix in which SUMO and a simulator of the user's own would both move the vehicle.
+    """Refuse a matrix in which two kinds of movers would both move the vehicle.
 
     Raises
     ------
@@ -72,12 +73,9 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
         With the first such test.
     """
     for point in matrix:
-        if isinstance(point.scenario, Simulator) is not isinstance(scenario, Simulator):
-            own, other = "a simulator of the user's own", "a scenario of SUMO"
-            kinds = (own, other) if isinstance(scenario, Simulator) else (other, own)
-            problem = (
-                f"matrix.tests: {point.name!r} is {kinds[1]}, and scenario.model is {kinds[0]}"
-            )
+        there, here = point.scenario.mover.kind, scenario.mover.kind
+        if there != here:
+            problem = f"matrix.tests: {point.name!r} is {there}, and scenario.model is {here}"
             raise InputError("", problem, "tests of the kind of scenario.model")
 
 

@@ -57,8 +57,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), rows, strict=True):
         command = f"{system.command} {system.characteristics.options(row)}"
         note_work(f"{REPRODUCED_BY}{command}")
-        scenario = encounter(point, dict(zip(searched, values, strict=True))).scenario
-        assert isinstance(scenario, Simulator)
+        scenario: Any = encounter(point, dict(zip(searched, values, strict=True))).scenario
         with (
             set_variables({MARK: this_process.mark}),
             user_errors(system.source),

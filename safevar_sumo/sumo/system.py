@@ -19,17 +19,10 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal, Quantity
-from safevar_sumo.scenarios import (
-    VUT,
-    Point,
-    Scenario,
-    Simulator,
-    WorldScenario,
-    equals_clear,
-    weather_of,
-)
+from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.scenarios.declared import with_ranges
+from safevar_sumo.scenarios.mover import Mover, Part
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WORST, Domain, MetricsTable, Study, Weather
 from safevar_sumo.sumo.bodies import SceneWorld
@@ -130,14 +123,21 @@ class System:
         return (only,)
 
     @property
-    def has_simulator(self) -> bool:
-        """Whether a simulator of the user's own moves and drives the vehicle."""
-        return isinstance(self.points[0].scenario, Simulator)
+    def mover(self) -> Mover:
+        """Who moves the vehicles, of the same kind at all points."""
+        return self.points[0].scenario.mover
 
-    def refuse_simulator(self, reason: str) -> None:
-        """Refuse what a simulator of the user's own cannot do, an `InputError` with the reason."""
-        if self.has_simulator:
-            problem = f"scenario.model is a simulator of the user's own: {reason}"
+    def require(self, part: Part, question: str) -> None:
+        """Refuse a question that needs a part that the mover lacks, with the reason.
+
+        Raises
+        ------
+        InputError
+            About the study.
+        """
+        if not self.mover.has(part):
+            kind, reason = self.mover.kind, self.mover.lacks[part]
+            problem = f"{question} needs {part}, and scenario.model is {kind}: {reason}"
             raise InputError(self.source, problem, "a study with a vehicle and a driving system")
 
     @property
@@ -147,10 +147,8 @@ class System:
 
     @property
     def step(self) -> float:
-        """Time step of the simulations [s]; 0 in a simulator of the user's own, which has its
-        own.
-        """
-        if self.has_simulator:
+        """Time step of the simulations [s]; 0 of a mover with one of its own."""
+        if self.mover.has_own_step:
             return 0.0
         return self.scenes.step_of(self.points[0].scenario)
 
@@ -214,7 +212,7 @@ class System:
         """Remarks for the user on parts of networks and weathers that are not used or have no
         effect.
         """
-        if self.has_simulator:
+        if not self.mover.has("a driving system"):
             return noise_remarks(self.characteristics, self.points)
         # On networks, vehicles and drivers.
         uses_traci = isinstance(self.ads, TraciController)

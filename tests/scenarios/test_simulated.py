@@ -499,6 +499,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     assert "wall" in Path("a.html").read_text()
     wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
     refused("simulate", "wall.toml", "--animate", "b.html", message=("needs the position",))
+    refused("simulate", "wall.toml", "--trace", "b.csv", message=("states metrics alone",))
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def robust_shares(
         return np.full((len(settings), len(factors)), np.nan)
     neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.seed, count)
     shares = []
-    if evaluator.system.has_simulator:  # which keeps its own time step
+    if evaluator.system.mover.has_own_step:
         factors = (1.0,)
 
     # The share of neighbours that are unsafe, with each length of the time step.

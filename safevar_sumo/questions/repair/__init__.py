@@ -170,7 +170,7 @@ def repair(
         A rough answer: the study's own parameter set alone, and a short search. Not with `out`.
     """
     study = evaluator.study
-    evaluator.system.refuse_simulator("nothing of its driving system can be changed here")
+    evaluator.system.require("a driving system", "repair")
     if study.is_rated:
         text = (
             f"{study.name!r} is rated, and its repair would take a whole test matrix for every"
