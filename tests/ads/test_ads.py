@@ -194,6 +194,7 @@ class NearForMany(Hold):
         return self._near
 
 
+@pytest.mark.slow
 def test_an_ads_of_ones_own_warns() -> None:
     original = CARLA.characteristics.original
     for_many = checked_class(UserCode("ads", NearForMany), Ads)()

@@ -59,6 +59,7 @@ def mass(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "rule"), [(Rss(), rss), (FuzzySafety(), fuzzy)], ids=["rss", "fuzzy_safety"]
 )

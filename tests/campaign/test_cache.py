@@ -201,6 +201,7 @@ def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     assert_equal(evaluated(study, settings, fresh=True), edited)
 
 
+@pytest.mark.slow
 def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_continuation(
     folder: Path, simulated: list[int], in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -273,6 +273,7 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     ] == [("reaction", True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pace", "found", "words"),
     [
@@ -354,6 +355,7 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("longest", "options", "vehicles"),
     [(1e6, (), 100), (0.0, (), 3), (0.0, ("--vehicles", "7"), 7)],

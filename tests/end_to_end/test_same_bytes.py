@@ -37,6 +37,7 @@ def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command
     assert len({run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small", "worker_processes")
 def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> None:
     study("--jobs", "2", "--out", "out")
@@ -47,6 +48,7 @@ OURS = [*ALGORITHMS]
 MIXED = ["nsga2", "surrogate", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithms", "workers", "batch", "breaks_after"),
     [(OURS, 7, None, None), (OURS, 3, 3, None), (OURS, 2, 1, None), (MIXED, 1, 11, 9)],

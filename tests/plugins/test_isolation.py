@@ -113,6 +113,7 @@ class Late(ScalarAds):
 """A driving system that no longer brakes after 1,200 instances: more than `check` makes."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", ["rules late.toml --samples 1500", "study late.toml --out out --quiet"]
 )

@@ -145,6 +145,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             assert kept[0] < least or kept.min() >= least, (number, result.point.name)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_simulations")
 def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(ahead: Study) -> None:
     text = Path("ahead.toml").read_text()

@@ -202,6 +202,7 @@ def test_margin_and_rounding_are_those_of_tolerance() -> None:
     assert answer.numbers["unsafe"] == of_tolerance.numbers["unsafe"]
 
 
+@pytest.mark.slow
 def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
     answer = json_of("compare", "smoke", "smoke", "--samples", "100")
     numbers, limits = answer["numbers"], answer["tables"]["limits"]["rows"]
@@ -298,6 +299,7 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
     refused("report", dry, dry, "--out", "it.html", message=("twice",))
 
 
+@pytest.mark.slow
 def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

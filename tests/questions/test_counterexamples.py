@@ -122,6 +122,7 @@ def test_a_failure_between_tests_of_any_set_is_simulated_by_its_command() -> Non
         assert typed(row["simulate"])["f_safe"] < 0.3, row["simulate"]
 
 
+@pytest.mark.slow
 def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
     point = ("--point", "CPFA, speed 40, wet")
     at_test = json_of("simulate", "wear", "--set", "speed=40", *point)

@@ -88,6 +88,7 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
             assert cause["avoided_by"] == row["avoided_by"]
 
 
+@pytest.mark.slow
 def test_the_most_frequent_robust_cause_leads(explained: Answer) -> None:
     """Or the most robust one; its share is that of its kind."""
     causes = explained.tables["causes"]

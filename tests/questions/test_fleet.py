@@ -49,6 +49,7 @@ def are_no_thousands(value: float) -> bool:
     return len(repr(value).partition(".")[2]) != 3
 
 
+@pytest.mark.slow
 @given(
     rows=st.lists(
         st.tuples(

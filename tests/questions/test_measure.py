@@ -151,6 +151,7 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     assert json_of("verify", "pack.zip")["numbers"]["passed"]
 
 
+@pytest.mark.slow
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
     (folder / "nowhere.py").write_text(
         HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")

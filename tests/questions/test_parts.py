@@ -15,6 +15,7 @@ from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"), [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})]
 )

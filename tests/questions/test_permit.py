@@ -127,6 +127,7 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
     assert not answer.numbers["rough"]
 
 
+@pytest.mark.slow
 def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(short: Study) -> None:
     row = json_of("permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0")
     cars = row["tables"]["cars"]["rows"]
@@ -160,6 +161,7 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert run(*typed, "--format", "csv").stdout == printed, "the written list has the same answer"
 
 
+@pytest.mark.slow
 def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
     short: Study, worker_processes: None
 ) -> None:
@@ -175,6 +177,7 @@ def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
         pd.testing.assert_frame_equal(own, alone.tables[name], check_dtype=False)
 
 
+@pytest.mark.slow
 def test_a_speed_that_is_needed(short: Study) -> None:
     typed = ["permit", "short.toml", "--set", "brakeTorque=0.6", "--others", "new", "--fits", "0"]
     slow = json_of(*typed)["tables"]["cars"]["rows"][0]["up_to"]
@@ -184,6 +187,7 @@ def test_a_speed_that_is_needed(short: Study) -> None:
     assert found["numbers"]["need"] == slow + 1
 
 
+@pytest.mark.slow
 def test_all_cars_within_limits(short: Study) -> None:
     limits = ("brakeTorque >= 0.7", "payload <= 525", "treadDepth >= 3")
     answer = permit(short, limits=limits, others="new", fits=2, out="out.csv")
@@ -210,6 +214,7 @@ def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
     assert set(answer.table()["verdict"]) == {"up to"}
 
 
+@pytest.mark.slow
 def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study) -> None:
     stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
@@ -261,6 +266,7 @@ def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     return PermitSearch(Models((own,), ()), span, values, budget)
 
 
+@pytest.mark.slow
 def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
     Path("three.toml").write_text(MATRIX)
     study = load_study("three.toml")
@@ -277,11 +283,13 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     assert span_of(load_study("alks"), "lateral_speed").unit == "m/s"
 
 
+@pytest.mark.slow
 def test_a_study_that_states_ranges_keeps_what_searched_encounters_leave() -> None:
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True, "up_to": "speed=12"}
     assert permit("wear", cars={"a": {}}, **options).numbers["margin"] == 0.1
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     begin=st.floats(10.1, 58),

@@ -148,6 +148,7 @@ def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
     assert ((worst < 0) == is_unsafe).all()
 
 
+@pytest.mark.slow
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
     (row,) = json_of("permit", "autoware_july", *car)["tables"]["cars"]["rows"]

@@ -33,6 +33,7 @@ def keeps(decel: float, delay: float, clearance: float = 0.0) -> bool:
     return CLEARANCE - 15 * delay - 15**2 / 2 / decel >= clearance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("question", ["risk", "rules", "explain", "tolerance", "compare"])
 @pytest.mark.parametrize("number", [150, 700])
 def test_a_question_keeps_to_the_number_of_simulations(
@@ -78,6 +79,7 @@ def test_the_least_number_is_told_before_anything_is_simulated(
         getattr(sv, question)(rig, simulations=least - 1, pool=InlinePool())
 
 
+@pytest.mark.slow
 def test_a_rough_comparison_keeps_to_its_number_in_a_matrix() -> None:
     answer = sv.compare("wear", "wear", simulations=1000, jobs=1)
     assert answer.numbers["simulations"] <= 1000
@@ -117,6 +119,7 @@ def test_the_regression_sees_curves_and_products_and_names_nothing_it_does_not_e
         assert (table["decel"], table["delay"]) == pytest.approx(shares, abs=0.03)
 
 
+@pytest.mark.slow
 def test_shares_of_few_simulations_are_about_those_of_many(rig: str) -> None:
     answer = sv.risk(rig, simulations=150, pool=InlinePool())
     usual = sv.risk(rig, pool=InlinePool())
@@ -233,6 +236,7 @@ def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.Monk
     assert output.stdout.startswith("Rough answer (--simulations 500)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cache", ["off", "folder"])
 @pytest.mark.parametrize("number", [400, 2000])
 def test_a_page_and_a_pack_share_one_number(

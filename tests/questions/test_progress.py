@@ -43,6 +43,7 @@ def assert_counts(shown: Shown) -> None:
     assert all(done <= total for _, done, total in shown)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ask", "options"), QUESTIONS)
 def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
     ask: Callable[..., Any], options: Mapping[str, Any]

@@ -30,12 +30,14 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     assert "no limit is called kept" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_rough_tolerance_says_which_limit_fails() -> None:
     answer = sv.tolerance("smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True)
     assert answer.numbers["kept"] is False
     assert "Do not release" in answer.verdict
 
 
+@pytest.mark.slow
 def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
     answer = sv.explain("smoke", quick=True)
     assert answer.verdict.startswith("Rough answer (--quick")
@@ -47,6 +49,7 @@ WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
 PROMISE = {"promise": ("brakeTorque >= 0.95",), "change": ("margin",)}
 
 
+@pytest.mark.slow
 def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -89,6 +92,7 @@ def test_a_rough_page_has_no_line_to_sign(slippery: Path, tmp_path: Path) -> Non
     assert 'class="signature"' not in page
 
 
+@pytest.mark.slow
 def test_on_a_terminal_the_rough_answer_comes_first(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

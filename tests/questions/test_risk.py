@@ -267,6 +267,7 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
         assert low < numbers[other]["share"] < high
 
 
+@pytest.mark.slow
 def test_shares_have_a_range_over_the_parameter_sets() -> None:
     """Of risk, and of rules for the whole sample and for each region."""
     study = load_study("wear")
@@ -295,6 +296,7 @@ def test_shares_have_a_range_over_the_parameter_sets() -> None:
     assert "the study's own parameter set of the vehicle model alone" in few.verdict
 
 
+@pytest.mark.slow
 def test_the_other_parameter_sets_are_planned() -> None:
     """Progress counts them from the beginning. A number of simulations that suffices for all but
     these is a bound, within which the own set answers alone.

@@ -28,6 +28,7 @@ COLLISION = Unsafe()
 SIDES = (0.0, ORIGINAL, 10.0)
 
 
+@pytest.mark.slow
 @given(table=st.lists(st.booleans(), min_size=27, max_size=27))
 def test_all_minimal_combinations_of_ends_and_no_other_are_found_whatever_the_outcomes(
     table: list[bool],
@@ -93,6 +94,7 @@ def test_few_settings_find_the_causes_of_shipped_studies(
     assert evaluator.simulated <= budget
 
 
+@pytest.mark.slow
 def test_the_answer_leads_with_the_smallest_changes() -> None:
     """Of rain: one pair, one of three, two of four (the enumeration of another implementation)."""
     answer = json_of("explain", "rain", "--fits", "2", "--jobs", "1")
@@ -128,6 +130,7 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
     assert answer.to_dict() == sv.explain(study, simulations=600, jobs=1).to_dict()
 
 
+@pytest.mark.slow
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
     answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
     assert "Scope: each combination was simulated in the original encounter" in answer.verdict

@@ -239,6 +239,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     assert done.stdout.startswith("7 of 7 claims are the same")
 
 
+@pytest.mark.slow
 def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -422,6 +422,7 @@ def test_what_makes_a_study_refuse_is_found_before_anything_is_written(
     assert contents(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_results_survive_a_study_whose_characteristics_are_in_another_order(
     copied: Path, case: Case, in_tmp: Path
 ) -> None:

@@ -604,6 +604,7 @@ class Rare(Wall):
 """
 
 
+@pytest.mark.slow
 def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     """A vehicle that fails in 3 of 20 runs counts 0.15; limits are of the worst run."""
     (wall.parent / "rare.py").write_text(RARE)
@@ -735,6 +736,7 @@ def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: 
     assert Path("count").stat().st_size > before
 
 
+@pytest.mark.slow
 def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
     with_failures(wall, "1 / 0", limit=5)
     told = ("settings failed, more than 10 %", "division by zero")
@@ -747,6 +749,7 @@ def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
         assemble(sv.load_study("rain", search={"failed": "skip"}))
 
 
+@pytest.mark.slow
 def test_a_pack_states_the_number_that_followed_from_time(
     wall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -804,6 +807,7 @@ def with_data(wall: Path, how: str, value: float) -> None:
         database.commit()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", BY)
 def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
     """Neither by `study`, nor by a question; what the simulator has written itself is no input."""

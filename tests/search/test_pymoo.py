@@ -177,6 +177,7 @@ def test_an_option_with_which_pymoo_fails_is_refused_with_its_message(
     assert str(refused.value).count("\n") == 1
 
 
+@pytest.mark.slow
 def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
     in_tmp: Path,
 ) -> None:

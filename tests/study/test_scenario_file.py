@@ -80,6 +80,7 @@ def test_a_path_counts_from_the_study(tmp_path: Path) -> None:
     assert assemble(study).points[0].scenario.duration == pytest.approx(14)
 
 
+@pytest.mark.slow
 def test_the_files_of_a_study_are_all_that_were_read(tmp_path: Path) -> None:
     """A logical file and the concrete one; and, if a parameter chooses the catalog, all
     catalogs.

@@ -86,6 +86,7 @@ def simulated(
     return sv.simulate({"extends": base, "name": "mine", "scenario": scenario, **tables}, changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", OPTIONS)
 def test_no_option_of_a_users_file_decides_what_a_collision_is(
     options: str, tmp_path: Path
@@ -143,6 +144,7 @@ def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
     assert "tripinfo-output = tripinfos.xml (NUL counts)" in remarks
 
 
+@pytest.mark.slow
 def test_one_remark_names_the_options_that_are_overruled(tmp_path: Path) -> None:
     network = own_network(tmp_path / "mine", "lead_vehicle_stopped")
     assert network_remarks(str(network)) == []
@@ -227,6 +229,7 @@ def test_a_body_in_the_path_that_sumo_does_not_see_is_an_error_with_its_time(
         simulated("native", network, WEAK_BRAKES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("own", "other", "centres"),
     [("16.5", "4.7", 12.87), ("4.7", "12", 10.62), ("4.7", "4.7", 6.97)],

@@ -112,6 +112,7 @@ def searched_study(case: str) -> Study:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
     """Its scene is one that SUMO has played, and its original vehicle drives there."""

@@ -116,6 +116,7 @@ GOOD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", sorted(GOOD))
 def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> None:
     network = with_traffic(mine, GOOD[what])

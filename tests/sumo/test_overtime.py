@@ -58,6 +58,7 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, engine: Engine) -
     assert len(heard) == len(runs.trace.time)
 
 
+@pytest.mark.slow
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
     system = assemble(at_point(load_study("alks", encounters="ranges"), "cut_in"))
     patient = replace(system, scenario=replace_in(system.scenario, duration=60.0))

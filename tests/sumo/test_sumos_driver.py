@@ -140,6 +140,7 @@ def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
     refuse_difference(runs, NET / "traffic.rou.xml", space[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "attributes",
     [

@@ -272,6 +272,7 @@ def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(mo
     assert vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path) -> None:
     traffic = tmp_path / "net" / "traffic.rou.xml"
