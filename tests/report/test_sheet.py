@@ -19,7 +19,7 @@ from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.ask import parse_question
 from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tolerance.in_ranges import RANGES, study_in_ranges
+from safevar_sumo.questions.tolerance.in_ranges import IN_RANGES, study_in_ranges
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.report.sections import ReportedStudy
@@ -217,7 +217,7 @@ def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
 ) -> None:
     answer = answer_of()
     row = ("CPNCO up to 60 km/h", kept, "A child is hit.", None, None)
-    answer.tables["ranges"] = tabulate("Ranges", RANGES, [row])
+    answer.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
     foreman, _, engineer = sheet_with(answer).partition("For the manufacturer's engineer")
     assert found in foreman
     assert "Ranges of the studyCPNCO up to 60 km/h" in engineer
@@ -236,7 +236,7 @@ def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_c
 def test_a_failure_in_the_ranges_lowers_the_greatest_speed() -> None:
     answer = answer_of()
     row = ("up to 60 km/h", False, "A child is hit.", {"speed": 36.2}, None)
-    answer.tables["ranges"] = tabulate("Ranges", RANGES, [row])
+    answer.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
     sheet = sheet_with(answer, speed=speed_of())
     assert "Greatest speed: 36 km/h (simulated" in sheet
     assert "a vehicle within these limits fails above the greatest speed." in sheet
@@ -300,7 +300,7 @@ def sheet_of_shipped(name: str) -> str:
     )
     if in_ranges := study_in_ranges(study):
         row = (scope_of(in_ranges), False, "A child is hit. " * 20, {}, None)
-        limits.tables["ranges"] = tabulate("Ranges", RANGES, [row])
+        limits.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
     own = replace(limits, study=study)
     has_speed = speed_question(reported(own))
     return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))
