@@ -43,6 +43,9 @@ def read_study(study: StudyLike, **changes: Any) -> Study:
         )
     for remark in raw.remarks:
         warn(remark)
+    for name in complete_study.scenario.over:
+        if complete_study.tests and all(name in test.over for test in complete_study.tests):
+            warn(f"scenario.over.{name} has no effect: each test has an axis of this name")
     return complete_study
 
 

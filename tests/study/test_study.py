@@ -65,6 +65,16 @@ def test_another_system_inherits_neither_title_nor_published_values(
     assert all(": has a different " in remark for remark in remarks)
 
 
+def test_an_axis_of_all_tests_that_no_test_takes_is_named(in_tmp: Path) -> None:
+    shared = "[scenario.over]\nspeed = { at = [20, 35], upper = 45 }\n"
+    Path("mine.toml").write_text(f'extends = "wear"\n{shared}')
+    _, remarks = with_remarks("mine.toml")
+    assert remarks == ["scenario.over.speed has no effect: each test has an axis of this name"]
+    Path("mine.toml").write_text(f'extends = "wear"\n{shared}[[matrix.tests]]\nname = "one"\n')
+    _, remarks = with_remarks("mine.toml")
+    assert not [text for text in remarks if "no effect" in text]
+
+
 def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(
     in_tmp: Path,
 ) -> None:
