@@ -23,7 +23,7 @@ from rich.console import Console
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
-from safevar_sumo.questions.ask import Option, options_of
+from safevar_sumo.questions.ask import COMMON_OPTIONS, Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.questions.render import FORMATS, WIDTH
 from safevar_sumo.questions.subject import study_in, study_or_case
@@ -43,12 +43,49 @@ METAVARS = {
     "directory": "DIR",
 }
 """How the help names positional parameters, unless by their names."""
+COMMON_NAMES = {
+    "Encounters": ("point", "ranges", "up_to"),
+    "Simulations": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
+    "Answer": ("form", "as_json", "details", "table", "plot", "fail_if"),
+}
+"""Options that many commands have: with one meaning, help names them in a few lines."""
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 
 
 class _Command(click.Command):
-    """A command that refuses an option with one value that is given twice."""
+    """A command that refuses an option with one value that is given twice. `--help` explains its
+    own options, and `--help-all` those that many commands have, too.
+    """
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        if ctx.meta.get("all"):
+            super().format_options(ctx, formatter)
+            return
+
+        # Options that the command has with a meaning of its own are explained.
+        options = {
+            option.name: option
+            for option in self.get_params(ctx)
+            if isinstance(option, click.Option)
+        }
+        meanings = {name: meaning for name, _, _, meaning in COMMON_OPTIONS}
+        common = {
+            title: [
+                options.pop(name).opts[0]
+                for name in names
+                if name in options and str(options[name].help).startswith(meanings.get(name, ""))
+            ]
+            for title, names in COMMON_NAMES.items()
+        }
+        records = (option.get_help_record(ctx) for option in options.values())
+        with formatter.section("Options"):
+            formatter.write_dl([record for record in records if record])
+
+        # All others are named.
+        if lines := [(title, ", ".join(flags)) for title, flags in common.items() if flags]:
+            with formatter.section("Options of many commands, which --help-all explains"):
+                formatter.write_dl(lines)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         given = Counter(word.partition("=")[0] for word in args)
@@ -57,6 +94,23 @@ class _Command(click.Command):
             if takes_one and given[option.opts[0]] > 1:
                 raise InputError(option.opts[0], "is given twice", "it once")
         return super().parse_args(ctx, args)
+
+
+def _explain_all(ctx: click.Context, _param: click.Parameter, is_asked: bool) -> None:
+    if is_asked:
+        ctx.meta["all"] = True
+        click.echo(ctx.get_help())
+        ctx.exit()
+
+
+HELP_ALL = click.Option(
+    ["--help-all"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_explain_all,
+    help="Show all options with their meanings and exit.",
+)
 
 
 def command_of(name: str, function: Callable[..., Any]) -> click.Command:
@@ -126,6 +180,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             *map(_argument, positional),
             *(_flag(option) for option in options if option.name != "table"),
             *(_output_options() if gives_answer else []),
+            HELP_ALL,
         ],
         callback=print_answer if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],

@@ -57,11 +57,15 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
     found = commands.get_command(None, command)  # type: ignore[arg-type]
-    assert CliRunner().invoke(commands, [command, "--help"]).exit_code == 0
-    for one in (
-        found,
-        *(option for option in found.params if not isinstance(option, click.Argument)),
-    ):
+    options = [option for option in found.params if not isinstance(option, click.Argument)]
+    short, full = (
+        CliRunner().invoke(commands, [command, flag], catch_exceptions=False).output
+        for flag in ("--help", "--help-all")
+    )
+    for one in options:
+        assert one.opts[0] in short
+        assert " ".join(str(one.help).split()) in " ".join(full.split())
+    for one in (found, *options):
         assert str(one.help).strip().endswith((".", "]")), one.name
 
 
