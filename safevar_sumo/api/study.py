@@ -28,10 +28,10 @@ from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Criterion, Jobs, PointName, Range, UpTo
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.measure import cases_by, study_by
+from safevar_sumo.questions.options import Criterion, Jobs, PointName, Range, UpTo
 from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.research_questions.answer import (
     REMARKS,
@@ -181,7 +181,7 @@ def study(
     changed = _with_options(as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed)
     loaded, system = load_for_search(changed)
     if unsafe is not None:
-        study_by(loaded, Unsafe.parse(unsafe))  # refuses what no study has, before the search
+        study_by(loaded, unsafe)  # refuses what no study has, before the search
     for remark in dict.fromkeys(system.remarks):
         warn(remark)
     keys = _select_runs(all_runs(loaded), shard)
@@ -217,7 +217,7 @@ def study(
 def _found(
     results: Results,
     system: System,
-    unsafe: str | None,
+    unsafe: Unsafe | None,
     jobs: int | None,
     progress: Progress,
     study: str,
@@ -227,7 +227,7 @@ def _found(
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
-    criterion = "" if unsafe is None else f" --unsafe {quote(unsafe)}"
+    criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
     directory = quote(str(results.directory))
     asked = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
     following = ", ".join(f"{PROGRAM_COMMAND} {one}{criterion}" for one in asked)

@@ -23,8 +23,8 @@ from rich.console import Console
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
-from safevar_sumo.questions.ask import COMMON_OPTIONS, Option, options_of
 from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.questions.options import COMMON_OPTIONS, Option, options_of
 from safevar_sumo.questions.render import FORMATS, WIDTH
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.study import study_names

@@ -8,23 +8,30 @@ every other public function.
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, update_wrapper
 from importlib import import_module, invalidate_caches
-from numbers import Integral, Real
 from pathlib import Path
-from shlex import quote, split
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_args, get_origin
+from shlex import quote
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from safevar_sumo.errors import MAX_JOBS, InputError, check_name, check_text, unknown_name, warn
+from safevar_sumo.errors import InputError, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
+from safevar_sumo.questions.options import (
+    CARS_FILE,
+    COMMON_OPTIONS,
+    CRITERION,
+    UP_TO,
+    Option,
+    flag_of,
+    options_of,
+)
 from safevar_sumo.questions.subject import Results, part_of, study_in, study_or_case
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
@@ -44,56 +51,6 @@ QUESTIONS = {
 """The module of each question, whose function has the question's name."""
 
 
-class Range(NamedTuple):
-    """The range of a number; `is_open` leaves out its ends."""
-
-    low: float
-    high: float
-    is_open: bool = False
-
-    def __contains__(self, value: object) -> bool:
-        assert isinstance(value, Real)
-        number = float(value)
-        return self.low < number < self.high if self.is_open else self.low <= number <= self.high
-
-    def __str__(self) -> str:
-        before, between = ("between", "and") if self.is_open else ("from", "to")
-        ends = [
-            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)
-        ]
-        return f"{before} {ends[0]} {between} {ends[1]}"
-
-
-Count = Annotated[int, Range(1, 100_000_000)]
-"""A number of vehicles, solutions or attempts."""
-Fraction = Annotated[float, Range(0, 1, is_open=True)]
-"""A share such as a confidence."""
-Margin = Annotated[float | None, Range(0, 100)]
-"""A distance to keep from a collision [m]."""
-CRITERION = '"METRIC < X"|collision|below=X|points=X'
-Criterion = Annotated[str | None, CRITERION]
-"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
-metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
-setting collides, else half of the original's safety degree; of a rated study, any point lost.
-"""
-CARS_FILE = "FILE.csv"
-"""A list of cars: its path, or in the library also a DataFrame or a mapping."""
-LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']
-"""Limits of characteristics."""
-ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
-"""Values of characteristics."""
-Fits = Annotated[int | None, Range(0, 1000)]
-"""A number of parameter sets; None for all."""
-PointName = Annotated[str | None, "NAME"]
-"""A test, or a point, of a study's matrix."""
-UpTo = Annotated[str | None, "NAME=V"]
-"""A value at which an axis ends."""
-Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
-"""A number of worker processes."""
-Cluster = Annotated[str | None, "ADDRESS"]
-"""The address of a Dask scheduler."""
-UP_TO = "up_to"
-"""The option that cuts an axis."""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
@@ -101,106 +58,6 @@ ROUGH = (
     " nothing):"
 )
 """The beginning of such an answer."""
-Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
-"""The largest number of simulations."""
-COMMON_OPTIONS = (
-    ("point", PointName, None, "Only this test, or this point, of the study's matrix."),
-    (
-        "ranges",
-        bool,
-        False,
-        "Any encounter in the ranges of the study's axes, not the tests alone.",
-    ),
-    ("up_to", UpTo, None, "Only encounters up to this value of an axis, such as speed=40."),
-    ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
-    ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
-    (
-        *("simulations", Simulations, None),
-        (
-            "At most so many simulations: a rough answer where more are usual. By default, as many"
-            " as take 15 minutes where a simulation takes long."
-        ),
-    ),
-    ("pool", Any, None, "Pool that simulates; by default new worker processes."),
-    (
-        "progress",
-        Any,
-        False,
-        "True for a bar on the terminal, or a function of a phase, the number of simulations done,"
-        " and their total.",
-    ),
-    (
-        *("as_it_is_now", bool, False),
-        (
-            "If results were computed with other files or versions, simulate with the present ones"
-            " and say so."
-        ),
-    ),
-    (
-        *("fresh", bool, False),
-        "Simulate everything anew, instead of reading what earlier commands have simulated.",
-    ),
-)
-"""Options that every question has: name, type, default, and meaning."""
-
-
-def flag_of(name: str) -> str:
-    """The flag of an option."""
-    return f"--{name.replace('_', '-')}"
-
-
-class Option(NamedTuple):
-    """An option of a function: the type of a value, its range, choices or the form of its text, its
-    default and its meaning.
-    """
-
-    name: str
-    kind: type
-    limits: Range | None
-    choices: tuple[str, ...]
-    metavar: str | None
-    is_repeated: bool
-    default: Any
-    meaning: str
-
-    @property
-    def flag(self) -> str:
-        return flag_of(self.name)
-
-    def check(self, value: Any) -> Any:
-        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE; refuses what has
-        another type or is outside the range.
-        """
-        # A table NAME=VALUE, a text, or several.
-        if self.is_repeated:
-            if isinstance(value, Mapping):
-                value = [f"{name}={inner}" for name, inner in value.items()]
-            values = (value,) if isinstance(value, str) else tuple(value)
-            if twice := next((text for text in values if values.count(text) > 1), None):
-                raise InputError(self.name, f"{twice!r} is given twice", "each value once")
-            return values
-        is_object = self.metavar == CARS_FILE and not isinstance(value, str)
-        if value is None or is_object or self.kind is bool or self.metavar == CRITERION:
-            return value
-        if self.kind not in (int, float):
-            return check_text(self.name, value)
-
-        # A number within its limits.
-        number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
-        words = f"{words} {self.limits}" if self.limits else words
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, number)
-            or (self.limits and value not in self.limits)
-        ):
-            raise InputError(self.name, repr(value), words)
-        return value
-
-
-SIMULATIONS = Option(
-    "simulations", int, get_args(Simulations)[1], (), None, False, None, "the largest number"
-)
-"""The option that questions on pages and in packs have, too."""
 
 
 class Question:
@@ -352,20 +209,16 @@ class Question:
             open_evaluator(study, pool, jobs, show, cluster) as evaluator,
         ):
             account = evaluator.account
-            evaluator.limit(simulations)
-            account.questions = questions
+            evaluator.limit(simulations, questions)
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)
-            criterion, values, cites = self._criterion(values, study)
-            if criterion is not None:
-                unsafe = Unsafe.parse(criterion)
+            unsafe, values, cites = self._criterion(values, study)
+            if unsafe is not None:
                 subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
-                if unsafe.bound:
-                    account.measure = unsafe.bound.measure
-                    evaluator.check_measured(account.measure)
+                evaluator.use(unsafe)
 
             # The question's own function.
             with user_errors(self.name):
@@ -391,9 +244,10 @@ class Question:
         command = "" if most is None else f" --simulations {most}"
         return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
 
-    def _criterion(self, values: JsonObject, study: Study) -> tuple[Any, JsonObject, str]:
+    def _criterion(self, values: JsonObject, study: Study) -> tuple[Unsafe | None, JsonObject, str]:
         """What is unsafe, the values of options with it, and where it comes from: a study's own
-        criterion stands where nothing else is asked for; a margin is that of a collision.
+        criterion stands where nothing else is asked for, and a margin, too, is asked for: it is
+        that of a collision.
         """
         option = next((one.name for one in self.options if one.metavar == CRITERION), "")
         if not option or any(values.get(name) is not None for name in (option, "margin")):
@@ -403,7 +257,7 @@ class Question:
             f"Criterion: {own.criterion or None} ({own.source})." if own.source else "",
             f"Not simulated: {own.not_simulated}." if own.not_simulated else "",
         )
-        criterion = own.criterion or None
+        criterion = Unsafe.parse(own.criterion) if own.criterion else None
         return criterion, {**values, option: criterion}, " ".join(filter(None, cites))
 
     def _following(
@@ -498,103 +352,8 @@ def find_question(name: str) -> Question:
     return found
 
 
-def options_of(function: Callable[..., Any]) -> list[Option]:
-    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring
-    describe them.
-    """
-    pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
-    texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
-    names = inspect.unwrap(function).__globals__
-    options = []
-    for parameter in inspect.signature(function).parameters.values():
-        if parameter.kind is parameter.KEYWORD_ONLY:
-            hint = parameter.annotation  # a text where the module postpones annotations
-            meaning = " ".join(texts.get(parameter.name, "").split())
-            options.append(
-                _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
-            )
-    return options
-
-
-def parse_question(text: str) -> tuple[Question, JsonObject]:
-    """A question and values of its options, from its command without subjects: `risk --samples
-    4000`.
-
-    Raises
-    ------
-    InputError
-        If there is no such question or option, or a value is not allowed.
-    """
-    # The question's name.
-    try:
-        name, *words = split(text)
-    except ValueError:  # nothing, or a quotation mark without its second one
-        raise InputError(
-            "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
-        ) from None
-    asked = find_question(name)
-
-    # Options, each with its value.
-    values = dict[str, Any]()
-    waiting = iter(words)
-    options = {option.flag: option for option in (*asked.options, SIMULATIONS)}
-    for flag in waiting:
-        check_name("ask", f"{name} has no option {flag!r}", flag, options)
-        option = options[flag]
-        if option.name in values and not option.is_repeated:
-            raise InputError(f"ask: {name} {flag}", "is given twice", "it once")
-        value = option.kind is bool or next(waiting, None)
-        try:
-            value = value if option.kind is bool else option.kind(value)
-        except (TypeError, ValueError):
-            raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
-        values[option.name] = option.check(
-            (*values.get(option.name, ()), value) if option.is_repeated else value
-        )
-    return asked, values
-
-
-def with_criterion(text: str, unsafe: str | None) -> str:
-    """A question as `parse_question` reads it, with a criterion if it takes one and states none."""
-    asked, values = parse_question(text)
-    takes_it = unsafe is not None and any(option.metavar == CRITERION for option in asked.options)
-    return f"{text} --unsafe {quote(str(unsafe))}" if takes_it and "unsafe" not in values else text
-
-
-def quick_questions(texts: Sequence[str]) -> list[str]:
-    """The questions, rough where they can be."""
-    found = []
-    for text in texts:
-        asked, values = parse_question(text)
-        is_made_rough = asked.has_rough_answer and QUICK not in values
-        found.append(f"{text} --{QUICK}" if is_made_rough else text)
-    return found
-
-
-def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
-    limits = None
-    metavar = None
-    if get_origin(hint) is Annotated:
-        hint, extra = get_args(hint)
-        limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
-    is_repeated = any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
-    kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
-    kind = str if is_repeated or not kinds else kinds[0]
-    choices = get_args(hint) if get_origin(hint) is Literal else ()
-    return Option(
-        parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
-    )
-
-
 def _name(source: StudyLike | Results) -> str:
     """How a command line names a subject."""
     if isinstance(source, Results):
         return str(source.directory)
     return source.origin.called or source.name if isinstance(source, Study) else str(source)
-
-
-def has_criterion(text: str, unsafe: str | None) -> bool:
-    """Whether a question as `with_criterion` gives it is asked by a criterion, and not by another
-    one or none.
-    """
-    return parse_question(text)[1].get("unsafe") == (None if unsafe is None else str(unsafe))

@@ -16,8 +16,8 @@ from safevar_sumo.errors import InputError, check_name, warn
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS, UNSAFE_SHARE
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Range
 from safevar_sumo.questions.check_scenario import TABLES, check_scenario
+from safevar_sumo.questions.options import Range
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
     SCENARIOS,

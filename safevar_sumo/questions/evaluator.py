@@ -46,7 +46,7 @@ from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
-from safevar_sumo.sumo.measuring import criterion_of
+from safevar_sumo.sumo.measuring import check_criterion
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
@@ -172,9 +172,12 @@ class Evaluator:
         account = self.account
         return None if account.most is None else int(account.left) // self._each
 
-    def limit(self, simulations: int | None) -> None:
-        """Let the question do so many simulations, with those that check a simulator's class."""
+    def limit(self, simulations: int | None, questions: int) -> None:
+        """Let the question do so many simulations, with those that check a simulator's class; it is
+        one of so many that share the time.
+        """
         self.account.asked = self.account.most = simulations
+        self.account.questions = questions
         self.account.is_question = True
         limits = simulations is not None and self.system.mover.takes_long
         self._pool.spare = spare(simulations or 0, 0) if limits else None
@@ -384,17 +387,17 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
     def choose_criterion(
-        self, text: Unsafe | str | None, source: Subject, original: Evaluations | None = None
+        self, stated: Unsafe | None, source: Subject, original: Evaluations | None = None
     ) -> Unsafe:
-        """The criterion that an option states, or else the default for the solutions of results, or
-        for settings over the whole domain of a study.
+        """The criterion that is stated, or else the default for the solutions of results, or for
+        settings over the whole domain of a study.
 
-        Raises what `parse_criterion` and `Unsafe.default_among` raise.
+        Raises what `checked` and `Unsafe.default_among` raise.
         """
-        if text is not None:
-            return self.parse_criterion(text)
-        if not isinstance(source, Study) and len(source.solutions):
-            return self.parse_criterion(source.unsafe)
+        if stated is None and not isinstance(source, Study) and len(source.solutions):
+            stated = source.unsafe
+        if stated is not None:
+            return self.checked(stated)
         self.check_measured()
         original = original or self.evaluate_original()
         if (
@@ -409,14 +412,23 @@ class Evaluator:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 
-    def parse_criterion(self, text: Unsafe | str) -> Unsafe:
-        """Parse the criterion that an option states; raises what `criterion_of` raises, and an
-        InputError if nobody is on the road, from whom it is a distance.
+    def use(self, unsafe: Unsafe) -> None:
+        """Ask by a criterion: settings without the value that it bounds are counted. Raises what
+        `checked` raises.
         """
-        criterion = criterion_of(text, self.study)
-        if criterion.measure == F_SAFE.name:
+        self.checked(unsafe)
+        if unsafe.bound:
+            self.account.measure = unsafe.bound.measure
+            self.check_measured(unsafe.bound.measure)
+
+    def checked(self, unsafe: Unsafe) -> Unsafe:
+        """A criterion; raises what `check_criterion` raises, and an InputError if nobody is on the
+        road, from whom it is a distance.
+        """
+        check_criterion(unsafe, self.study)
+        if unsafe.measure == F_SAFE.name:
             self.check_measured()
-        return criterion
+        return unsafe
 
     def check_measured(self, measure: str = F_SAFE.name) -> None:
         """Refuse what is measured in an encounter, as a distance, where nobody else is on the

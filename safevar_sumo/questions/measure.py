@@ -70,24 +70,24 @@ def subject_by(subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator) ->
 
 def cases_by(
     cases: Sequence[Case],
-    text: str | None,
+    unsafe: Unsafe | None,
     jobs: int | None,
     progress: Progress,
     cluster: str | None = None,
 ) -> list[Case]:
-    """Results by the criterion that a text states; as they are without one.
+    """Results by a criterion; as they are without one.
 
     Raises
     ------
     InputError
-        If it is no criterion, or not one of a study.
+        If it is not one of a study.
     """
-    if text is None:
+    if unsafe is None:
         return [*cases]
     found = []
     for case in cases:
         with open_evaluator(case.study, None, jobs, progress, cluster) as evaluator:
-            found.append(case_by(case, evaluator.parse_criterion(text), evaluator))
+            found.append(case_by(case, evaluator.checked(unsafe), evaluator))
     return found
 
 

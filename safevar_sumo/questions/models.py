@@ -14,7 +14,6 @@ import numpy as np
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
-from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Judge
@@ -151,7 +150,7 @@ class Models(NamedTuple):
 def limit_criterion(
     evaluator: Evaluator,
     subject: Subject,
-    unsafe: Unsafe | str | None,
+    unsafe: Unsafe | None,
     margin: float | None,
     original: Evaluations,
 ) -> Unsafe:
@@ -160,7 +159,7 @@ def limit_criterion(
     scenario, whose originals keep more.
     """
     is_distance = unsafe is None and margin is not None
-    criterion = evaluator.choose_criterion(COLLISION if is_distance else unsafe, subject, original)
+    criterion = evaluator.choose_criterion(Unsafe() if is_distance else unsafe, subject, original)
     return keeping_distance(evaluator, criterion, margin, is_stated=unsafe is not None)
 
 

@@ -19,11 +19,12 @@ from safevar_sumo.protocol import COLOURS, EURO_NCAP_2026, CellMatrix, Protocol
 from safevar_sumo.protocol.cells import EXTENDED, REQUIRED, UNCHECKED
 from safevar_sumo.protocol.rater import Points, Rater, darken
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import ValueTexts, question
+from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.figures import FONT_SIZE, escape_dollars, new_panels
+from safevar_sumo.questions.options import ValueTexts
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import CellResults, FloatArray, NamedValues
 from safevar_sumo.results import SolutionId, row_of_handle

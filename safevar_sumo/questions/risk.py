@@ -33,9 +33,10 @@ from safevar_sumo.questions.answer import (
     tabulate,
     with_interval,
 )
-from safevar_sumo.questions.ask import Count, Criterion, Fraction, question
+from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.options import Count, Criterion, Fraction
 from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson

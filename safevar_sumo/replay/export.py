@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import EnvironmentFault, InputError, about
 from safevar_sumo.output import temporary_folder
-from safevar_sumo.questions.ask import PointName
+from safevar_sumo.questions.options import PointName
 from safevar_sumo.records import TIME_DECIMALS, FloatArray, JsonObject, NamedValues
 from safevar_sumo.replay.animation import PLAYER_FOLDER, template_environment
 from safevar_sumo.replay.comparison import Comparison, comparison_of

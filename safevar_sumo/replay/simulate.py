@@ -19,7 +19,6 @@ from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import PointName, Range, UpTo
 from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
@@ -28,6 +27,7 @@ from safevar_sumo.questions.model_spread import (
     remarks_on_sets,
     studies_of_sets,
 )
+from safevar_sumo.questions.options import PointName, Range, UpTo
 from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.subject import refuse_part_of_results, study_in, study_or_case
 from safevar_sumo.questions.words import (

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.ask import SIMULATIONS
+from safevar_sumo.questions.options import SIMULATIONS
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 
-REPLAYS, SPEED = "replays", "permit"
-"""The name of the part of the replays, and the question about the speed of a sheet."""
+REPLAYS, SPEED = "replays", "speed"
+"""The names of the parts of the replays, and of the question about the speed of a sheet."""
 PART_OF_REPLAYS = 10
 ONE_SAMPLE = ("risk", "rules")
 """Questions that simulate one sample, if their options are the same."""
@@ -51,12 +51,3 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
         problem = f"{simulations:,} do not suffice for {len(own) + len(others)} questions"
         raise InputError("simulations", problem, "a larger number, or fewer questions (--ask)")
     return {**dict.fromkeys([*own, *others], part), REPLAYS: replays}
-
-
-def with_part(text: str, parts: Mapping[str, int]) -> str:
-    """A question with its part of the simulations; that about the speed of a sheet has other
-    words, and the part of `permit`.
-    """
-    part = parts.get(text, parts.get(SPEED) if text.startswith(f"{SPEED} ") else None)
-    is_stated = part is None or SIMULATIONS.flag in text.split()
-    return text if is_stated else f"{text} {SIMULATIONS.flag} {part}"

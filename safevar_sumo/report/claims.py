@@ -24,21 +24,23 @@ from safevar_sumo.campaign import all_runs
 from safevar_sumo.campaign.identity import PLATFORM
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, about
-from safevar_sumo.metrics import PUBLISHED_SCORING
+from safevar_sumo.metrics import PUBLISHED_SCORING, Unsafe
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import SIMULATIONS, has_criterion, with_criterion
+from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.measure import cases_by
+from safevar_sumo.questions.options import SIMULATIONS, flag_of
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.report.budget import REPLAYS, with_part
+from safevar_sumo.report.budget import REPLAYS, SPEED
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
-from safevar_sumo.report.page import answer_or_reason, answer_to, make_page, usual_questions
+from safevar_sumo.report.page import make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.sheet import with_speed
+from safevar_sumo.report.texts import answer_about, completed, parse_question, with_criterion
 from safevar_sumo.results import (
     MANIFEST,
     SOLUTIONS,
@@ -55,7 +57,7 @@ from safevar_sumo.terminal import Parts, Progress
 STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
 """Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
-LISTS, CARS = "lists", "--cars"
+LISTS, CARS = "lists", "cars"
 """The folder of the lists of cars in a pack, and the option of a question that names one."""
 SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
 MALFORMED = (
@@ -186,29 +188,41 @@ class Packed:
         """
         if self.case.scoring != assemble(self.case.study).measuring.scoring:
             raise InputError(MANIFEST, "scoring is not that of the study", PACK)
-        (case,) = cases_by([self.case], self.packed.unsafe, self._jobs, self._progress)
+        (case,) = cases_by([self.case], self.unsafe, self._jobs, self._progress)
         return case
 
-    def answer(self, text: str) -> Answer:
-        if text not in self._answers:
-            add_import_folders(self._places)
-            shown = self.shown
-            unsafe = self.packed.unsafe
-            case = shown if has_criterion(text, unsafe) else self.case
-            with temporary_folder() as folder:
-                placed = text
-                if name := list_in(text):
-                    path = Path(folder, name)
-                    path.parent.mkdir()
-                    path.write_bytes(self.files[name])
-                    placed = with_list(text, str(path))
-                usual = {with_criterion(one, unsafe) for one in usual_questions(shown)}
-                ask = answer_to if text in {*self.packed.questions} - usual else answer_or_reason
-                part = with_part(text, self.packed.simulations).removeprefix(text)
-                asked = partial(ask, pool=self.pool, questions=len(self.packed.questions) + 1)
-                where = [self._directory], None, self._jobs, self._progress
-                answer = asked(f"{placed}{part}", [case], *where)
-            self._answers[text] = replace(answer, command=answer.command.replace(f"{folder}/", ""))
+    @property
+    def unsafe(self) -> Unsafe | None:
+        """The criterion of the pack."""
+        return None if self.packed.unsafe is None else Unsafe.parse(self.packed.unsafe)
+
+    def answer(self, text: str, asked: tuple[Question, JsonObject] | None = None) -> Answer:
+        """The answer to a question of the pack, or to another one under a name."""
+        if text in self._answers:
+            return self._answers[text]
+        add_import_folders(self._places)
+        shown = self.shown
+        usual = {with_criterion(one, self.unsafe) for one in usual_questions(shown)}
+        question, values = asked or parse_question(text)
+        part = self.packed.simulations.get(text)
+        values = completed(question, values, self.unsafe, part, quick=False)
+        case = shown if values.get("unsafe") == self.unsafe else self.case
+        with temporary_folder() as folder:
+            if name := values.get(CARS):
+                path = Path(folder, name)
+                path.parent.mkdir()
+                path.write_bytes(self.files[name])
+                values[CARS] = str(path)
+            answer = answer_about(
+                question,
+                values,
+                *([case], [self._directory], None, self._jobs, self._progress),
+                is_asked=text in {*self.packed.questions} - usual,
+                pool=self.pool,
+                questions=len(self.packed.questions) + 1,
+            )
+        command = answer.command.replace(f"{folder}/", "")
+        self._answers[text] = replace(answer, command=command)
         return self._answers[text]
 
     def simulations(self) -> dict[str, int]:
@@ -232,7 +246,7 @@ class Packed:
             answers=[self.answer(text) for text in self.packed.questions],
             simulations=self.packed.simulations.get(REPLAYS),
         )
-        return with_speed(study, lambda text: self.answer(with_criterion(text, self.packed.unsafe)))
+        return with_speed(study, partial(self.answer, SPEED))
 
     def page(self) -> bytes:
         return make_page([self.ask_speed()], parts=Parts(self._progress)).encode()
@@ -329,13 +343,13 @@ class Packed:
 def list_in(text: str) -> str:
     """The list of cars that a question names; empty without one."""
     words = split(text)
-    return words[words.index(CARS) + 1] if CARS in words else ""
+    return words[words.index(flag_of(CARS)) + 1] if flag_of(CARS) in words else ""
 
 
 def with_list(text: str, path: str) -> str:
     """A question that names a list of cars, about another list."""
     words = split(text)
-    words[words.index(CARS) + 1] = path
+    words[words.index(flag_of(CARS)) + 1] = path
     return join(words)
 
 

@@ -15,19 +15,13 @@ import msgspec
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError, describe_error
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import (
-    Cluster,
-    Criterion,
-    Jobs,
-    Simulations,
-    parse_question,
-    with_criterion,
-)
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.measure import cases_by
+from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
@@ -71,6 +65,7 @@ from safevar_sumo.report.pack import (
     write_pack,
 )
 from safevar_sumo.report.page import speed_part, usual_questions
+from safevar_sumo.report.texts import parse_question, with_criterion
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
@@ -153,7 +148,7 @@ def _pack_study(
     number: int,
     directory: Path,
     ask: Sequence[str],
-    unsafe: str | None,
+    unsafe: Unsafe | None,
     how: JsonObject,
     progress: Progress,
     simulations: int | None,
@@ -182,7 +177,9 @@ def _pack_study(
         again = len(case.settings) * (shown.study != case.study) * simulations_of_setting(system)
         parts = divided([*questions, *speed_part(questions, case)], simulations - again, system)
     outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
-    described = PackedStudy(folder, questions, runs, outcomes, solutions, unsafe, parts)
+    described = PackedStudy(
+        folder, questions, runs, outcomes, solutions, str(unsafe) if unsafe else None, parts
+    )
 
     # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)

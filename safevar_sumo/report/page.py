@@ -7,12 +7,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -20,27 +19,20 @@ from markupsafe import Markup
 from safevar_sumo.campaign.cache import keep_simulations
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import (
-    SIMULATIONS,
-    Cluster,
-    Criterion,
-    Jobs,
-    Simulations,
-    has_criterion,
-    parse_question,
-    quick_questions,
-    with_criterion,
-)
+from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.measure import cases_by
+from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
-from safevar_sumo.report.budget import REPLAYS, divided, with_part
+from safevar_sumo.report.budget import REPLAYS, SPEED, divided
 from safevar_sumo.report.sections import ReportedStudy, page_commands, replays, tested, trust
 from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
+from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import choose_handle, read_manifest, write_whole
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import assemble
@@ -132,6 +124,7 @@ def report(
         If a directory holds no results, there is no such question or point, or the file cannot be
         written.
     """
+    unsafe = None if unsafe is None else Unsafe.parse(unsafe)
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 
@@ -146,24 +139,24 @@ def report(
     with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
-        asked = [quick_questions(texts) if quick else texts for texts in asked]
         texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
         budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
-        costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
-        parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
+        parts = Parts(show, [*map(_cost, texts), *PAGE_COSTS * len(cases)])
 
-        def next_answer(text: str, chosen: slice, *, is_asked: bool = bool(ask)) -> Answer:
+        def next_answer(
+            text: str, chosen: slice, asked: tuple[Question, JsonObject] | None = None
+        ) -> Answer:
             # The next answer, about these of the results.
-            stated = with_part(text, budgets[chosen.start or 0]) if budgets else text
-            question = with_criterion(stated, unsafe)
-            subjects = by_criterion if has_criterion(question, unsafe) else at_point
-            name = f"question {next(numbers)} of {len(texts)}, {question.split()[0]}"
-            answer = answer_to if is_asked else answer_or_reason
+            question, values = asked or parse_question(text)
+            part = budgets[chosen.start or 0].get(text) if budgets else None
+            values = completed(question, values, unsafe, part, quick=quick)
+            subjects = by_criterion if values.get("unsafe") == unsafe else at_point
+            name = f"question {next(numbers)} of {len(texts)}, {question.name}"
             about = subjects[chosen], paths[chosen], point, jobs, parts.begin(name)
-            how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool}
-            return answer(question, *about, questions=len(texts), **how)
+            how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool, "questions": len(texts)}
+            return answer_about(question, values, *about, is_asked=bool(ask) and not asked, **how)
 
         # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
@@ -178,12 +171,16 @@ def report(
                 later_changes=later_changes[number],
                 simulations=budgets[number][REPLAYS] if budgets else None,
             )
-            studies.append(with_speed(study, partial(next_answer, chosen=chosen, is_asked=False)))
+            studies.append(with_speed(study, partial(next_answer, SPEED, chosen)))
         shared = [next_answer(text, slice(None)) for text in joint]
         stack.close()  # this process simulates the replays
-        page = make_page(studies, shared, parts)
-    write_whole(out, page)
+        write_whole(out, make_page(studies, shared, parts))
     return out
+
+
+def _cost(text: str) -> int:
+    """As many simulations as take as long as a question."""
+    return USUAL_COSTS.get(text.split()[0], LEAST_COST)
 
 
 def _budgets(
@@ -231,9 +228,9 @@ def _with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
 
 
 def speed_part(asked: Sequence[str], case: Case) -> list[str]:
-    """The question of the greatest speed that the sheet of a page has, without its options."""
+    """The name of the question of the greatest speed, if the sheet of a page has it."""
     has_sheet = any(text.startswith("tolerance") for text in asked)
-    return ["permit"] if has_sheet and speeds_of(case) else []
+    return [SPEED] if has_sheet and speeds_of(case) else []
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
@@ -271,47 +268,6 @@ def usual_questions(case: Case, point: str | None = None) -> list[str]:
     left_out = SMALLEST if assemble(case.study).mover.takes_long else ""
     questions = [text for text in USUAL_QUESTIONS if text != left_out]
     return [*questions, *(["repair"] if can_repair else [])]
-
-
-def answer_to(
-    text: str,
-    cases: Sequence[Case],
-    directories: Sequence[Path],
-    point: str | None,
-    jobs: int | None,
-    progress: Progress,
-    *,
-    as_it_is_now: bool = False,
-    pool: Pool | None = None,
-    questions: int = 1,
-) -> Answer:
-    """The answer to a question about results.
-
-    Raises
-    ------
-    InputError
-        If there is no such question, it has no answer, or it is about another number of results.
-    """
-    question, values = parse_question(text)
-    if len(question.others) + 1 != len(cases):
-        expected = f"{len(question.others) + 1} results directories"
-        raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", expected)
-    simulations = values.pop(SIMULATIONS.name, None)
-    command = question.command_line([*map(str, directories)], {"point": point}, values)
-    how: JsonObject = {"simulations": simulations, "jobs": jobs, "as_it_is_now": as_it_is_now}
-    how |= {"pool": pool, "questions": questions}
-    answer = question.answer(cases, values, **how, progress=progress)
-    return replace(answer, command=command + answer.command)
-
-
-def answer_or_reason(text: str, cases: Sequence[Case], *arguments: Any, **how: Any) -> Answer:
-    """As `answer_to`, but if a question that nobody asked for has no answer, the reason."""
-    try:
-        return answer_to(text, cases, *arguments, **how)
-    except InputError as error:
-        name, study = text.partition(" ")[0], cases[0].study
-        verdict = f"No answer: {error.problem}; expected: {error.legal}."
-        return Answer(question=name, study=study, verdict=verdict, numbers={}, tables={})
 
 
 def make_page(

@@ -130,7 +130,7 @@ class ReportedStudy:
     later_changes
         The files and versions that have changed since.
     speed
-        The answer to `speed_question`, which is among the answers, too.
+        The answer to `speed_values`, which is among the answers, too.
     simulations
         The largest number of simulations of its replays in a simulator of the user's own.
     """

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
-from shlex import join
 from typing import Any
 
 import pandas as pd
@@ -19,6 +18,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Columns, tabulate
+from safevar_sumo.questions.ask import QUICK, Question, find_question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.tables import html_table
@@ -112,38 +112,41 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     }
 
 
-def speed_question(study: ReportedStudy) -> str:
-    """The question how fast vehicles within the limits of the sheet may drive; empty where nobody
-    may work by the sheet, or the study varies no speed.
+def speed_values(study: ReportedStudy) -> JsonObject:
+    """The options with which `permit` says how fast vehicles within the limits of the sheet may
+    drive; none where nobody may work by the sheet, or the study varies no speed.
     """
     limits = _limits_of(study)
     if limits is None or study.point or _why_no_limits(study, limits) or not speeds_of(study.case):
-        return ""
-    unsafe, margin = limits.numbers["unsafe"], limits.numbers["margin"]
-    if _is_relative(study.case, Unsafe.parse(unsafe)):
-        return ""
+        return {}
+    unsafe, margin = Unsafe.parse(limits.numbers["unsafe"]), limits.numbers["margin"]
+    if _is_relative(study.case, unsafe):
+        return {}
 
-    # The criterion and the values of the limits; what a workshop does not measure has the value
-    # that the study states, if it states one.
-    is_contact = unsafe == "collision" and margin
-    words = ["--margin", f"{margin:g}"] if is_contact else ["--unsafe", unsafe]
-    words += ["--quick"] * limits.numbers["rough"]
+    # The values of the limits; what a workshop does not measure has the value that the study
+    # states, if it states one.
+    texts = list[str]()
     rows = _rows_of(limits)
     for item in study.case.characteristics.vehicle:
         if item.is_for_workshop or item.name not in study.case.study.unmeasured:
             low, high = _together(item, rows.get(item.name))
-            words += ["--limits", f"{item.name} >= {low!r}", "--limits", f"{item.name} <= {high!r}"]
-    return join(["permit", "--others", "new", *words])
+            texts += [f"{item.name} >= {low!r}", f"{item.name} <= {high!r}"]
+    is_contact = unsafe.is_collision and margin
+    criterion = {"margin": margin} if is_contact else {"unsafe": unsafe}
+    rough = {QUICK: True} if limits.numbers["rough"] else {}
+    return {"others": "new", "limits": tuple(texts), **criterion, **rough}
 
 
-def with_speed(study: ReportedStudy, ask: Callable[[str], Answer]) -> ReportedStudy:
-    """A study with the answer to its `speed_question`, if it has one, as the last of its answers:
-    the sheet is about the limits of that question, whatever else was asked.
+def with_speed(
+    study: ReportedStudy, ask: Callable[[tuple[Question, JsonObject]], Answer]
+) -> ReportedStudy:
+    """A study with the answer about the speed of its sheet, if it has one, as the last of its
+    answers: the sheet is about the limits of that question, whatever else was asked.
     """
-    text = speed_question(study)
-    if not text:
+    values = speed_values(study)
+    if not values:
         return study
-    speed = ask(text)
+    speed = ask((find_question("permit"), values))
     return replace(study, answers=[*study.answers, speed], speed=speed)
 
 

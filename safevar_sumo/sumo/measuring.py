@@ -23,7 +23,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     checked_measure,
 )
-from safevar_sumo.metrics.unsafe import COLLISION, CriterionLike
+from safevar_sumo.metrics.unsafe import COLLISION
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 
@@ -111,27 +111,26 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
 
 
 def own_criterion(study: Study) -> Unsafe:
-    """The study's own criterion; without one, a collision. Raises what `criterion_of` raises."""
-    text = study.unsafe.criterion or COLLISION
-    try:
-        return criterion_of(text, study)
-    except InputError as error:
-        raise InputError("", f"{CRITERION_KEY} = {error.problem}", error.legal) from None
-
-
-def criterion_of(text: CriterionLike, study: Study) -> Unsafe:
-    """A criterion that is stated for a study.
+    """The study's own criterion; without one, a collision.
 
     Raises
     ------
     InputError
-        If it is no criterion, or about points of a study that is not rated.
+        If it is no criterion, and what `check_criterion` raises.
     """
-    criterion = Unsafe.parse(text)
-    if criterion.points is not None and not study.is_rated:
-        problem = f"{text!r}: study {study.name!r} is not rated and has no points"
-        raise InputError("unsafe", problem, "collision or below=X")
+    try:
+        criterion = Unsafe.parse(study.unsafe.criterion or COLLISION)
+        check_criterion(criterion, study)
+    except InputError as error:
+        raise InputError("", f"{CRITERION_KEY} = {error.problem}", error.legal) from None
     return criterion
+
+
+def check_criterion(criterion: Unsafe, study: Study) -> None:
+    """Refuse a criterion about points of a study that is not rated."""
+    if criterion.points is not None and not study.is_rated:
+        problem = f"{str(criterion)!r}: study {study.name!r} is not rated and has no points"
+        raise InputError("unsafe", problem, "collision or below=X")
 
 
 class _Named:

@@ -13,7 +13,6 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.questions import model_spread
-from safevar_sumo.questions.ask import quick_questions
 from safevar_sumo.report.page import report
 from tests.in_process import InlinePool, run
 
@@ -77,11 +76,6 @@ def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
     answer = sv.repair("wear", promise=("treadDepth >= 4",), quick=True)
     assert answer.verdict.startswith("Rough answer (--quick")
     assert (answer.numbers["rough"], answer.numbers["fits_tried"]) == (True, 1)
-
-
-def test_questions_of_a_rough_page_are_rough_where_they_can_be() -> None:
-    asked = ["tolerance", "explain --top 3", "risk"]
-    assert quick_questions(asked) == ["tolerance --quick", "explain --top 3 --quick", "risk"]
 
 
 @pytest.mark.slow

@@ -27,12 +27,12 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.reference_drivers import FullBraking
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.ask import parse_question
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.figures import new_figure
 from safevar_sumo.report import sections
-from safevar_sumo.report.page import _picture, answer_or_reason, answer_to, usual_questions
+from safevar_sumo.report.page import _picture, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.report.texts import answer_about, parse_question
 from safevar_sumo.results import handles_of
 from safevar_sumo.results.manifest import read_manifest, write_manifest
 from safevar_sumo.scenarios import SCENARIOS
@@ -204,10 +204,10 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slipper
 
 
 def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:
-    arguments = "repair", [case], [slippery], None, 1, show_no_progress
-    assert answer_or_reason(*arguments).verdict.startswith("No answer: ")
+    arguments = *parse_question("repair"), [case], [slippery], None, 1, show_no_progress
+    assert answer_about(*arguments, is_asked=False).verdict.startswith("No answer: ")
     with pytest.raises(InputError):
-        answer_to(*arguments)
+        answer_about(*arguments, is_asked=True)
 
 
 def test_the_sentence_about_a_model_is_whole() -> None:

@@ -16,14 +16,13 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
-from safevar_sumo.questions.ask import parse_question
 from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.in_ranges import IN_RANGES, study_in_ranges
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.report.sections import ReportedStudy
-from safevar_sumo.report.sheet import sheet_of, speed_question
+from safevar_sumo.report.sheet import sheet_of, speed_values
 from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -262,9 +261,8 @@ def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -
 
 def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> None:
     all_measured = replace_in(STUDY, unmeasured={})
-    asked = speed_question(reported(replace(answer_of(), study=all_measured)))
-    question, values = parse_question(asked)
-    assert (question.name, values["margin"], values["others"]) == ("permit", 0.3, "new")
+    values = speed_values(reported(replace(answer_of(), study=all_measured)))
+    assert (values["margin"], values["others"]) == (0.3, "new")
     assert values["limits"] == (
         *("treadDepth >= 3.0", "treadDepth <= 8.0", "brakeTorque >= 0.85", "brakeTorque <= 1.0"),
         *("brakeResponse >= 0.05", "brakeResponse <= 0.132", "payload >= 75.0", "payload <= 525.0"),
@@ -274,14 +272,14 @@ def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_other
     )
     # What the study states of a value that nobody measured stands in place of a limit.
     joint = replace(answer_of(unsafe="drac > 6", rough=True), study=with_ranges(STUDY))
-    _, values = parse_question(speed_question(reported(joint)))
+    values = speed_values(reported(joint))
     assert not [limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))]
-    assert (values["unsafe"], values["quick"]) == ("drac > 6", True)
+    assert (values["unsafe"], values["quick"]) == (Unsafe.parse("drac > 6"), True)
     sheet = sheet_with(joint, speed=speed_of(study=joint.study))
     assert "these values: brake actuator delay 0.2 s; detection range of the sensors 40 m;" in sheet
     # Nobody asks where there is no speed, or nothing to work by.
-    assert not speed_question(reported(replace(answer_of(), study=read_study("r13h"))))
-    assert not speed_question(reported(answer_of(box=False)))
+    assert not speed_values(reported(replace(answer_of(), study=read_study("r13h"))))
+    assert not speed_values(reported(answer_of(box=False)))
 
 
 def sheet_of_shipped(name: str) -> str:
@@ -302,7 +300,7 @@ def sheet_of_shipped(name: str) -> str:
         row = (scope_of(in_ranges), False, "A child is hit. " * 20, {}, None)
         limits.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
     own = replace(limits, study=study)
-    has_speed = speed_question(reported(own))
+    has_speed = speed_values(reported(own))
     return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))
 
 

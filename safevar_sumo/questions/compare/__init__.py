@@ -16,9 +16,9 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import about
-from safevar_sumo.metrics import RATING_POINTS, Unsafe, unsafe as criteria
+from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Count, Criterion, LimitTexts, Margin, question
+from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare.differences import (
     BOTH,
@@ -48,6 +48,7 @@ from safevar_sumo.questions.compare.settings import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import check_margin, distance_to_keep
+from safevar_sumo.questions.options import Count, Criterion, LimitTexts, Margin
 from safevar_sumo.questions.pairs import (
     ENDS,
     SETTING_COLUMNS,
@@ -227,27 +228,21 @@ def _criteria(
     subjects: Sequence[Subject],
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
-    unsafe: str | None,
+    unsafe: Unsafe | None,
     margin: float | None,
 ) -> list[Unsafe]:
     """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its
     bodies touch.
     """
     # The stated criterion, a distance to keep, or what results suggest.
-    stated = criteria.COLLISION if unsafe is None and margin is not None else unsafe
-    criterion = (
-        _default_criterion(subjects, evaluators, originals)
-        if stated is None
-        else evaluators[0].parse_criterion(stated)
-    )
+    stated = Unsafe() if unsafe is None and margin is not None else unsafe
+    criterion = stated or _default_criterion(subjects, evaluators, originals)
     check_margin(criterion, margin)
     if criterion.is_collision and (margin is not None or unsafe is None):
         criterion = replace(
             criterion, keep=max(distance_to_keep(side.study, margin) for side in evaluators)
         )
-    return [
-        replace(side.parse_criterion(criterion), contact=side.system.contact) for side in evaluators
-    ]
+    return [replace(side.checked(criterion), contact=side.system.contact) for side in evaluators]
 
 
 def _default_criterion(

@@ -95,7 +95,7 @@ def gather_failures(
     subject: Subject,
     evaluator: Evaluator,
     solutions: Sequence[str],
-    criterion: Unsafe | str | None,
+    criterion: Unsafe | None,
     fits: int,
 ) -> Population:
     """Evaluate all solutions of results, or settings drawn from a study's whole domain, a tenth of
@@ -107,7 +107,6 @@ def gather_failures(
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
     # Settings of the study's domain, or solutions of the results.
-    stated = None if criterion is None else evaluator.parse_criterion(criterion)
     named = [SolutionId.parse(text) for text in solutions]
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
@@ -123,7 +122,7 @@ def gather_failures(
 
     # All are simulated here, and judged by one criterion.
     evaluations = evaluator.evaluate(candidates.settings, TO_EXPLAIN)
-    unsafe = stated or Unsafe.default_among(evaluations, original)
+    unsafe = criterion or Unsafe.default_among(evaluations, original)
     names = candidates.names
 
     # Settings without a valid encounter do not count.

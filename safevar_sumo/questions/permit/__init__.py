@@ -12,10 +12,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.metrics.unsafe import COLLISION
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import (
+from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import budget_of
+from safevar_sumo.questions.models import keeping_distance, models_of
+from safevar_sumo.questions.options import (
     CARS_FILE,
     Criterion,
     Fits,
@@ -23,12 +28,7 @@ from safevar_sumo.questions.ask import (
     Margin,
     Range,
     ValueTexts,
-    question,
 )
-from safevar_sumo.questions.case import Subject
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import budget_of
-from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of
@@ -125,10 +125,7 @@ def permit(
     _check_forms(cars, set, limits, out)
     fleet = read_cars(study, cars, set, limits, others, ignore)
     criterion = keeping_distance(
-        evaluator,
-        evaluator.parse_criterion(COLLISION if unsafe is None else unsafe),
-        margin,
-        is_stated=unsafe is not None,
+        evaluator, evaluator.checked(unsafe or Unsafe()), margin, is_stated=unsafe is not None
     )
     models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.

@@ -22,17 +22,17 @@ import tomli_w
 
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import F_SAFE, margin_of
-from safevar_sumo.metrics.unsafe import COLLISION
+from safevar_sumo.metrics import F_SAFE, Unsafe, margin_of
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Criterion, Fits, LimitTexts, Margin, question
+from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.causes import find_cause_limits, find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import Models, check_margin, fit_names, models_of
+from safevar_sumo.questions.options import Criterion, Fits, LimitTexts, Margin
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
@@ -184,7 +184,7 @@ def repair(
             legal = "--quick without --out, or --out without --quick"
             raise InputError("quick", f"a rough repair is not written to {out}", legal)
         _check_file(Path(out), study)
-    criterion = evaluator.parse_criterion(COLLISION if unsafe is None else unsafe)
+    criterion = evaluator.checked(unsafe or Unsafe())
     check_margin(criterion, margin)
     keep = margin_of(study, margin) if unsafe is None or margin is not None else 0.0
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)

@@ -13,7 +13,6 @@ import pandas as pd
 
 from safevar_sumo.errors import check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
-from safevar_sumo.questions.ask import Fraction, Jobs, Range, options_of
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -22,6 +21,7 @@ from safevar_sumo.questions.case import (
     load_cases,
     solutions_for_metric,
 )
+from safevar_sumo.questions.options import Fraction, Jobs, Range, options_of
 from safevar_sumo.questions.research_questions import changes
 from safevar_sumo.questions.research_questions.budgets import DRAWN, within_budgets
 from safevar_sumo.questions.research_questions.comparisons import (

@@ -53,7 +53,7 @@ class Asked(NamedTuple):
     limits: dict[str, Limit]
     unsafe: Unsafe
     original: Evaluations
-    criterion: str | None
+    criterion: Unsafe | None
     margin: float | None
     fits: int | None
     budget: int

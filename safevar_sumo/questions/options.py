@@ -1,0 +1,202 @@
+"""Options of functions: their types, ranges, defaults and meanings, as signatures and docstrings
+have them.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+
+from safevar_sumo.errors import MAX_JOBS, InputError, check_text
+from safevar_sumo.metrics import Unsafe
+
+
+class Range(NamedTuple):
+    """The range of a number; `is_open` leaves out its ends."""
+
+    low: float
+    high: float
+    is_open: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        assert isinstance(value, Real)
+        number = float(value)
+        return self.low < number < self.high if self.is_open else self.low <= number <= self.high
+
+    def __str__(self) -> str:
+        before, between = ("between", "and") if self.is_open else ("from", "to")
+        ends = [
+            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)
+        ]
+        return f"{before} {ends[0]} {between} {ends[1]}"
+
+
+Count = Annotated[int, Range(1, 100_000_000)]
+"""A number of vehicles, solutions or attempts."""
+Fraction = Annotated[float, Range(0, 1, is_open=True)]
+"""A share such as a confidence."""
+Margin = Annotated[float | None, Range(0, 100)]
+"""A distance to keep from a collision [m]."""
+CRITERION = '"METRIC < X"|collision|below=X|points=X'
+Criterion = Annotated[Unsafe | None, CRITERION]
+"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
+metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
+setting collides, else half of the original's safety degree; of a rated study, any point lost.
+"""
+CARS_FILE = "FILE.csv"
+"""A list of cars: its path, or in the library also a DataFrame or a mapping."""
+LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']
+"""Limits of characteristics."""
+ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
+"""Values of characteristics."""
+Fits = Annotated[int | None, Range(0, 1000)]
+"""A number of parameter sets; None for all."""
+PointName = Annotated[str | None, "NAME"]
+"""A test, or a point, of a study's matrix."""
+UpTo = Annotated[str | None, "NAME=V"]
+"""A value at which an axis ends."""
+Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
+"""A number of worker processes."""
+Cluster = Annotated[str | None, "ADDRESS"]
+"""The address of a Dask scheduler."""
+UP_TO = "up_to"
+"""The option that cuts an axis."""
+Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
+"""The largest number of simulations."""
+COMMON_OPTIONS = (
+    ("point", PointName, None, "Only this test, or this point, of the study's matrix."),
+    (
+        "ranges",
+        bool,
+        False,
+        "Any encounter in the ranges of the study's axes, not the tests alone.",
+    ),
+    ("up_to", UpTo, None, "Only encounters up to this value of an axis, such as speed=40."),
+    ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
+    ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
+    (
+        *("simulations", Simulations, None),
+        (
+            "At most so many simulations: a rough answer where more are usual. By default, as many"
+            " as take 15 minutes where a simulation takes long."
+        ),
+    ),
+    ("pool", Any, None, "Pool that simulates; by default new worker processes."),
+    (
+        "progress",
+        Any,
+        False,
+        "True for a bar on the terminal, or a function of a phase, the number of simulations done,"
+        " and their total.",
+    ),
+    (
+        *("as_it_is_now", bool, False),
+        (
+            "If results were computed with other files or versions, simulate with the present ones"
+            " and say so."
+        ),
+    ),
+    (
+        *("fresh", bool, False),
+        "Simulate everything anew, instead of reading what earlier commands have simulated.",
+    ),
+)
+"""Options that every question has: name, type, default, and meaning."""
+
+
+def flag_of(name: str) -> str:
+    """The flag of an option."""
+    return f"--{name.replace('_', '-')}"
+
+
+class Option(NamedTuple):
+    """An option of a function: the type of a value, its range, choices or the form of its text, its
+    default and its meaning.
+    """
+
+    name: str
+    kind: type
+    limits: Range | None
+    choices: tuple[str, ...]
+    metavar: str | None
+    is_repeated: bool
+    default: Any
+    meaning: str
+
+    @property
+    def flag(self) -> str:
+        return flag_of(self.name)
+
+    def check(self, value: Any) -> Any:
+        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE, a criterion as
+        `Unsafe`; refuses what has another type or is outside the range.
+        """
+        # A table NAME=VALUE, a text, or several.
+        if self.is_repeated:
+            if isinstance(value, Mapping):
+                value = [f"{name}={inner}" for name, inner in value.items()]
+            values = (value,) if isinstance(value, str) else tuple(value)
+            if twice := next((text for text in values if values.count(text) > 1), None):
+                raise InputError(self.name, f"{twice!r} is given twice", "each value once")
+            return values
+        is_object = self.metavar == CARS_FILE and not isinstance(value, str)
+        if value is None or is_object or self.kind is bool:
+            return value
+        if self.metavar == CRITERION:
+            return Unsafe.parse(value)
+        if self.kind not in (int, float):
+            return check_text(self.name, value)
+
+        # A number within its limits.
+        number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
+        words = f"{words} {self.limits}" if self.limits else words
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, number)
+            or (self.limits and value not in self.limits)
+        ):
+            raise InputError(self.name, repr(value), words)
+        return value
+
+
+SIMULATIONS = Option(
+    "simulations", int, get_args(Simulations)[1], (), None, False, None, "the largest number"
+)
+"""The option that questions on pages and in packs have, too."""
+
+
+def options_of(function: Callable[..., Any]) -> list[Option]:
+    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring
+    describe them.
+    """
+    pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
+    texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
+    names = inspect.unwrap(function).__globals__
+    options = []
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.kind is parameter.KEYWORD_ONLY:
+            hint = parameter.annotation  # a text where the module postpones annotations
+            meaning = " ".join(texts.get(parameter.name, "").split())
+            options.append(
+                _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
+            )
+    return options
+
+
+def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
+    limits = None
+    metavar = None
+    if get_origin(hint) is Annotated:
+        hint, extra = get_args(hint)
+        limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
+    is_repeated = any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
+    kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
+    kind = str if is_repeated or not kinds else kinds[0]
+    choices = get_args(hint) if get_origin(hint) is Literal else ()
+    return Option(
+        parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
+    )

@@ -1,0 +1,123 @@
+"""Questions of pages and packs: read from their texts, completed, and answered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from shlex import quote, split
+from typing import Any
+
+from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.ask import QUICK, Question, find_question
+from safevar_sumo.questions.case import Case
+from safevar_sumo.questions.options import CRITERION, SIMULATIONS
+from safevar_sumo.records import JsonObject
+from safevar_sumo.terminal import Progress
+
+
+def parse_question(text: str) -> tuple[Question, JsonObject]:
+    """A question and values of its options, from its command without subjects: `risk --samples
+    4000`.
+
+    Raises
+    ------
+    InputError
+        If there is no such question or option, or a value is not allowed.
+    """
+    # The question's name.
+    try:
+        name, *words = split(text)
+    except ValueError:  # nothing, or a quotation mark without its second one
+        raise InputError(
+            "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
+        ) from None
+    asked = find_question(name)
+
+    # Options, each with its value.
+    values = dict[str, Any]()
+    waiting = iter(words)
+    options = {option.flag: option for option in (*asked.options, SIMULATIONS)}
+    for flag in waiting:
+        check_name("ask", f"{name} has no option {flag!r}", flag, options)
+        option = options[flag]
+        if option.name in values and not option.is_repeated:
+            raise InputError(f"ask: {name} {flag}", "is given twice", "it once")
+        value = option.kind is bool or next(waiting, None)
+        try:
+            value = value if option.kind is bool else option.kind(value)
+        except (TypeError, ValueError):
+            raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
+        values[option.name] = option.check(
+            (*values.get(option.name, ()), value) if option.is_repeated else value
+        )
+    return asked, values
+
+
+def takes_criterion(question: Question) -> bool:
+    """Whether it is asked by a criterion."""
+    return any(option.metavar == CRITERION for option in question.options)
+
+
+def with_criterion(text: str, unsafe: Unsafe | None) -> str:
+    """A question with a criterion, if it takes one and states none."""
+    question, values = parse_question(text)
+    is_given = unsafe is not None and takes_criterion(question) and "unsafe" not in values
+    return f"{text} --unsafe {quote(str(unsafe))}" if is_given else text
+
+
+def completed(
+    question: Question, values: JsonObject, unsafe: Unsafe | None, part: int | None, *, quick: bool
+) -> JsonObject:
+    """Values of a question with what it does not state itself: a criterion, its part of the
+    simulations, and whether its answer is rough.
+    """
+    usual: JsonObject = {SIMULATIONS.name: part}
+    if unsafe is not None and takes_criterion(question):
+        usual["unsafe"] = unsafe
+    if quick and question.has_rough_answer:
+        usual[QUICK] = True
+    return usual | values
+
+
+def answer_about(
+    question: Question,
+    values: JsonObject,
+    cases: Sequence[Case],
+    directories: Sequence[Path],
+    point: str | None,
+    jobs: int | None,
+    progress: Progress,
+    *,
+    is_asked: bool,
+    as_it_is_now: bool = False,
+    pool: Pool | None = None,
+    questions: int = 1,
+) -> Answer:
+    """The answer to a question about results; if nobody asked for it and it has none, the reason.
+
+    Raises
+    ------
+    InputError
+        If the question is asked for and has no answer, or is about another number of results.
+    """
+    own = {name: value for name, value in values.items() if name != SIMULATIONS.name}
+    how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool, "questions": questions}
+    how |= {"jobs": jobs, "simulations": values.get(SIMULATIONS.name)}
+    try:
+        if len(question.others) + 1 != len(cases):
+            expected = f"{len(question.others) + 1} results directories"
+            problem = f"{question.name} cannot be asked about {len(cases)}"
+            raise InputError("ask", problem, expected)
+        command = question.command_line([*map(str, directories)], {"point": point}, own)
+        answer = question.answer(cases, own, **how, progress=progress)
+    except InputError as error:
+        if is_asked:
+            raise
+        verdict = f"No answer: {error.problem}; expected: {error.legal}."
+        study = cases[0].study
+        return Answer(question=question.name, study=study, verdict=verdict, numbers={}, tables={})
+    return replace(answer, command=command + answer.command)
