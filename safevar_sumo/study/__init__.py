@@ -22,19 +22,13 @@ from safevar_sumo.study.encounters import (
     as_axes as as_axes,
     axis_of as axis_of,
 )
+from safevar_sumo.study.extending import StudyTables as StudyTables
 from safevar_sumo.study.file import (
     SCHEMA_LINE as SCHEMA_LINE,
-    StudyTables as StudyTables,
     checked_study as checked_study,
-    data_files as data_files,
-    fmus_of as fmus_of,
     plain_values as plain_values,
     read_tables as read_tables,
     study_names as study_names,
-    user_code as user_code,
-    user_code_names as user_code_names,
-    user_modules as user_modules,
-    without_skipping as without_skipping,
     write_study as write_study,
 )
 from safevar_sumo.study.marks import (
@@ -64,5 +58,13 @@ from safevar_sumo.study.schema import (
     label_of as label_of,
     locate_parameter as locate_parameter,
     tables_of as tables_of,
+)
+from safevar_sumo.study.user_files import (
+    data_files as data_files,
+    fmus_of as fmus_of,
+    user_code as user_code,
+    user_code_names as user_code_names,
+    user_modules as user_modules,
+    without_skipping as without_skipping,
 )
 from safevar_sumo.study.validation import convert_table as convert_table

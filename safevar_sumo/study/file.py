@@ -1,6 +1,4 @@
-"""Strict reading of study files, with the studies that they extend; writing of study files; and the
-names of the user code and FMUs of a study.
-"""
+"""Strict reading of study files, with the studies that they extend; writing of study files."""
 
 from __future__ import annotations
 
@@ -9,7 +7,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import tomli_w
@@ -19,21 +17,11 @@ from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.encounters import Parameters
-from safevar_sumo.study.marks import (
-    OF_MATRIX,
-    OF_SCENARIO,
-    OF_STUDY,
-    OF_SYSTEM,
-    OF_VEHICLE_AND_ADS,
-    PART_OF_SYSTEM,
-    WHOLE,
-    keys_with,
-)
-from safevar_sumo.study.scenario_file import MODEL, WEATHER, files_of_scenario, with_file
+from safevar_sumo.study.extending import StudyTables, with_overrides
+from safevar_sumo.study.scenario_file import with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     OBJECTIVES,
-    PYMOO,
     Origin,
     RepairTable,
     SearchTable,
@@ -66,17 +54,6 @@ ENDED_STUDIES = {
     "alks_joint_following": "alks at --point following",
 }
 """Shipped studies that are a part of another one now."""
-
-
-class StudyTables(NamedTuple):
-    """The tables of a study before they are checked, with its source in errors, its origin, and
-    remarks for the user on what they do not inherit.
-    """
-
-    source: object
-    tables: Parameters
-    origin: Origin = Origin()
-    remarks: tuple[str, ...] = ()
 
 
 def study_names() -> list[str]:
@@ -118,7 +95,7 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
         raw = raw._replace(tables={**raw.tables, "encounters": changes.pop("encounters")})
     if changes:
         arguments = ", ".join(f"{name}=..." for name in changes)
-        raw = _with_overrides(raw, plain_values(changes), f"{raw.source} with {arguments}")
+        raw = with_overrides(raw, plain_values(changes), f"{raw.source} with {arguments}")
     with about(raw.source):
         if "origin" in raw.tables:
             raise InputError("", "origin: there is no such key")
@@ -280,7 +257,7 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
 
     # This study's tables over those of its base.
     base_study = _read_file(base_path, (*visited_paths, path))
-    merged_study = _with_overrides(base_study, tables, raw.source)
+    merged_study = with_overrides(base_study, tables, raw.source)
 
     # Where both come from.
     folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
@@ -290,116 +267,6 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
     files = (*raw.origin.files, *base_study.origin.files)
     return merged_study._replace(
         origin=Origin(called=raw.origin.called, places=folders, files=files), remarks=remarks
-    )
-
-
-def _with_overrides(base: StudyTables, overrides: Tables, source: object) -> StudyTables:
-    """Override a study's tables, but for those that the new study does not inherit: their marks in
-    the records say when; of another weather not the axes of its parameters.
-    """
-    # Keys about this one study, and keys about its scenario, if the overrides name another one.
-    left_out = {*keys_with(OF_STUDY, Study)}
-    if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
-        left_out.update(keys_with(OF_SCENARIO, Study))
-    inherited = {key: value for key, value in base.tables.items() if key not in left_out}
-    scenario = inherited.get("scenario")
-    if isinstance(scenario, dict) and "over" in scenario:
-        inherited["scenario"] = _with_axes_for(overrides, scenario)
-    tables = _merge(inherited, overrides)
-
-    # Keys about the parts of the system that differ now.
-    parts = [
-        key
-        for key in keys_with(PART_OF_SYSTEM, Study)
-        if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
-    ]
-    marks = [OF_SYSTEM] if parts else []
-    marks += [OF_VEHICLE_AND_ADS] if {"vehicle", "ads"} & {*parts} else []
-    marks += [OF_MATRIX] if "matrix" in parts else []
-    for key in {key for mark in marks for key in keys_with(mark, Study)} - overrides.keys():
-        tables.pop(key, None)
-
-    # A study without a title of its own is called by its name.
-    if parts or base.tables.get("title", "") == base.tables.get("name"):
-        tables["title"] = overrides.get("title", tables.get("name", ""))
-    remarks = base.remarks
-    dropped = [
-        f"[{key}]"
-        for key, value in base.tables.items()
-        if isinstance(value, dict)
-        and key not in {*tables, *keys_with(OF_STUDY, Study)}  # which no study inherits
-    ]
-    lost = _set_in(base.tables.get("scenario")) - _set_in(tables.get("scenario"))
-    dropped += [f"{name} of [scenario]" for name in sorted(lost)]
-    if parts and dropped:
-        differences = " and a different ".join("ADS" if key == "ads" else key for key in parts)
-        of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
-        remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
-    return StudyTables(source, tables, base.origin, remarks)
-
-
-def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
-    """A table [scenario] that a study inherits: of another weather without the axes of its
-    parameters, and for the cells of a protocol, which are fixed, without any.
-    """
-    matrix = overrides.get("matrix")
-    if isinstance(matrix, dict) and matrix.get("protocol"):
-        return {key: value for key, value in scenario.items() if key not in ("over", "margin")}
-    names = scenario["over"].keys() - (WEATHER if "weather" in overrides else ())
-    return {
-        **scenario,
-        "over": {name: scenario["over"][name] for name in scenario["over"] if name in names},
-    }
-
-
-def _names_scenario(table: object, base_table: object) -> bool:
-    """Whether a table [scenario] names a file or another model than that of its base, whose matrix
-    is not about it.
-    """
-    if not isinstance(table, dict):
-        return False
-    base_model = base_table.get("model") if isinstance(base_table, dict) else None
-    return "file" in table or table.get("model", base_model) != base_model
-
-
-def _set_in(scenario: object) -> set[str]:
-    """The parameters that a table [scenario] sets or searches."""
-    inner_tables = scenario.values() if isinstance(scenario, dict) else ()
-    return {name for table in inner_tables if isinstance(table, dict) for name in table}
-
-
-def _model_and_network(table: object) -> object:
-    """The model and network that a table names; instead of a model, a weather or matrix itself."""
-    if not isinstance(table, dict):
-        return table
-    parameters = table.get("parameters")
-    return table.get("model", table), (
-        parameters.get("network") if isinstance(parameters, dict) else None
-    )
-
-
-def _merge(base: Tables, overrides: Tables) -> Parameters:
-    """Override `base` by `overrides`; another `model` or `distribution`, and the tables
-    that are inherited as a whole, replace a whole table; false in place of a table leaves it out.
-    """
-    result = dict(base)
-    for key, value in overrides.items():
-        if value is False and isinstance(result.get(key), dict):
-            del result[key]
-            continue
-        result[key] = _merge(base[key], value) if _refines(key, base.get(key), value) else value
-    return result
-
-
-def _refines(key: str, base_value: object, override: object) -> bool:
-    """Whether an override changes single keys of the table that it overrides."""
-    if key in keys_with(WHOLE, Study) or not (
-        isinstance(base_value, dict) and isinstance(override, dict)
-    ):
-        return False
-    return all(
-        override.get(choice, base_value.get(choice)) == base_value.get(choice)
-        for choice in ("model", "distribution")
     )
 
 
@@ -428,82 +295,3 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     )
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
-
-
-def user_code_names(study: Study) -> list[str]:
-    """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
-    return [f"{key} = {name!r}" for key, name in (*user_code(study), *fmus_of(study))]
-
-
-def without_skipping(study: Study) -> Study:
-    """A study that stops where its simulator fails."""
-    search = msgspec.structs.replace(study.search, failed="stop")
-    return msgspec.structs.replace(study, search=search)
-
-
-def fmus_of(study: Study) -> list[tuple[str, str]]:
-    """Key and path of a study's FMU."""
-    return [("ads.model", study.ads.model)] if study.ads.kind == "fmu" else []
-
-
-def user_modules(study: Study) -> list[str]:
-    """The modules of a study's user code."""
-    return sorted({name.partition(":")[0] for _, name in user_code(study)})
-
-
-def user_code(study: Study) -> list[tuple[str, str]]:
-    """Keys and names of a study's user code."""
-    tests = [test.model for test in study.tests]
-    names_by_key = {
-        "vehicle.model": [study.vehicle.model],
-        "ads.model": [study.ads.model],
-        "scenario.model": [study.scenario.model, *tests],
-        "metrics.also": study.metrics.also,
-        "search.objectives": study.search.objectives,
-        "search.algorithms": [
-            name for name in study.search.algorithms if not name.startswith(PYMOO)
-        ],
-    }
-    fmus = fmus_of(study)
-    return [
-        (key, name)
-        for key, names in names_by_key.items()
-        for name in dict.fromkeys(names)
-        if ":" in name and (key, name) not in fmus
-    ]
-
-
-def data_files(study: Study) -> dict[str, str]:
-    """The paths of the data files and folders that a study names, by their names.
-
-    Raises
-    ------
-    InputError
-        If one of them does not exist.
-    """
-    places = study.origin.places or (os.getcwd(),)
-    paths = {}
-
-    # Each file or folder beside the study.
-    for key, table in (
-        ("vehicle", study.vehicle),
-        ("ads", study.ads),
-        ("scenario", study.scenario),
-    ):
-        for name in table.files:
-            found = [
-                os.path.abspath(path) for place in places if (path := Path(place, name)).exists()
-            ]
-            if not found:
-                problem = f"{key}.files: there is no file {name!r}"
-                raise InputError(
-                    study.source, problem, f"the path of a file or folder, relative to {places[0]}"
-                )
-            paths[name] = found[0]
-
-    # Files of OpenSCENARIO, at every point of the matrix.
-    if study.scenario.model == MODEL:
-        tests = study.tests
-        with about(study.source):
-            paths |= files_of_scenario(study.scenario.parameters, tests, study.origin.places)
-    return paths
