@@ -10,7 +10,7 @@ from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campaign
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
-from safevar_sumo.questions.research_questions.fronts import few_evaluations_in_words
+from safevar_sumo.questions.research_questions.fronts import why_few_evaluations
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.study import Study, StudyLike
 from safevar_sumo.sumo import Engine
@@ -99,7 +99,7 @@ def run(
             retry_failed=retry_failed,
         )
     results = load(directory)
-    if remark := few_evaluations_in_words(results.case):
+    if remark := why_few_evaluations(results.case):
         warn(remark)
     return results
 

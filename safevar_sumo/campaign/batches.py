@@ -8,13 +8,10 @@ import hashlib
 import math
 import platform
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
-import platformdirs
 
 from safevar_sumo.ads import PerVehicleAds
 from safevar_sumo.campaign.cache import (
@@ -32,29 +29,25 @@ from safevar_sumo.campaign.evaluation import (
     carry_out,
     evaluate_settings,
     repeat_first_batch,
-    reproduction_command,
     system_of,
     verify_settings,
 )
 from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
-from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.share import MAX_SKIPPED
+from safevar_sumo.campaign.user_checks import check_code
 from safevar_sumo.errors import InputError, UserCodeError, warn
-from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
-from safevar_sumo.plugins.process import REPRODUCED_BY
+from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
-from safevar_sumo.results import identity_digest
-from safevar_sumo.study import Study, user_code_names, without_skipping
+from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import needs_no_sumo, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
-from safevar_sumo.sumo.kept import number_simulated
-from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
-from safevar_sumo.vehicles import VEHICLES, Vehicle, region_of
+from safevar_sumo.vehicles import VEHICLES, Vehicle
 
 if TYPE_CHECKING:
-    from safevar_sumo.check import Finding
+    pass
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
@@ -70,8 +63,6 @@ SMALL_PORTION = 256
 """That number where vehicles take turns or SUMO itself simulates, so that each costs time."""
 COMPILING = "compiling the vehicle model, for the first time"
 """The phase of progress in which one worker compiles, and no simulation has begun."""
-SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
-"""What is expected of a simulator in another process."""
 ECONOMICAL_FRACTION = 1 / 4
 """Fraction of the most economical batch size from which on the steps of a simulation cost no more
 than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
@@ -348,103 +339,3 @@ def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lam
 
 def _why_no_verdict(task: Task) -> str:
     return why_no_verdict(system_of(task.study)) or ""
-
-
-def check_code(study: Study, pool: Pool) -> Use:
-    """Check the user code of a study in a worker, unless it has passed before with the same files;
-    returns what it used there. Where the number of simulations is limited, the check takes at most
-    a tenth of them.
-
-    Raises
-    ------
-    UserCodeError
-        With file, line and advice of the first finding that makes results wrong.
-    """
-    if not user_code_names(study):
-        return Use({}, [])
-    digest = identity_digest(manifest_now(study, system_of(study)))
-    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
-    with suppress(OSError, msgspec.MsgspecError):
-        known = msgspec.json.decode(marker.read_bytes(), type=Use)
-        if known.modules == digests_by_name(known.modules, study.origin.places):
-            return known
-    job = Task(study=study), None if pool.spare is None else pool.spare[0]
-    use: Use
-    ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
-    if pool.spare is not None:
-        return use
-    with suppress(OSError):  # without the marker, the next process checks again
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.write_bytes(msgspec.json.encode(use))
-    return use
-
-
-def repeat_elsewhere(study: Study, pool: Pool) -> None:
-    """Simulate three settings in two processes, in one of them with the points in another order.
-
-    Raises
-    ------
-    UserCodeError
-        If a result differs.
-    """
-    system = system_of(study)
-    rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
-    backwards = Selection(points=tuple(range(len(system.matrix)))[::-1])
-    jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
-    if pool.workers > 1:  # the second one has simulated nothing yet
-        here, there = carry_out(evaluate_settings, jobs, pool)
-    else:
-        (here,) = carry_out(evaluate_settings, jobs[:1], pool)
-        pool.close()  # its worker starts again
-        (there,) = carry_out(evaluate_settings, jobs[1:], pool)
-    for row, difference in differences(there.results, here.results):
-        command = reproduction_command(study, rows[row])
-        problem = f"{difference} in another process, or with points in another order"
-        raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
-
-
-def random_settings(study: Study, *shape: int) -> FloatArray:
-    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
-    region = region_of(study)
-    characteristics = region.characteristics
-    rng = np.random.default_rng(study.search.seed)
-
-    def draw(count: int) -> FloatArray:
-        return rng.uniform(
-            characteristics.lower, characteristics.upper, (count, len(characteristics))
-        )
-
-    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))
-
-
-def find_in_new_process(study: Study) -> list[Finding]:
-    """What a simulator of the user's own returns otherwise in a new process, for the original and
-    for both ends of the domains; nothing if the study says that it is not deterministic.
-    """
-    study = without_skipping(study)
-    system = system_of(study)
-    if system.mover.is_exact or system.repeats > 1:
-        return []
-    members = system.characteristics
-    settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
-    with open_pool(1) as pool:  # first, as a simulator may end its process
-        (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(replace(system, matrix=system.matrix[::-1]), settings)
-    for row, difference in differences(here.results, there.results):
-        from safevar_sumo.check import Finding  # slow to import, and rarely needed
-
-        words = f"{difference} in a new process"
-        command = reproduction_command(study, settings[row])
-        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
-    return []
-
-
-def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
-    """What user code uses in its check, and the number of simulations in a simulator."""
-    from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
-
-    unload_user_modules()
-    before = number_simulated()
-    with record_use(task.study.origin.places) as use:
-        refuse_defects(task.study, most)
-    return use, number_simulated() - before

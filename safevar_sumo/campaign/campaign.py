@@ -15,13 +15,7 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.ads import PerVehicleAds
-from safevar_sumo.campaign.batches import (
-    ask_why_no_verdict,
-    check_code,
-    compile_vehicle,
-    random_settings,
-    repeat_elsewhere,
-)
+from safevar_sumo.campaign.batches import ask_why_no_verdict, compile_vehicle
 from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
@@ -40,6 +34,7 @@ from safevar_sumo.campaign.runs import (
     all_runs,
 )
 from safevar_sumo.campaign.share import Share, carry_share
+from safevar_sumo.campaign.user_checks import check_code, random_settings, repeat_elsewhere
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.records import Evaluations, JsonObject

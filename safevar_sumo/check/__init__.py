@@ -8,12 +8,12 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.check.trials import FailedCheck, try_algorithm, try_simulations
+from safevar_sumo.check.trials import Finding, try_algorithm, try_simulations
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
@@ -60,23 +60,6 @@ CHECKS: Mapping[str, str] = {
 """The checks, with advice on a failure. All but the last three, of which every answer itself warns,
 also keep a study from starting.
 """
-
-
-class Finding(NamedTuple):
-    """A failed check: its name and the wrong result, the place of the user code, the input that
-    shows it, and what is expected.
-    """
-
-    check: str
-    finding: str
-    where: str
-    input: str
-    expected: str
-
-    def __str__(self) -> str:
-        """The finding with its input and place on one line."""
-        place = "" if self.where in self.finding else f" ({self.where})"
-        return f"{self.check}: {self.finding}{f', with {self.input}' if self.input else ''}{place}"
 
 
 def study_to_check(name: str) -> Study:
@@ -154,19 +137,19 @@ def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
 
 
 def _first_defect(
-    study: Study, names: Mapping[str, str], failures: Iterator[FailedCheck]
+    study: Study, names: Mapping[str, str], findings: Iterator[Finding]
 ) -> Iterator[Finding]:
-    """The first of the failures of user code, or the error that it raises; `names` are its names by
-    their keys.
+    """The first of the findings about user code, or the error that it raises; `names` are its names
+    by their keys.
     """
     where = (
         " or ".join(_definition(study, key, name) for key, name in names.items()) or study.source
     )
     try:
         with about(study.source), np.errstate(all="ignore"):
-            failure = next(failures, None)
-        if failure is not None:
-            yield Finding(failure.check, failure.got, where, failure.input, failure.expected)
+            finding = next(findings, None)
+        if finding is not None:
+            yield finding._replace(where=where)
     except UserCodeError as error:
         yield Finding(
             "contract", error.problem, error.place or where, "", error.legal or "no exception"

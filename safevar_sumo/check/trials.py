@@ -52,13 +52,21 @@ MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 _Rows = IntArray
 
 
-class FailedCheck(NamedTuple):
-    """A failed check: the actual result, the expected one, and the input that shows it."""
+class Finding(NamedTuple):
+    """A failed check: its name and the wrong result, the place of the user code, which a trial does
+    not know, the input that shows it, and what is expected.
+    """
 
     check: str
-    got: str
+    finding: str
+    where: str
+    input: str
     expected: str
-    input: str = ""
+
+    def __str__(self) -> str:
+        """The finding with its input and place on one line."""
+        place = "" if self.where in self.finding else f" ({self.where})"
+        return f"{self.check}: {self.finding}{f', with {self.input}' if self.input else ''}{place}"
 
 
 class Extent(NamedTuple):
@@ -79,7 +87,7 @@ def try_simulations(
     progress: Progress = show_no_progress,
     tell: Callable[[Extent], None] = lambda extent: None,
     most: int | None = None,
-) -> Iterator[FailedCheck]:
+) -> Iterator[Finding]:
     """Simulate a study with the original vehicle, the corners of the domains and random settings:
     so many `vehicles`, by default as many as the time allows, in a simulator of the user's own with
     at most so many simulations. `tell` is called with their number.
@@ -128,16 +136,16 @@ def try_simulations(
         except InputError as error:
             found, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
-            yield FailedCheck("contract", found, reacts, setting)
+            yield Finding("contract", found, "", setting, reacts)
 
 
-def try_original(system: System, runs: SimulationRuns) -> Iterator[FailedCheck]:
+def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
     """What is wrong in the run of the original vehicle: units of a simulator of the user's own, and
     metrics that change with a quantity that they do not state.
     """
     if not system.mover.is_exact and (contradiction := unit_contradiction(runs.trace)):
         expected = "speeds in m/s, and distances in m"
-        yield FailedCheck("contract", contradiction, expected, "the original vehicle")
+        yield Finding("contract", contradiction, "", "the original vehicle", expected)
     for measure in system.measuring.measures.values():
         if measure.of == "settings":
             continue
@@ -152,7 +160,7 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[FailedCheck]:
             if not np.array_equal(values, others, equal_nan=True):
                 got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
                 expected = f"needs = {(*measure.quantities, quantity)}"
-                yield FailedCheck("contract", got, expected, "the original vehicle")
+                yield Finding("contract", got, "", "the original vehicle", expected)
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
@@ -171,21 +179,18 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     return number, number * seconds
 
 
-def try_algorithm(study: Study, name: str) -> Iterator[FailedCheck]:
+def try_algorithm(study: Study, name: str) -> Iterator[Finding]:
     """Let an algorithm search twice, the second time after another run."""
     outputs = _search(study, name, seeds=(1,))
     repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
-        yield FailedCheck(
-            "repetition",
-            f"{len(repeated)} settings instead of {len(outputs)} in another run",
-            expected,
-        )
+        difference = f"{len(repeated)} settings instead of {len(outputs)} in another run"
+        yield Finding("repetition", difference, "", "", expected)
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
         difference = f"setting {row} is {repeated[row].tolist()} instead of {outputs[row].tolist()}"
-        yield FailedCheck("repetition", f"{difference} in another run", expected)
+        yield Finding("repetition", f"{difference} in another run", "", "", expected)
 
 
 def _try(
@@ -194,7 +199,7 @@ def _try(
     settings: FloatArray,
     progress: Progress,
     expected: str,
-) -> Iterator[FailedCheck]:
+) -> Iterator[Finding]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     # All settings at once, with code that is loaded anew for the other runs.
     run = load()
@@ -220,7 +225,7 @@ def _try(
             {name: values[rows] for name, values in outputs.items()}, other_outputs
         ):
             changes = _changes(characteristics, settings[rows[row]])
-            yield FailedCheck(check, f"{difference} {circumstance}", expected, changes)
+            yield Finding(check, f"{difference} {circumstance}", "", changes, expected)
 
 
 def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:

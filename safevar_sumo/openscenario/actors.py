@@ -216,7 +216,7 @@ class Actor:
         # Where that is along its path and beside it.
         lane = self._follow_lane()
         offset = self._offsets(lane, sample, last, times)
-        distance, left, turn = self._ways(lane, ahead, offset, speed)
+        distance, left, turn = self._places_after(lane, ahead, offset, speed)
         if self.follows is not None:
             distance = self._behind(self.follows, later)
         pose = now.path.pose(distance, left)
@@ -246,7 +246,7 @@ class Actor:
             self.running["sideways"].end = float(np.append(times[sample : last + 1], np.inf)[index])
         return np.broadcast_to(motion.value(passed - motion.since), last - sample)
 
-    def _ways(
+    def _places_after(
         self, lane: FollowedLane | None, ahead: Array, offset: Array, speed: Array
     ) -> tuple[Array, Array, Array]:
         """Distances along the path and to its left after steps that lead so far `ahead` [m], and

@@ -198,9 +198,9 @@ class Question:
         one of so many `questions` that share the time.
         """
         from safevar_sumo.questions.answer import Answer
+        from safevar_sumo.questions.by_criterion import subject_by
         from safevar_sumo.questions.case import Case
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
-        from safevar_sumo.questions.measure import subject_by
 
         # Simulations by the criterion that is asked for.
         study = study_in(subjects[0])

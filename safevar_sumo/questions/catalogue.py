@@ -304,7 +304,7 @@ def check(
         return check_scenario(name, ego or "Ego", FINDINGS)
     # What loads SUMO is imported where it is needed.
     from safevar_sumo.campaign import check_algorithms
-    from safevar_sumo.campaign.batches import find_in_new_process
+    from safevar_sumo.campaign.user_checks import find_in_new_process
     from safevar_sumo.check import CHECKS, check_study, study_to_check
     from safevar_sumo.sumo.system import assemble
 

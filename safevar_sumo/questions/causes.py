@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from enum import StrEnum
-from itertools import combinations, islice, pairwise, takewhile
+from itertools import combinations, islice, takewhile
 from math import comb
 from typing import NamedTuple
 
@@ -19,7 +18,6 @@ import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
-from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.research_questions.statistics import median_interval
@@ -303,111 +301,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     return frame.assign(of_run=[*map(np.median, counts)], of_run_low=low, of_run_high=high)
 
 
-PARTS = (32, 8, 8, 8)
-"""Number of parts into which each round divides what is left of a line from the original to a
-setting. The search finds every unsafe stretch of the line that is as long as the first parts.
-"""
-
-
-COARSE_PARTS = (8, 4, 4)
-"""The same where few simulations are allowed."""
-
-
-def settings_of_line(parts: Sequence[int]) -> int:
-    """How many settings of a line are simulated."""
-    return sum(parts) - len(parts) + 1
-
-
-class BoundaryState(StrEnum):
-    """What lies on a line from the original just below the smallest share of the line that is
-    unsafe.
-    """
-
-    SAFE = "safe"
-    FILTER = "filter threshold"
-    NOT_SIMULATED = "not simulated"
-
-
-class Limits(NamedTuple):
-    """How far the changes of a cause shrink while they stay unsafe and above the filter's
-    thresholds.
-
-    Attributes
-    ----------
-    boundary
-        The values after all changes are multiplied by `fraction`, the smallest factor at which the
-        vehicle is unsafe.
-    single_boundary
-        For each characteristic, the value to which this one can return towards the original while
-        the others stay.
-    fraction
-        The factor.
-    end
-        What lies just below the factor.
-    """
-
-    boundary: NamedValues
-    single_boundary: NamedValues
-    fraction: float
-    end: BoundaryState
-
-
-def find_cause_limits(
-    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
-) -> list[Limits]:
-    """Find the limits of causes."""
-    if not causes:
-        return []
-
-    # What each cause changes.
-    characteristics = evaluator.characteristics
-    settings = settings_of(characteristics, causes)
-    original = characteristics.with_original_vehicle(settings)
-    is_changed = settings != original
-    # A cause has a line on which all its changes are scaled, then a line for each change by itself.
-    groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
-    line_counts = list(map(len, groups))
-    is_scaled = np.concatenate(groups)
-    ends = np.repeat(settings, line_counts, axis=0)
-    original = np.repeat(original, line_counts, axis=0)
-
-    # A line begins where what it scales is as in the original.
-    starts = np.where(is_scaled, original, ends)
-    thresholds = np.divide(
-        characteristics.threshold,
-        np.abs(ends - original),
-        out=np.zeros(ends.shape),
-        where=is_scaled,
-    )
-    number = len(starts) * settings_of_line(PARTS)
-    is_coarse = evaluator.left is not None and evaluator.left < 2 * number
-    parts = COARSE_PARTS if is_coarse else PARTS
-    with evaluator.phases.stage(BOUNDARIES, len(starts) * settings_of_line(parts)):
-        shares, limits, states = _first_unsafe_shares(
-            evaluator, starts, ends, unsafe, thresholds.max(axis=1), parts
-        )
-
-    # The limits of each cause, from its lines.
-    first_lines = np.cumsum([0, *line_counts])
-    return [
-        Limits(
-            boundary=dict(zip(cause.changes, limits[first, flags].tolist(), strict=True)),
-            single_boundary=dict(
-                zip(
-                    cause.changes,
-                    np.diagonal(limits[first + 1 : stop, flags]).tolist(),
-                    strict=True,
-                )
-            ),
-            fraction=float(shares[first]) if cause.changes else 0.0,
-            end=states[first],
-        )
-        for cause, flags, (first, stop) in zip(
-            causes, is_changed, pairwise(first_lines), strict=True
-        )
-    ]
-
-
 def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> FloatArray:
     """The original vehicle with the changes of each of M causes only, in its encounter; shape (M,
     n).
@@ -417,35 +310,3 @@ def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> 
         [values.get(item.name, item.original) for item in characteristics] for values in of_causes
     ]
     return np.array(values).reshape(-1, len(characteristics))
-
-
-def _first_unsafe_shares(
-    evaluator: Evaluator,
-    starts: FloatArray,
-    ends: FloatArray,
-    unsafe: Unsafe,
-    lowest: FloatArray,
-    parts: Sequence[int],
-) -> tuple[FloatArray, FloatArray, list[BoundaryState]]:
-    """The first unsafe share of each of M lines, shape (M,), the setting there, shape (M, n), and
-    what lies just below it.
-
-    A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`,
-    shape (M,), on, and its end must be unsafe. Rounds divide it into `parts`, whose product is
-    16,384 by default. A setting that cannot be simulated is neither safe nor unsafe; just below the
-    share, it gives the state `NOT_SIMULATED`.
-    """
-    # The first unsafe share of each line.
-    found = find_boundaries(
-        starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), parts, lowest
-    )
-
-    # What ends the line on the safe side.
-    is_valid = evaluator.evaluate(found.safe, BOUNDARIES).valid
-    is_at_threshold = (found.safe_shares == lowest) & (lowest > 0)
-    states = np.select(
-        [is_at_threshold, is_valid | (found.safe_shares == lowest)],
-        [BoundaryState.FILTER, BoundaryState.SAFE],
-        BoundaryState.NOT_SIMULATED,
-    )
-    return found.unsafe_shares, found.unsafe, [BoundaryState(state) for state in states]

@@ -57,7 +57,7 @@ def meet_worst_phases(
     and what they leave there by the judge, shape (M,).
 
     `left` is what they leave at phase 0: those that fail there, are not open, or leave more than
-    `NEAR` ways of a step stay.
+    `NEAR` lengths of a step stay.
 
     Notes
     -----
@@ -67,14 +67,14 @@ def meet_worst_phases(
     """
     settings, left = settings.copy(), left.copy()
     is_open = is_open & (left >= 0)
-    ways = _ways(model, settings)
+    steps = _lengths_of_step(model, settings)
 
     # At first a whole step; its end, phase 1, is phase 0 again.
     low, high = np.zeros(len(left)), np.ones(len(left))
     shares = np.arange(1, PARTS)[:, np.newaxis] / PARTS
     for _ in range(ROUNDS):
         # Within a part of a step, a phase can take away a part of the clearance.
-        near = np.flatnonzero(is_open & (left < NEAR * ways * (high - low)))
+        near = np.flatnonzero(is_open & (left < NEAR * steps * (high - low)))
         if not len(near):
             break
 
@@ -93,7 +93,7 @@ def meet_worst_phases(
     return settings, left
 
 
-def _ways(model: Model, settings: FloatArray) -> FloatArray:
+def _lengths_of_step(model: Model, settings: FloatArray) -> FloatArray:
     """The most that each of M vehicles covers in a step at the start of an encounter that counts
     [m], shape (M,); infinite where the limit is of no distance.
     """

@@ -19,8 +19,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
+from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case

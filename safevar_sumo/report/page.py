@@ -23,14 +23,15 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Question
+from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.measure import cases_by
 from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.budget import REPLAYS, SPEED, divided
-from safevar_sumo.report.sections import ReportedStudy, page_commands, replays, tested, trust
+from safevar_sumo.report.replays import page_commands, replays
+from safevar_sumo.report.sections import ReportedStudy, tested, trust
 from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
 from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import choose_handle, read_manifest, write_whole

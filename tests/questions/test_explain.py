@@ -18,14 +18,12 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
+from safevar_sumo.questions.cause_limits import BoundaryState, Limits, find_cause_limits
 from safevar_sumo.questions.causes import (
-    BoundaryState,
-    Limits,
     are_causes,
     causes_of_runs,
     count_distinct_causes,
     count_needed,
-    find_cause_limits,
     find_minimal_causes,
     select_affordable_rows,
 )

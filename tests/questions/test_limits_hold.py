@@ -16,8 +16,8 @@ from scipy.optimize import Bounds, differential_evolution
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.by_criterion import study_by
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.measure import study_by
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.tolerance.together import MAX_SIMULATIONS
 from safevar_sumo.records import FloatArray

@@ -18,9 +18,10 @@ from numpy.random import default_rng
 from safevar_sumo import risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
+from safevar_sumo.questions.indices import OUTPUTS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import STAGE
-from safevar_sumo.questions.risk import OUTPUTS, deciding_in_words
+from safevar_sumo.questions.risk import deciding_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel

@@ -29,7 +29,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.figures import new_figure
-from safevar_sumo.report import sections
+from safevar_sumo.report import replays, sections
 from safevar_sumo.report.page import _picture, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.texts import answer_about, parse_question
@@ -159,7 +159,7 @@ def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
         tables={"causes": pd.DataFrame({"changes": changes}), "others": pd.DataFrame()}
     )
     study = ReportedStudy(directory=slippery, case=case, versions={}, answers=[answer])  # type: ignore[list-item]
-    played = list(sections.replays(study, show_no_progress))
+    played = list(replays.replays(study, show_no_progress))
     names = [
         entry["title"].partition(":")[0] for entry in played if entry["title"].startswith("Only ")
     ]
@@ -264,7 +264,7 @@ def test_a_study_is_carried_out_from_what_its_results_record(
     case: Any = SimpleNamespace(study=study, has_runs=True, solutions=np.empty(0))
     one = ReportedStudy(directory=Path("its results"), case=case, versions={}, answers=[])
     monkeypatch.setattr(ReportedStudy, "choices", {})
-    ((_, command),) = sections.page_commands(one)
+    ((_, command),) = replays.page_commands(one)
     python, option, script = shlex.split(command)
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
@@ -305,7 +305,7 @@ def test_an_answer_that_cannot_be_given_has_no_command() -> None:
     ]
     one = ReportedStudy(directory=Path("it"), case=case, versions={}, answers=missing)
     vars(one)["choices"] = {}
-    assert [*sections.page_commands(one)] == [("The answer rules", "rules it")]
+    assert [*replays.page_commands(one)] == [("The answer rules", "rules it")]
 
 
 @SLOW

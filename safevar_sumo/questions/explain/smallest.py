@@ -14,7 +14,8 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of, settings_of_line
+from safevar_sumo.questions.cause_limits import settings_of_line
+from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import Enumeration, enumerate_causes, staircase
 from safevar_sumo.questions.explain.robustness import robustness_in_words

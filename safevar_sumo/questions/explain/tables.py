@@ -8,14 +8,13 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.cause_limits import Limits, find_cause_limits
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     OTHER_SETS,
     Cause,
-    Limits,
     are_causes,
     directions,
-    find_cause_limits,
     settings_of,
 )
 from safevar_sumo.questions.counterexamples import values_as_printed

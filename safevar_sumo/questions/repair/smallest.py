@@ -37,7 +37,7 @@ times as many, and so on.
 """
 
 
-class Failure(NamedTuple):
+class Counterexample(NamedTuple):
     """A setting, shape (n,), with which a change failed, the number of the problem, of one
     parameter set, and the point; none without a matrix.
     """
@@ -60,7 +60,7 @@ class Search:
         self.problem = problems[0]
         self.settings_of = {0: settings}
         self._thinning = 1 if self.problem.arrays else THINNING
-        self._failures = list[Failure]()
+        self._failures = list[Counterexample]()
         self._best = dict[int, FloatArray]()
         self._least = dict[int, float]()
 
@@ -130,7 +130,7 @@ class Search:
         changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(-1, len(today))
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
-    def _failure_of(self, change: FloatArray) -> Failure | None:
+    def _failure_of(self, change: FloatArray) -> Counterexample | None:
         """The worst failure among the first settings with which a change fails; None if it survives
         all.
         """
@@ -144,7 +144,7 @@ class Search:
                 )
                 worst = int(np.argmin(robustness))
                 if robustness[worst] < 0:
-                    return Failure(
+                    return Counterexample(
                         rows[worst], number, () if points is None else (int(points[worst]),)
                     )
                 start = start + size
@@ -166,7 +166,7 @@ class Search:
                 rows = rows[self._survivors(changes[rows], [failure])]
         return None
 
-    def _survivors(self, changes: FloatArray, failures: Sequence[Failure]) -> IntArray:
+    def _survivors(self, changes: FloatArray, failures: Sequence[Counterexample]) -> IntArray:
         """The rows of the changes that survive the settings of failures at their points; few at a
         time.
         """

@@ -35,7 +35,7 @@ from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     describe_evaluations,
     describe_rules,
-    few_evaluations_in_words,
+    why_few_evaluations,
 )
 from safevar_sumo.questions.research_questions.statistics import ALPHA, fewest_runs
 from safevar_sumo.questions.research_questions.tables import (
@@ -210,7 +210,7 @@ def answer_questions(
         for case in cases
         for remark in (
             *case.remarks,
-            few_evaluations_in_words(case),
+            why_few_evaluations(case),
             describe_runs_without_solutions(case),
         )
         if remark

@@ -205,7 +205,7 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
     return "; ".join(texts)
 
 
-def few_evaluations_in_words(case: Case) -> str:
+def why_few_evaluations(case: Case) -> str:
     """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget, without
     those that say that they stop by themselves; "" without any.
     """

@@ -11,7 +11,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
-from safevar_sumo.questions.causes import settings_of_line
+from safevar_sumo.questions.cause_limits import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion

@@ -15,8 +15,8 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.by_criterion import STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.measure import STAGE, study_by
 from safevar_sumo.records import Evaluations, FloatArray
 from tests.in_process import json_of, run, searched
 from tests.made_up import HARDEST_BRAKING

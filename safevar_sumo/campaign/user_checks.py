@@ -1,0 +1,139 @@
+"""Whether user code keeps what results rest on: it is checked, and repeated elsewhere."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+import platformdirs
+
+from safevar_sumo.campaign.evaluation import (
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+    reproduction_command,
+    system_of,
+)
+from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.pool import Pool, open_pool
+from safevar_sumo.errors import UserCodeError
+from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
+from safevar_sumo.plugins.process import REPRODUCED_BY
+from safevar_sumo.records import FloatArray, differences
+from safevar_sumo.results import identity_digest
+from safevar_sumo.study import Study, user_code_names, without_skipping
+from safevar_sumo.sumo.kept import number_simulated
+from safevar_sumo.sumo.matrix import drive_and_score
+from safevar_sumo.vehicles import region_of
+
+if TYPE_CHECKING:
+    from safevar_sumo.check.trials import Finding
+
+
+SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
+"""What is expected of a simulator in another process."""
+
+
+def check_code(study: Study, pool: Pool) -> Use:
+    """Check the user code of a study in a worker, unless it has passed before with the same files;
+    returns what it used there. Where the number of simulations is limited, the check takes at most
+    a tenth of them.
+
+    Raises
+    ------
+    UserCodeError
+        With file, line and advice of the first finding that makes results wrong.
+    """
+    if not user_code_names(study):
+        return Use({}, [])
+    digest = identity_digest(manifest_now(study, system_of(study)))
+    marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
+    with suppress(OSError, msgspec.MsgspecError):
+        known = msgspec.json.decode(marker.read_bytes(), type=Use)
+        if known.modules == digests_by_name(known.modules, study.origin.places):
+            return known
+    job = Task(study=study), None if pool.spare is None else pool.spare[0]
+    use: Use
+    ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
+    if pool.spare is not None:
+        return use
+    with suppress(OSError):  # without the marker, the next process checks again
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.write_bytes(msgspec.json.encode(use))
+    return use
+
+
+def repeat_elsewhere(study: Study, pool: Pool) -> None:
+    """Simulate three settings in two processes, in one of them with the points in another order.
+
+    Raises
+    ------
+    UserCodeError
+        If a result differs.
+    """
+    system = system_of(study)
+    rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
+    backwards = Selection(points=tuple(range(len(system.matrix)))[::-1])
+    jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
+    if pool.workers > 1:  # the second one has simulated nothing yet
+        here, there = carry_out(evaluate_settings, jobs, pool)
+    else:
+        (here,) = carry_out(evaluate_settings, jobs[:1], pool)
+        pool.close()  # its worker starts again
+        (there,) = carry_out(evaluate_settings, jobs[1:], pool)
+    for row, difference in differences(there.results, here.results):
+        command = reproduction_command(study, rows[row])
+        problem = f"{difference} in another process, or with points in another order"
+        raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
+
+
+def random_settings(study: Study, *shape: int) -> FloatArray:
+    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
+    region = region_of(study)
+    characteristics = region.characteristics
+    rng = np.random.default_rng(study.search.seed)
+
+    def draw(count: int) -> FloatArray:
+        return rng.uniform(
+            characteristics.lower, characteristics.upper, (count, len(characteristics))
+        )
+
+    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))
+
+
+def find_in_new_process(study: Study) -> list[Finding]:
+    """What a simulator of the user's own returns otherwise in a new process, for the original and
+    for both ends of the domains; nothing if the study says that it is not deterministic.
+    """
+    study = without_skipping(study)
+    system = system_of(study)
+    if system.mover.is_exact or system.repeats > 1:
+        return []
+    members = system.characteristics
+    settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
+    with open_pool(1) as pool:  # first, as a simulator may end its process
+        (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
+    here = drive_and_score(replace(system, matrix=system.matrix[::-1]), settings)
+    for row, difference in differences(here.results, there.results):
+        from safevar_sumo.check.trials import Finding  # slow to import, and rarely needed
+
+        words = f"{difference} in a new process"
+        command = reproduction_command(study, settings[row])
+        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
+    return []
+
+
+def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
+    """What user code uses in its check, and the number of simulations in a simulator."""
+    from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
+
+    unload_user_modules()
+    before = number_simulated()
+    with record_use(task.study.origin.places) as use:
+        refuse_defects(task.study, most)
+    return use, number_simulated() - before

@@ -1,0 +1,115 @@
+"""Replays of a page, and the commands that give its numbers."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from itertools import repeat
+from typing import Any
+
+from safevar_sumo.api.simulation import simulate_with_original
+from safevar_sumo.errors import warn
+from safevar_sumo.questions.counterexamples import fewest_changes
+from safevar_sumo.questions.words import change_texts, question_command
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
+from safevar_sumo.replay.animation import player_data
+from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
+from safevar_sumo.replay.scene import lay_out_scene
+from safevar_sumo.report.sections import ReportedStudy
+from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.terminal import Progress
+
+MAX_CAUSES = 6
+"""Maximum number of replays of settings that answers name by their changes."""
+CHANGES, ENCOUNTER = "changes", "encounter"
+"""A table's column of settings to replay: values by characteristic, all others as in the original
+vehicle; and, where encounters are ranges, the column of their encounters.
+"""
+
+
+def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
+    """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
+    each set of changed characteristics.
+    """
+    # The fewest changes, as `study` names them, and the chosen solutions.
+    characteristics = study.case.characteristics
+    settings = dict[str, FloatArray]()
+    most = study.simulations if study.system.mover.takes_long else None
+    fewest = fewest_changes(study.case, jobs=1) if most is None else None
+    if fewest is not None:
+        settings["Fewest changes"] = fewest.settings[0]
+    for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
+        settings[handle] = setting
+
+    # Causes that answers name, each set of changed characteristics once.
+    changes: dict[tuple[str, ...], tuple[NamedValues, NamedValues]] = {}
+    for answer in study.answers:
+        for frame in answer.tables.values():
+            for row, encounter in zip(
+                frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False
+            ):
+                changes.setdefault(tuple(sorted(row)), (row, encounter))
+    for row, encounter in [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]:
+        name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
+        settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
+
+    # Each is simulated again, and compared with what was recorded: as many as there may be, each
+    # with the original vehicle, and at the points of a matrix to know the worst one.
+    if most is not None:
+        each = simulations_of_setting(study.system) + 2 * study.system.repeats
+        settings = dict([*settings.items()][: most // each])
+    different = []
+    for number, (name, setting) in enumerate(settings.items()):
+        progress("replays", number, len(settings))
+        comparison = comparison_of(
+            simulate_with_original(study.case.study, study.system, setting, filtered=False)
+        )
+        if not comparison.has_position:
+            return  # a simulator of the user's own that logs none: nothing can be shown
+        last = comparison.rows[-1]
+        differences = []
+        if name in study.choices:
+            recorded: dict[Any, Any] = study.chosen_solutions.loc[name].to_dict()
+            differences = list_differences(comparison.evaluations.take([last]), recorded)
+        different += [name] if differences else []
+        reason = f" ({study.choices[name]})" if name in study.choices else ""
+        yield {
+            "title": f"{name}{reason}: {comparison.verdict(last)}",
+            "point": comparison.point.name,
+            "changes": change_texts(characteristics, characteristics.named(setting)),
+            "differences": differences,
+            "player": player_data(lay_out_scene(comparison)),
+        }
+    if different:
+        why = why_different(is_imported=not study.case.has_runs)
+        warn(
+            f"{study.directory}: simulated again with different results: {', '.join(different)};"
+            f" {why}"
+        )
+
+
+def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
+    """The commands that give the numbers of the page, each after what it gives."""
+    # The study itself.
+    directory = str(study.directory)
+    flag = " --as-it-is-now" if study.later_changes else ""
+    if study.case.has_runs:
+        out = json.dumps(f"{directory}-again")
+        script = (
+            f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out},"
+            " progress=True)"
+        )
+        what = (
+            f"The study {study.case.study.name}, as its manifest.json records it, into another"
+            " directory"
+        )
+        yield what, f"python -c {shlex.quote(script)}"
+
+    # Its answers and replays.
+    for answer in study.answers:
+        if answer.command:
+            yield f"The answer {answer.question}", answer.command + flag
+    for handle in study.choices:
+        simulate = f"{question_command('simulate', directory, study.point)} --solution {handle}"
+        yield f"The replay of {handle}", f"{simulate} --plot it.png --animate it.html{flag}"
