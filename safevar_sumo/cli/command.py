@@ -13,8 +13,9 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 from click.shell_completion import CompletionItem
@@ -23,9 +24,10 @@ from rich.console import Console
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
+from safevar_sumo.questions.ask import COMMON_OPTIONS
 from safevar_sumo.questions.changes import NUMBER_PATTERN
-from safevar_sumo.questions.options import COMMON_OPTIONS, Option, options_of
-from safevar_sumo.questions.render import FORMATS, WIDTH
+from safevar_sumo.questions.options import Option, options_of
+from safevar_sumo.questions.render import WIDTH, Form
 from safevar_sumo.questions.subject import study_in, study_or_case
 from safevar_sumo.study import study_names
 
@@ -46,7 +48,7 @@ METAVARS = {
 COMMON_NAMES = {
     "Encounters": ("point", "ranges", "up_to"),
     "Simulations": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
-    "Answer": ("form", "as_json", "details", "table", "plot", "fail_if"),
+    "Answer": ("format", "json", "details", "table", "plot", "fail_if"),
 }
 """Options that many commands have: with one meaning, help names them in a few lines."""
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
@@ -69,7 +71,7 @@ class _Command(click.Command):
             for option in self.get_params(ctx)
             if isinstance(option, click.Option)
         }
-        meanings = {name: meaning for name, _, _, meaning in COMMON_OPTIONS}
+        meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
         common = {
             title: [
                 options.pop(name).opts[0]
@@ -113,6 +115,57 @@ HELP_ALL = click.Option(
 )
 
 
+def print_answer(
+    call: Callable[..., Answer],
+    declared: Contents | None,
+    /,
+    *,
+    format: Form = "text",
+    json: bool = False,
+    details: bool = False,
+    table: Annotated[str | None, "NAME"] = None,
+    plot: Annotated[Path | None, "FILE"] = None,
+    fail_if: Annotated[tuple[str, ...], '"KEY > X"'] = (),
+    **values: Any,
+) -> None:
+    """Print the answer, and end with its exit code.
+
+    Parameters
+    ----------
+    format
+        How to print.
+    json
+        Short for --format json.
+    details
+        Print all tables and numbers.
+    table
+        Print this table only.
+    plot
+        Draw the answer: png, pdf or svg.
+    fail_if
+        End with exit code 3 if a number, or a table's column in any row, is so; may be
+        repeated.
+    """
+    # What the answer will not have is refused before it is computed.
+    conditions = [_parse(text) for text in fail_if]
+    if declared:
+        _check_names(declared, values, [key for key, _, _ in conditions], table)
+    if plot is not None:
+        check_writable(plot, "plot", PICTURE_ENDINGS)
+
+    # Only the answer goes to standard output.
+    form = "json" if json else format
+    with nullcontext() if form == "text" else prints_to_standard_error():
+        answer = call(table=table, **values)
+    if form != "text" or table or not values.get("quiet"):
+        _print(answer, form, table, details=details)
+    if plot is not None:
+        from safevar_sumo.questions.figures import save
+
+        save(answer.figure(), plot, "plot")
+    _exit_on_failures(answer, conditions)
+
+
 def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     """The command that calls a function.
 
@@ -140,49 +193,20 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             **constants,
         )
 
-    def print_answer(
-        form: str,
-        as_json: bool,
-        details: bool,
-        table: str | None,
-        plot: Path | None,
-        fail_if: tuple[str, ...],
-        **values: Any,
-    ) -> None:
-        # What the answer will not have is refused before it is computed.
-        conditions = [_parse(text) for text in fail_if]
-        if declared:
-            _check_names(declared, values, [key for key, _, _ in conditions], table)
-        if plot is not None:
-            check_writable(plot, "plot", PICTURE_ENDINGS)
-
-        # Only the answer goes to standard output.
-        form = "json" if as_json else form
-        with nullcontext() if form == "text" else prints_to_standard_error():
-            answer: Answer = call(table=table, **values)
-        if form != "text" or table or not values.get("quiet"):
-            _print(answer, form, table, details=details)
-        if plot is not None:
-            from safevar_sumo.questions.figures import save
-
-            save(answer.figure(), plot, "plot")
-        _exit_on_failures(answer, conditions)
-
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
     # The command, with the options of every answer.
-    declared = contents_of(function)
     gives_answer = "Answer" in str(signature.return_annotation)
     return _Command(
         name,
         params=[
             *map(_argument, positional),
             *(_flag(option) for option in options if option.name != "table"),
-            *(_output_options() if gives_answer else []),
+            *map(_flag, options_of(print_answer) if gives_answer else ()),
             HELP_ALL,
         ],
-        callback=print_answer if gives_answer else print_text,
+        callback=partial(print_answer, call, contents_of(function)) if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
 
@@ -292,35 +316,6 @@ def _flag(option: Option) -> click.Option:
             else {"default": option.default}
         ),
     )
-
-
-def _output_options() -> list[click.Option]:
-    """The options of every command that gives an answer."""
-    path = _Path(path_type=Path)
-    return [
-        click.Option(
-            ["--format", "form"],
-            type=click.Choice(FORMATS),
-            default="text",
-            show_default=True,
-            help="How to print.",
-        ),
-        click.Option(["--json", "as_json"], is_flag=True, help="Short for --format json."),
-        click.Option(["--details"], is_flag=True, help="Print all tables and numbers."),
-        click.Option(["--table"], metavar="NAME", help="Print this table only."),
-        click.Option(
-            ["--plot"], type=path, metavar="FILE", help="Draw the answer: png, pdf or svg."
-        ),
-        click.Option(
-            ["--fail-if"],
-            multiple=True,
-            metavar='"KEY > X"',
-            help=(
-                "End with exit code 3 if a number, or a table's column in any row, is so; may be"
-                " repeated."
-            ),
-        ),
-    ]
 
 
 def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> None:

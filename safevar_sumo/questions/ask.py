@@ -25,10 +25,14 @@ from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.questions.options import (
     CARS_FILE,
-    COMMON_OPTIONS,
     CRITERION,
     UP_TO,
+    Cluster,
+    Jobs,
     Option,
+    PointName,
+    Simulations,
+    UpTo,
     flag_of,
     options_of,
 )
@@ -93,16 +97,12 @@ class Question:
         """Further positional parameters, and whether each is a file instead of a subject."""
         # Options that all questions have.
         own = inspect.signature(compute).parameters
-        further = [option for option in COMMON_OPTIONS if option[0] not in own]
-        common = [
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
-            )
-            for name, kind, default, _ in further
-        ]
-        shown = [parameters[0], *(parameter for parameter in parameters[2:]), *common]
+        further = [option for option in COMMON_OPTIONS if option.name not in own]
+        known = inspect.signature(Question.__call__).parameters
+        common = [known[option.name] for option in further]
+        shown = [parameters[0], *parameters[2:], *common]
         self.__signature__ = inspect.Signature(shown, return_annotation="Answer")
-        texts = "\n".join(f"{name}\n    {text}" for name, _, _, text in further)
+        texts = "\n".join(f"{option.name}\n    {option.meaning}" for option in further)
         self.__doc__ = f"{inspect.cleandoc(compute.__doc__ or '')}\n{texts}"
 
     @cached_property
@@ -119,18 +119,46 @@ class Question:
         self,
         source: StudyLike | Results | None = None,
         *others: StudyLike | Results,
-        point: str | None = None,
+        point: PointName = None,
         ranges: bool = False,
-        up_to: str | None = None,
-        jobs: int | None = None,
-        cluster: str | None = None,
-        simulations: int | None = None,
-        pool: Pool | None = None,
-        progress: bool | Progress = False,
+        up_to: UpTo = None,
+        jobs: Jobs = None,
+        cluster: Cluster = None,
+        simulations: Simulations = None,
+        pool: Any = None,
+        progress: Any = False,
         as_it_is_now: bool = False,
         fresh: bool = False,
         **values: Any,
     ) -> Answer:
+        """The answer about a study, or results, and other subjects.
+
+        Parameters
+        ----------
+        point
+            Only this test, or this point, of the study's matrix.
+        ranges
+            Any encounter in the ranges of the study's axes, not the tests alone.
+        up_to
+            Only encounters up to this value of an axis, such as speed=40.
+        jobs
+            Number of worker processes, by default one for each core.
+        cluster
+            Compute on the workers of this Dask scheduler instead.
+        simulations
+            At most so many simulations: a rough answer where more are usual. By default, as many
+            as take 15 minutes where a simulation takes long.
+        pool
+            Pool that simulates; by default new worker processes.
+        progress
+            True for a bar on the terminal, or a function of a phase, the number of simulations
+            done, and their total.
+        as_it_is_now
+            If results were computed with other files or versions, simulate with the present ones
+            and say so.
+        fresh
+            Simulate everything anew, instead of reading what earlier commands have simulated.
+        """
         # Where the question itself cuts encounters, it gets the whole of them.
         is_own = any(option.name == UP_TO for option in self.options)
         cut, values = (None, {**values, UP_TO: up_to}) if is_own else (up_to, values)
@@ -306,6 +334,10 @@ class Question:
             *(f"{flag_of(name)} {quote(str(text))}" for name, text in part.items() if text),
         ]
         return " ".join(words)
+
+
+COMMON_OPTIONS = options_of(Question.__call__)
+"""Options that every question has."""
 
 
 def question(compute: Callable[..., Answer]) -> Question:

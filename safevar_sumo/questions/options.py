@@ -67,45 +67,6 @@ UP_TO = "up_to"
 """The option that cuts an axis."""
 Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
 """The largest number of simulations."""
-COMMON_OPTIONS = (
-    ("point", PointName, None, "Only this test, or this point, of the study's matrix."),
-    (
-        "ranges",
-        bool,
-        False,
-        "Any encounter in the ranges of the study's axes, not the tests alone.",
-    ),
-    ("up_to", UpTo, None, "Only encounters up to this value of an axis, such as speed=40."),
-    ("jobs", Jobs, None, "Number of worker processes, by default one for each core."),
-    ("cluster", Cluster, None, "Compute on the workers of this Dask scheduler instead."),
-    (
-        *("simulations", Simulations, None),
-        (
-            "At most so many simulations: a rough answer where more are usual. By default, as many"
-            " as take 15 minutes where a simulation takes long."
-        ),
-    ),
-    ("pool", Any, None, "Pool that simulates; by default new worker processes."),
-    (
-        "progress",
-        Any,
-        False,
-        "True for a bar on the terminal, or a function of a phase, the number of simulations done,"
-        " and their total.",
-    ),
-    (
-        *("as_it_is_now", bool, False),
-        (
-            "If results were computed with other files or versions, simulate with the present ones"
-            " and say so."
-        ),
-    ),
-    (
-        *("fresh", bool, False),
-        "Simulate everything anew, instead of reading what earlier commands have simulated.",
-    ),
-)
-"""Options that every question has: name, type, default, and meaning."""
 
 
 def flag_of(name: str) -> str:
@@ -175,7 +136,7 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
     """
     pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
     texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
-    names = inspect.unwrap(function).__globals__
+    names = globals() | inspect.unwrap(function).__globals__
     options = []
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:

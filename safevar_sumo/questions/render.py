@@ -9,7 +9,7 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import pandas as pd
 from rich.console import Console
@@ -32,7 +32,7 @@ from safevar_sumo.terminal import print_text
 if TYPE_CHECKING:
     from safevar_sumo.questions.answer import Answer
 
-FORMATS = ("text", "json", "csv", "latex", "html")
+Form = Literal["text", "json", "csv", "latex", "html"]
 SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z])")
 """Between two sentences."""
 MAX_SENTENCES = 3

@@ -129,7 +129,9 @@ def own_criterion(study: Study) -> Unsafe:
 def check_criterion(criterion: Unsafe, study: Study) -> None:
     """Refuse a criterion about points of a study that is not rated."""
     if criterion.points is not None and not study.is_rated:
-        problem = f"{str(criterion)!r}: study {study.name!r} is not rated and has no points"
+        problem = (
+            f"'points={criterion.points:g}': study {study.name!r} is not rated and has no points"
+        )
         raise InputError("unsafe", problem, "collision or below=X")
 
 

@@ -120,7 +120,7 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     )  # few changes have few subsets
     handle = str(handles_of(case.solutions)[safe])
     evaluator = Evaluator(case.study, InlinePool())
-    answer = explain.compute(case, evaluator, solution=(handle,), unsafe="collision", fits=0)
+    answer = explain.compute(case, evaluator, solution=(handle,), unsafe=Unsafe(), fits=0)
     (row,) = answer.tables["solutions"].to_dict("records")
     assert (row["solution"], row["reason"], row["avoided_by"]) == (handle, "requested", None)
     assert answer.tables["causes"].empty
@@ -435,7 +435,7 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
     study = load_study("smoke")
     answer = explain.compute(
-        study, Evaluator(study, InlinePool(), verified=0), unsafe="below=99", fits=0, top=1
+        study, Evaluator(study, InlinePool(), verified=0), unsafe=Unsafe(below=99), fits=0, top=1
     )
     degree = f"{answer.numbers['original_degree']:.3g}"
     said = (

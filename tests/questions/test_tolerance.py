@@ -150,7 +150,7 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     bare, known, two = (
         tolerance.compute(subject, Evaluator(study, pool), unsafe=unsafe, characteristics=names)
         for subject, unsafe, names in (
-            (study, "collision", ()),
+            (study, Unsafe(), ()),
             (case, None, ()),
             (case, None, ("a,b",)),
         )

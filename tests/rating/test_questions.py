@@ -61,7 +61,7 @@ def test_what_is_shipped_passes_the_check() -> None:
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     answer = tolerance.compute(
-        STUDY, evaluator, characteristics=("brakeTorque",), unsafe="points=4.0"
+        STUDY, evaluator, characteristics=("brakeTorque",), unsafe=Unsafe(points=4.0)
     )
     column = list(evaluator.characteristics.names).index("brakeTorque")
     (alone,) = scan(evaluator, [column], Unsafe(points=4.0))
