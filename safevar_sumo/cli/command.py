@@ -115,7 +115,7 @@ HELP_ALL = click.Option(
 )
 
 
-def print_answer(
+def _give_answer(
     call: Callable[..., Answer],
     declared: Contents | None,
     /,
@@ -203,10 +203,10 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         params=[
             *map(_argument, positional),
             *(_flag(option) for option in options if option.name != "table"),
-            *map(_flag, options_of(print_answer) if gives_answer else ()),
+            *map(_flag, options_of(_give_answer) if gives_answer else ()),
             HELP_ALL,
         ],
-        callback=partial(print_answer, call, contents_of(function)) if gives_answer else print_text,
+        callback=partial(_give_answer, call, contents_of(function)) if gives_answer else print_text,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
 

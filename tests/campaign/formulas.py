@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, batches, evaluation, run_campaign
+from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, run_campaign, user_checks
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.share import carry_share
 from safevar_sumo.errors import SafevarError
@@ -73,7 +73,7 @@ class FormulaPool(InlinePool):
     def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
         if function in (carry_share, evaluate_settings):
             return function(*arguments)
-        return (Use({}, []), 0) if function is batches._refuse_defects else ""
+        return (Use({}, []), 0) if function is user_checks._refuse_defects else ""
 
 
 def with_search(study: Study, **changes: object) -> Study:
