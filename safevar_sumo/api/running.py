@@ -8,12 +8,12 @@ from pathlib import Path
 
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campaign
+from safevar_sumo.campaign.campaign import RECORDED
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.questions.research_questions.fronts import why_few_evaluations
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.study import Study, StudyLike
-from safevar_sumo.sumo import Engine
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Progress, open_progress
 
@@ -27,7 +27,7 @@ def run(
     pool: Pool | None = None,
     progress: bool | Progress = False,
     only: Sequence[tuple[str, int]] | None = None,
-    engine: str = Engine.RECORDED,
+    engine: str = RECORDED,
     retry_failed: bool = False,
 ) -> Results:
     """Search a study; a call with the same study and directory continues where an earlier one was

@@ -41,7 +41,6 @@ from safevar_sumo.study import SAFETY_DEGREE, Study, StudyLike
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.encounters import where_met
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import worst_point
 from safevar_sumo.sumo.models import create_shipped_models
 from safevar_sumo.sumo.system import System, assemble
@@ -381,10 +380,9 @@ def simulate_with_original(
     at_point = system.at(point)
     observations = list[Observation]()
     runs = drive_all(
-        at_point,
+        replace(at_point, in_sumo=True),
         settings,
-        Engine.LIBSUMO,
-        listen=lambda seen: observations.append(Observation._make(map(np.copy, seen))),
+        lambda seen: observations.append(Observation._make(map(np.copy, seen))),
     )
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 

@@ -18,6 +18,7 @@ from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.campaign import RunKey, all_runs
 from safevar_sumo.campaign.batches import ask_why_no_verdict
 from safevar_sumo.campaign.campaign import (
+    RECORDED,
     choose_engine,
     evaluate_original,
     measure_speed,
@@ -54,7 +55,7 @@ from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
-from safevar_sumo.sumo import Engine, assemble, drive_and_score, settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
@@ -293,14 +294,14 @@ def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:
 def _measured(study: Study, system: System, runs: int, engine: str, pool: Pool) -> Answer:
     """The estimated time of a search, from a short measurement."""
     # The speed on this machine.
-    used, reason = choose_engine(system, engine)
-    task = Task(study=study, engine=used, batch_size=settings_per_batch(system, used))
+    system, used, reason = choose_engine(system, engine)
+    task = Task(study=study, in_sumo=system.in_sumo, batch_size=settings_per_batch(system))
     begin = time.monotonic()
     evaluate_original(task, pool)
     ask_why_no_verdict(study, pool)
     start = time.process_time() + time.monotonic() - begin  # of this process and of a worker
     rate = measure_speed(task, pool, runs)
-    verification = measure_verification(task, pool, runs) if used is Engine.RECORDED else 0.0
+    verification = measure_verification(task, pool, runs) if used == RECORDED else 0.0
 
     # The summary at the end loads statistics, and lets the original drive in this process.
     begin = time.monotonic()

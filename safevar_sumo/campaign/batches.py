@@ -40,7 +40,7 @@ from safevar_sumo.errors import InputError, UserCodeError, warn
 from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo import needs_no_sumo, settings_per_batch
+from safevar_sumo.sumo import reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
@@ -289,13 +289,11 @@ class Batches(NamedTuple):
 
 def choose_batches(study: Study, selection: Selection) -> Batches:
     """Choose how settings of a study fill batches."""
-    task = Task(study=study, selection=selection)
     system = selection.of(system_of(study))
-    are_recorded = needs_no_sumo(system)
+    are_recorded = not reason_for_sumo(system)
     have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
-    return Batches(
-        settings_per_batch(system, task.engine), are_recorded and not have_turns, are_recorded
-    )
+    size = settings_per_batch(system)
+    return Batches(size, are_recorded and not have_turns, are_recorded)
 
 
 def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:

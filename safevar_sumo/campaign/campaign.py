@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -46,7 +47,7 @@ from safevar_sumo.results import (
     read_manifest,
 )
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import Engine, reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo import reason_for_sumo, settings_per_batch
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress, show_no_progress
 
@@ -64,7 +65,7 @@ SUMO_COST = 60
 """How many simulations in recorded scenes take as long as one in SUMO, roughly."""
 SETTINGS_PER_JOB = 150
 """Largest number of settings that a worker repeats in SUMO at once."""
-ENGINES = (str(Engine.RECORDED), str(Engine.LIBSUMO))
+RECORDED, SUMO = ENGINES = "recorded", "sumo"
 """The engines that a study may name."""
 
 
@@ -85,7 +86,7 @@ def run_campaign(
     pool: Pool,
     progress: Progress,
     warn: Callable[[str], None],
-    engine: str = Engine.RECORDED,
+    engine: str = RECORDED,
     *,
     retry_failed: bool = False,
     batch_size: int | None = None,
@@ -123,15 +124,15 @@ def run_campaign(
     results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, wanted)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
-    engine_used, reason = choose_engine(system, engine)
-    results.manifest["engine"] = {"name": str(engine_used), "reason": reason}
+    system, engine_used, reason = choose_engine(system, engine)
+    results.manifest["engine"] = {"name": engine_used, "reason": reason}
     results.manifest |= _about_algorithms(study)
-    size = batch_size or settings_per_batch(system, engine_used)
-    task = Task(study=study, engine=engine_used, batch_size=size)
+    size = batch_size or settings_per_batch(system)
+    task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
 
     # What the user should know before the search begins.
     asked = len(keys) * study.search.evaluations
-    repeated = min(asked, MAX_REPEATED) if engine_used is Engine.RECORDED else 0
+    repeated = min(asked, MAX_REPEATED) if engine_used == RECORDED else 0
     parts = Parts(progress, [asked, SUMO_COST * repeated])
     show_search = parts.begin()
     show_journals = journal_progress(study, keys, directory, show_search)
@@ -158,7 +159,7 @@ def run_campaign(
         warn(remark)
     if [run.key for run in runs] == sorted(all_runs(study)):
         results.finish({run.key: run.solutions for run in runs})
-    if engine_used is Engine.RECORDED and runs:
+    if engine_used == RECORDED and runs:
         sample = choose_sample(study, original, runs)
         for remark in repeat_in_sumo(task, sample, pool, parts.begin()):
             warn(remark)
@@ -291,21 +292,18 @@ def journal_progress(
     return show
 
 
-def choose_engine(system: System, name: str) -> tuple[Engine, str]:
-    """Choose the engine that moves a system's vehicles, and say why; raises InputError for an
-    unknown engine.
+def choose_engine(system: System, name: str) -> tuple[System, str, str]:
+    """The system with the engine that moves its vehicles, which engine this is, and why; raises
+    InputError for an unknown engine.
     """
     if name not in ENGINES:
         raise InputError("engine", repr(name), one_of(ENGINES))
-    if name == Engine.LIBSUMO:
+    if name == SUMO:
         system.require("SUMO", f"the engine {name}")
-        return Engine.LIBSUMO, "requested"
-    reason = reason_for_sumo(system)
-    return (
-        (Engine.LIBSUMO, reason)
-        if reason
-        else (Engine.RECORDED, "nobody reacts to the vehicle under test")
-    )
+        system = replace(system, in_sumo=True)
+    if reason := reason_for_sumo(system):
+        return system, SUMO, reason
+    return system, RECORDED, "nobody reacts to the vehicle under test"
 
 
 def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:

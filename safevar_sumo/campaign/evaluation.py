@@ -24,7 +24,6 @@ from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, IntArray, Outcome, differences
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score, evaluate_matrix
 from safevar_sumo.sumo.system import System, assemble, simulate_command
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -77,8 +76,8 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    engine
-        What moves the vehicles.
+    in_sumo
+        Whether SUMO moves the vehicles, also where recorded scenes suffice.
     batch_size
         Maximum number of settings in a batch.
     selection
@@ -86,7 +85,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     study: Study
-    engine: Engine = Engine.RECORDED
+    in_sumo: bool = False
     batch_size: int = MAX_COPIES
     selection: Selection = EVERYTHING
 
@@ -182,6 +181,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     than the study's time limit ends.
     """
     system = system_of(task.study)
+    system = replace(system, in_sumo=True) if task.in_sumo else system
     system.vehicle.compile()  # outside the time limit
     # Of runs that take long, each has the time limit.
     limit = end_if_longer(task.study.search.time_limit)
@@ -189,7 +189,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
         if task.selection != EVERYTHING:
             evaluations = _evaluate_parameters(task.selection.of(system), task, rows)
         else:
-            evaluations = drive_and_score(system, rows, task.engine)
+            evaluations = drive_and_score(system, rows)
     if user_code_names(task.study) and system.repeats == 1:
         _first_batches.setdefault(msgspec.msgpack.encode(task.study), (task, rows, evaluations))
     return evaluations
@@ -228,16 +228,14 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     settings = rows[:, :n]
     values = rows[:, n:]
     if selection.each:
-        return evaluate_matrix(system, settings, task.engine, each=True)
+        return evaluate_matrix(system, settings, each=True)
     if not values.size:
-        return drive_and_score(system, settings, task.engine, with_originals=False)
+        return drive_and_score(system, settings, with_originals=False)
 
     # A driving system that takes an array for each parameter drives all at once.
     if selection.arrays:
         system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
-        return replace(
-            drive_and_score(system, settings, task.engine, with_originals=False), settings=rows
-        )
+        return replace(drive_and_score(system, settings, with_originals=False), settings=rows)
 
     # Any other one drives once for each set of values.
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
@@ -249,7 +247,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
             task.study, dict(zip(selection.parameters, parameter_set, strict=True))
         )
         driven = replace(system, ads=assemble(study).ads)
-        evaluations = drive_and_score(driven, settings[group], task.engine, with_originals=False)
+        evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
     return Evaluations.concatenate(groups).take(

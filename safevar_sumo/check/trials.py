@@ -26,7 +26,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
-from safevar_sumo.sumo import needs_no_sumo
+from safevar_sumo.sumo import reason_for_sumo
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -130,7 +130,7 @@ def try_simulations(
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
-    if ":" in study.scenario.model and needs_no_sumo(system):
+    if ":" in study.scenario.model and not reason_for_sumo(system):
         try:
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:

@@ -18,7 +18,7 @@ from safevar_sumo.scenarios.mover import OWN_SIMULATOR
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
-from safevar_sumo.sumo.engine import Engine, Start, open_in_process, open_varied_world, open_world
+from safevar_sumo.sumo.engine import Start, open_in_process, open_varied_world, open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
@@ -69,6 +69,8 @@ def reason_for_sumo(system: System) -> str:
     """
     if reason := system.mover.lacks.get("recorded scenes"):
         return reason
+    if system.in_sumo:
+        return "requested"
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
@@ -80,16 +82,8 @@ def reason_for_sumo(system: System) -> str:
     return system.scenes.reason_for_sumo(system.points)
 
 
-def needs_no_sumo(system: System, engine: Engine = Engine.RECORDED) -> bool:
-    """Whether the vehicles drive without SUMO, in recorded scenes or among bodies on tracks."""
-    return engine is Engine.RECORDED and not reason_for_sumo(system)
-
-
 def drive_all(
-    system: System,
-    settings: FloatArray,
-    engine: Engine = Engine.RECORDED,
-    listen: Listener | None = None,
+    system: System, settings: FloatArray, listen: Listener | None = None
 ) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
@@ -111,7 +105,7 @@ def drive_all(
     scenario = on_road.points[0].scenario
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
-        plays = needs_no_sumo(system, engine)
+        plays = not reason_for_sumo(system)
         traffic = traffic_of(system, encounters, 0.0 if plays else OVERTIME)
         if not plays:  # in SUMO, among the other actors that it moves
             with open_points_world(system, encounters, traffic) as sumo_world:

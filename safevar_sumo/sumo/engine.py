@@ -12,7 +12,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout, suppress
-from enum import StrEnum
 from io import StringIO
 
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
@@ -61,16 +60,6 @@ STEP_LENGTH = 0.05
 """Time step where neither a study nor its network's file names one [s]: SUMO's own, 1 s, is no time
 to brake in.
 """
-
-
-class Engine(StrEnum):
-    """What moves the vehicles: numpy in recorded scenes, or SUMO in this process.
-
-    If an actor may react to the vehicles, RECORDED is the same as LIBSUMO.
-    """
-
-    RECORDED = "recorded"
-    LIBSUMO = "sumo"
 
 
 @contextmanager

@@ -25,9 +25,8 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
-from safevar_sumo.sumo.batch import drive_all, needs_no_sumo, score
+from safevar_sumo.sumo.batch import drive_all, reason_for_sumo, score
 from safevar_sumo.sumo.encounters import in_place_of_unmet, met_at, worst_points
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.system import System
 
@@ -118,11 +117,7 @@ def vehicle_remarks(system: System) -> list[str]:
 
 
 def drive_and_score(
-    system: System,
-    settings: FloatArray,
-    engine: Engine = Engine.RECORDED,
-    *,
-    with_originals: bool = True,
+    system: System, settings: FloatArray, *, with_originals: bool = True
 ) -> Evaluations:
     """Simulate settings, shape (N, n), as they are given, in one batch and score them.
 
@@ -133,15 +128,12 @@ def drive_and_score(
     """
     # Large batches are cut; beside each setting drives the original in its encounter.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
-    size = max(1, batch_size(system, engine) // (2 if takes_pairs else 1))
+    size = max(1, batch_size(system) // (2 if takes_pairs else 1))
     if len(settings) > size:
         starts = range(0, len(settings), size)
         batches = [settings[start : start + size] for start in starts]
         return Evaluations.concatenate(
-            [
-                drive_and_score(system, batch, engine, with_originals=with_originals)
-                for batch in batches
-            ]
+            [drive_and_score(system, batch, with_originals=with_originals) for batch in batches]
         )
 
     # The original meets the encounter of each variant, too.
@@ -153,9 +145,9 @@ def drive_and_score(
     # At all points, or at the only one.
     try:
         if system.matrix:
-            found = evaluate_matrix(system, vehicles, engine)
+            found = evaluate_matrix(system, vehicles)
         else:
-            found = score(system, vehicles, drive_all(system, vehicles, engine))
+            found = score(system, vehicles, drive_all(system, vehicles))
     except UserCodeError as error:
         if not system.skips_failed:
             raise
@@ -192,9 +184,7 @@ def _beside(
     return vehicles, np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)
 
 
-def evaluate_matrix(
-    system: System, settings: FloatArray, engine: Engine, *, each: bool = False
-) -> Evaluations:
+def evaluate_matrix(system: System, settings: FloatArray, *, each: bool = False) -> Evaluations:
     """Evaluate settings, shape (N, n), at every point: at their worst ones; of a rated study also
     their rating points.
 
@@ -204,7 +194,7 @@ def evaluate_matrix(
     # Every point once, in groups.
     results = {
         result.point.name: (result.evaluations, rated_quantities(result.runs))
-        for result in simulate_points(system, settings, engine)
+        for result in simulate_points(system, settings)
     }
     at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
 
@@ -220,11 +210,11 @@ def evaluate_matrix(
     return replace(evaluations, cells=cells) if each else evaluations
 
 
-def settings_per_batch(system: System, engine: Engine) -> int:
+def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
     if system.mover.at_once:  # each result is journaled at once
         return system.mover.at_once
-    if not needs_no_sumo(system, engine):
+    if reason_for_sumo(system):
         return MAX_COPIES
     if len(
         system.characteristics.scenario
@@ -242,13 +232,13 @@ def largest_batch(system: System) -> int:
     return min(in_memory, system.ads.max_vehicles or in_memory)
 
 
-def batch_size(system: System, engine: Engine) -> int:
+def batch_size(system: System) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
     network.
     """
     if system.mover.at_once:
         return system.mover.at_once
-    if needs_no_sumo(system, engine):
+    if not reason_for_sumo(system):
         return largest_batch(system)
     lanes = max(
         number_of_lanes(open_network(network))
@@ -266,17 +256,15 @@ def drive_worst(system: System, settings: FloatArray) -> SimulationRuns:
     return drive_all(system.at(worst_point(system, settings[-1])), settings)
 
 
-def simulate_all_points(
-    system: System, settings: FloatArray, engine: Engine = Engine.RECORDED
-) -> list[PointResult]:
+def simulate_all_points(system: System, settings: FloatArray) -> list[PointResult]:
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the
     errors of `drive_all`.
     """
-    by_name = {result.point.name: result for result in simulate_points(system, settings, engine)}
+    by_name = {result.point.name: result for result in simulate_points(system, settings)}
     return [by_name[point.name] for point in system.points]
 
 
-def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Iterator[PointResult]:
+def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResult]:
     """Yield the results of settings at every point, group by group of points that share a
     simulation.
     """
@@ -285,14 +273,14 @@ def simulate_points(system: System, settings: FloatArray, engine: Engine) -> Ite
     # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
-    if needs_no_sumo(system, engine) and (not searched or [*searched] == [PHASE]):
+    if not reason_for_sumo(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         here = replace(system, matrix=points)
         # Settings that have no encounter of these points keep their rows, for the others' sake.
         met = met_at(points[0], system, settings)
         vehicles = settings if met.all() else in_place_of_unmet(points[0], system, settings, met)
-        runs = drive_all(here, vehicles, engine)
+        runs = drive_all(here, vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         if not met.all():
             evaluations = evaluations.where(met, Outcome.INFEASIBLE)

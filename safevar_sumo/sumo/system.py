@@ -79,6 +79,7 @@ class System:
     - `criterion` is the study's own.
     - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
     - `command` simulates the original vehicle of the study.
+    - With `in_sumo` SUMO moves the vehicles, also where recorded scenes suffice.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
@@ -97,6 +98,7 @@ class System:
     scenes: Scenes = field(default_factory=Scenes)
     time_limit: float = 300.0
     sees_nobody: bool = False
+    in_sumo: bool = False
     aggregate: str = WORST
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0

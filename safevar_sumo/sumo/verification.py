@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from safevar_sumo.sumo.batch import drive_all, observer_of, open_points_world, t
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.encounters import met_at
-from safevar_sumo.sumo.engine import Engine, Start, open_in_process
+from safevar_sumo.sumo.engine import Start, open_in_process
 from safevar_sumo.sumo.matrix import batch_size
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traffic import OVERTIME
@@ -95,7 +96,7 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
 
     # Those of a point drive together.
     remark = ""
-    size = batch_size(system, Engine.RECORDED)
+    size = batch_size(system)
     for number in np.union1d(worst, other):
         at_point = system.at(points[number])
         is_here = (worst == number) | (other == number)
@@ -114,7 +115,7 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     the longest.
     """
     order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
-    size = batch_size(system, Engine.LIBSUMO)
+    size = batch_size(replace(system, in_sumo=True))
     for start in range(0, len(order), size):
         rows = order[start : start + size]
         chosen = runs.of(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.openscenario import STEP, Played, play
 from safevar_sumo.scenarios import OpenScenario
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import run
@@ -184,7 +184,7 @@ def test_searched_profiles_are_those_of_each_value_and_of_sumo(tmp_path: Path) -
     settings = np.tile(members.original, (len(values), 1))
     settings[:, members.names.index("v")] = values
     searched = drive_and_score(system, settings)
-    in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
+    in_sumo = drive_and_score(replace(system, in_sumo=True), settings)
     assert np.array_equal(searched.f_safe, in_sumo.f_safe, equal_nan=True)
     assert searched.outcome.tolist() == ["invalid-test", "stopped", "stopped", "collision"]
     for value, degree in list(zip(values, searched.f_safe, strict=True))[1:]:

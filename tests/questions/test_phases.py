@@ -27,7 +27,6 @@ from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study, study_names
 from safevar_sumo.sumo.batch import drive_all, score
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, json_of, refused
@@ -90,7 +89,7 @@ def test_sumo_repeats_a_phase_to_the_bit() -> None:
     system = assemble(at_point(load_study("autoware_july"), "CCRs, speed 60, clear"))
     system = at_phase(system, 0.3712)
     settings = drawn(system, 3, 4)
-    runs = [drive_all(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)]
+    runs = [drive_all(replace(system, in_sumo=one), settings) for one in (False, True)]
     here, there = (score(system, settings, one).f_safe for one in runs)
     assert_array_equal(here, there)
 

@@ -5,6 +5,7 @@ original, and what is refused.
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, searched, verify_everywhere
@@ -158,10 +158,10 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )
-    in_sumo = drive_and_score(system, settings, Engine.LIBSUMO)
+    in_sumo = drive_and_score(replace(system, in_sumo=True), settings)
     assert in_sumo.outcome.tolist() == together.outcome.tolist()
     assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
-    assert settings_per_batch(system, Engine.RECORDED) > len(settings)
+    assert settings_per_batch(system) > len(settings)
 
 
 @pytest.mark.parametrize("case", ["walker", "parked"])
@@ -176,7 +176,7 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     corners = product(*((one.lower, one.upper) for one in system.characteristics.scenario))
     settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
     recorded, in_sumo = (
-        drive_and_score(system, settings, engine) for engine in (Engine.RECORDED, Engine.LIBSUMO)
+        drive_and_score(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
     assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)

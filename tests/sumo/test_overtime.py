@@ -13,7 +13,6 @@ from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Outcome, differences
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.sumo.batch import drive_all
-from safevar_sumo.sumo.engine import Engine
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import drawn, original_of
@@ -48,10 +47,10 @@ def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
     assert not [*differences(alone, together)]
 
 
-@pytest.mark.parametrize("engine", [Engine.RECORDED, Engine.LIBSUMO])
-def test_the_new_car_stops_behind_the_leader(creeping: System, engine: Engine) -> None:
+@pytest.mark.parametrize("in_sumo", [False, True])
+def test_the_new_car_stops_behind_the_leader(creeping: System, in_sumo: bool) -> None:
     heard = []
-    runs = drive_all(creeping, original_of(creeping), engine, listen=heard.append)
+    runs = drive_all(replace(creeping, in_sumo=in_sumo), original_of(creeping), heard.append)
     assert runs.outcome[0] == Outcome.STOPPED
     assert runs.trace.speed[-1, 0] == 0
     assert runs.trace.gap[-1, 0] == pytest.approx(0.7035, abs=1e-4)

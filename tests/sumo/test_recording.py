@@ -24,7 +24,7 @@ from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import Engine, reason_for_sumo, recording, simulate_all_points
+from safevar_sumo.sumo import reason_for_sumo, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -50,8 +50,7 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
     outcomes = []
     tolerance = ROUNDING if len(system.characteristics.scenario) else 0.0
     results = (
-        simulate_all_points(system, settings, engine)
-        for engine in (Engine.RECORDED, Engine.LIBSUMO)
+        simulate_all_points(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
     )
     for recorded, copies in zip(*results, strict=True):
         assert not [
