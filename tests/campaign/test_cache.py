@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import batches, cache
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
@@ -339,18 +338,6 @@ def test_two_processes_share_a_cache(folder: Path) -> None:
     answers.add(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
     assert len(answers) == 1
     assert b"probability" in answers.pop()
-
-
-def test_an_answer_is_the_same_from_the_cache(
-    folder: Path, simulated: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A question that is asked again needs no worker at all."""
-    first = sv.risk("smoke", samples=100, jobs=1)
-    assert sum(simulated) > 100
-    simulated.clear()
-    monkeypatch.setattr(batches, "carry_out", None)
-    assert sv.risk("smoke", samples=100, jobs=1).render("json") == first.render("json")
-    assert not simulated
 
 
 def test_evidence_does_not_check_itself(

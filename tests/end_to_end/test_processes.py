@@ -57,18 +57,6 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
     assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
-@SLOW
-def test_two_workers_that_are_killed_leave_the_same_bytes(whole: Path) -> None:
-    moments = random.Random(5)
-    process = started("study", "small.toml", "--out", "out", "--jobs", "2", "--quiet", batch=5)
-    until_it_writes(process)
-    for worker in workers_of(process):
-        worker.kill()  # each share loses one
-        time.sleep(moments.uniform(0.2, 0.6))
-    assert process.poll() is None, "too late: the study is over"
-    assert_ends_with_the_results(process, whole)
-
-
 @pytest.mark.parametrize(
     "when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", "twice"))]
 )

@@ -15,14 +15,12 @@ import pytest
 from msgspec.structs import replace
 from numpy.testing import assert_array_equal
 
-import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.check import trials
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.protocol.cells import MODELS
-from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
@@ -32,7 +30,7 @@ from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import InlinePool, searched
+from tests.in_process import searched
 from tests.made_up import drawn
 from tests.manual import ROOT
 
@@ -252,53 +250,6 @@ def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
         points.append(drive_and_score(system, drawn(system, 2, 2)).column("rating_points"))
     assert_array_equal(*points)
     assert points[0].max() > 0
-
-
-def with_own_models(study: Study, folder: Path) -> Study:
-    """A study with copies of its scenario, vehicle and driving system."""
-    for key, shipped in {"scenario": SCENARIOS, "vehicle": VEHICLES, "ads": ADS}.items():
-        table = getattr(study, key)
-        study = replace(study, **{key: replace(table, model=copied(shipped[table.model], folder))})
-    return study
-
-
-@SLOW
-@pytest.mark.parametrize(("name", "point"), [("smoke", None), ("sun", None), ("alks", "cut_in")])
-def test_a_search_with_models_in_a_users_file_finds_the_same_solutions(
-    name: str, point: str | None, in_tmp: Path
-) -> None:
-    ours = part_of_study(short(name, "nsga2"), name != "smoke", point, None)
-    assert_same_solutions(ours, with_own_models(ours, in_tmp), in_tmp)
-
-
-@SLOW
-def test_repair_and_compare_of_models_in_a_users_file_are_the_same(
-    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """But for the simulations that find out whether a user's system drives many vehicles with
-    different parameters.
-    """
-    monkeypatch.setattr("safevar_sumo.questions.falsify.USUAL_BUDGET", 300)
-    monkeypatch.setattr("safevar_sumo.questions.repair.SOBOL_VEHICLES", 32)
-    scenario = {"model": "crossing", "parameters": {"test": "CPFA", "speed": 40.0}}
-    change = {
-        "response_time": {"lower": 0.0, "upper": 1.5, "unit": "s", "meaning": "it plans with"}
-    }
-    ours = load_study("wear", matrix=None, scenario=scenario, repair=change)
-    answers = []
-    for study in (ours, with_own_models(ours, in_tmp)):
-        slower = replace(study, ads=replace(study.ads, parameters={"response_time": 0.6}))
-        worn = ["brakeTorque >= 0.5"]
-        repaired = sv.repair(
-            study, promise=worn, change=["response_time"], fits=0, pool=InlinePool()
-        )
-        compared = sv.compare(study, slower, samples=16, pool=InlinePool())
-        answers.append(
-            [(one.verdict, {**one.numbers, "simulations": 0}) for one in (repaired, compared)]
-        )
-    assert answers[0] == answers[1]
-    assert answers[0][0][1]["repairs"] == 1
-    assert answers[0][1][1]["only_a_unsafe"] > 0
 
 
 def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() -> None:

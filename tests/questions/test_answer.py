@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.cli.program import COMMANDS, commands, first_paragraph
+from safevar_sumo.cli.program import commands
 from safevar_sumo.questions.answer import Answer, Column, Wide, contents, tabulate, with_interval
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
@@ -254,16 +254,8 @@ def test_an_unknown_key_is_refused_with_the_nearest() -> None:
         ANSWER.values("probabilty")
 
 
-@pytest.mark.parametrize("name", QUESTIONS)
-def test_help_and_call_have_the_same_sentence_and_options(name: str) -> None:
-    ask = find_question(name)
-    assert getattr(sv, name) is ask
-    first, _, _ = (ask.__doc__ or "").partition("\n\n")
-    assert first_paragraph(COMMANDS[name]) == " ".join(first.split())
-    text = CliRunner().invoke(commands, [name, "--help"]).output
-    for option in ask.options:
-        assert option.meaning
-        assert f"--{option.name.replace('_', '-')}" in text
+def test_every_question_is_called_by_its_name() -> None:
+    assert [find_question(name) for name in QUESTIONS] == [getattr(sv, name) for name in QUESTIONS]
 
 
 def test_the_question_that_the_manual_adds_from_outside(
@@ -314,18 +306,6 @@ def test_a_printed_command_asks_the_same() -> None:
     given = command.make_context("tolerance", typed[4:]).params
     assert given["point"] == "CPNA, night"
     assert {name: given[name] for name in values} == values
-
-
-def test_a_question_refuses_a_point_as_its_command_does() -> None:
-    refused(
-        "rules",
-        "wear",
-        "--point",
-        "CPFB",
-        message=("--point: 'CPFB'", "expected: one of 26 points"),
-    )
-    with pytest.raises(sv.InputError, match="point: 'CPFB'"):
-        sv.rules("wear", point="CPFB")
 
 
 def test_a_change_has_no_share_of_an_original_that_is_0() -> None:

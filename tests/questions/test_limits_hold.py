@@ -54,14 +54,18 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
     "a metric, worst in a matrix": (
         "wear",
         {"matrix": FEW_TESTS},
-        {"unsafe": "drac > 8", "fits": 2},
+        {"unsafe": Unsafe.parse("drac > 8"), "fits": 2},
         600,
         "in 2 of 2 parameter sets",
     ),
     "a user's metric": (
         "rain",
         {"metrics": {"also": ["hardest_braking:HARDEST"]}},
-        {"unsafe": "hardest > 6.8", "fits": 0, "characteristics": ("tireFric,maxBrakeTorque",)},
+        {
+            "unsafe": Unsafe.parse("hardest > 6.8"),
+            "fits": 0,
+            "characteristics": ("tireFric,maxBrakeTorque",),
+        },
         600,
         "hardest > 6.8",
     ),
@@ -145,7 +149,7 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
     if claim != "several parameter sets":  # which few simulations do not reach
         request.getfixturevalue("few_simulations")
     (in_tmp / "hardest_braking.py").write_text(HARDEST_BRAKING)
-    unsafe = Unsafe.parse(options.get("unsafe", "collision"))
+    unsafe = options.get("unsafe", Unsafe())
     study = study_by(load_study(name, **changes), unsafe)
     evaluator = Evaluator(study, InlinePool(), verified=0)
     answer = tolerance.compute(study, evaluator, **options)

@@ -5,14 +5,12 @@ computed in this process.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from msgspec.structs import replace as replace_in
 
-import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.api.study import _verdict
 from safevar_sumo.check import check_study
@@ -90,7 +88,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
     points = float(original.column("rating_points")[0])
     assert points > evaluations.column("rating_points")[1]
     answer = explain.compute(
-        case, evaluator, solution=("nsga2:0:0",), unsafe=f"points={points - 1e-3}"
+        case, evaluator, solution=("nsga2:0:0",), unsafe=Unsafe(points=points - 1e-3)
     )
     (failure,) = answer.tables["solutions"].to_dict("records")
     assert failure["points"]
@@ -120,37 +118,6 @@ def test_only_cells_of_a_worse_colour_explain_a_failure(monkeypatch: pytest.Monk
     ((endings, worse_cells),) = compare_at_cells(evaluator, original_of(evaluator))
     assert worse_cells == (matrix[0].name, matrix[4].name)
     assert endings.startswith(f"At {matrix[4].name}: ")
-
-
-@SLOW
-def test_every_question_of_a_rated_study_takes_a_bound_on_points(in_tmp: Path) -> None:
-    criterion = ("--unsafe", "rating_points < 2.2")
-    study = (
-        'extends = "euro_ncap_rating"\nname = "rated"\n[search]\npopulation = 8\nevaluations = 32\n'
-    )
-    Path("rated.toml").write_text(study)
-    studied = json_of("study", "rated.toml", "--out", "results", "--quiet", *criterion)
-    solutions = sv.load("results").solutions
-    count = (solutions["rating_points"] < 2.2).sum()
-    assert count > 0
-    assert studied["verdict"].startswith(
-        f"The search found {len(solutions)} different solutions; of them {count} "
-    )
-    found = {}
-    for typed in (
-        ("risk", "rated.toml", "--samples", "64"),
-        ("rules", "rated.toml", "--samples", "64"),
-        ("explain", "results", "--fits", "0", "--top", "1"),
-        ("compare", "rated.toml", "rated.toml", "--samples", "32"),
-        ("tolerance", "rated.toml", "--characteristics", "treadDepth"),
-    ):
-        answer = found[typed[0]] = json_of(*typed, *criterion)
-        assert answer["numbers"]["unsafe"] == "rating_points < 2.2", typed
-    assert 0 < found["risk"]["numbers"]["failures"] == found["rules"]["numbers"]["failures"] < 64
-    assert found["explain"]["numbers"]["failures"] == count
-    (limit,) = found["tolerance"]["tables"]["limits"]["rows"]
-    cars = [{"treadDepth": value} for value in (limit["alone_low"], limit["alone_high"])]
-    assert (sv.evaluate("rated.toml", cars, filtered=False, jobs=1)["rating_points"] >= 2.2).all()
 
 
 @SLOW

@@ -38,7 +38,7 @@ from safevar_sumo.results.identity import (
     packages_of,
 )
 from safevar_sumo.results.manifest import read_manifest
-from safevar_sumo.study import Study, tables_of, write_study
+from safevar_sumo.study import Study, tables_of
 from tests.campaign.formulas import carried_out, with_search
 from tests.in_process import json_of, refused, run
 from tests.made_up import made_up_evaluations
@@ -353,21 +353,6 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     assert contents(copied) == before
 
 
-@pytest.mark.slow
-def test_altered_journals_are_simulated_again(copied: Path, slippery: Path) -> None:
-    journal = copied / "runs/nsga2-00.jsonl"
-    whole = (slippery / "runs/nsga2-00.jsonl").read_bytes()
-    journal.write_bytes(whole.replace(b'"collision"', b'"exploded"', 1))
-    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout
-    run("study", str(slippery.parent / "slippery.toml"), "--out", str(copied))
-    assert journal.read_bytes() == whole
-    assert (copied / "solutions.csv").read_bytes() == (slippery / "solutions.csv").read_bytes()
-    journal.write_bytes(re.sub(rb',"crc32":\d+}\n', b"}\n", whole))
-    assert "nsga2 0 of 1 runs" in run("tables", str(copied)).stdout
-    journal.write_bytes(whole.replace(b'"format":7', b'"format":5', 1))
-    refused("tables", str(copied), message="belongs to another study, version or run")
-
-
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir], ids=["a pipe", "a folder"])
 def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
     make: Callable[[Path], None], copied: Path, slippery: Path
@@ -420,20 +405,6 @@ def test_what_makes_a_study_refuse_is_found_before_anything_is_written(
     with pytest.raises(InputError, match=r"rs-0\d\.jsonl|manifest|solutions|runs"):
         carried_out(with_search(study, runs=2), tmp_path)
     assert contents(tmp_path) == before
-
-
-@pytest.mark.slow
-def test_results_survive_a_study_whose_characteristics_are_in_another_order(
-    copied: Path, case: Case, in_tmp: Path
-) -> None:
-    rows = case.study.vehicle.characteristics
-    vehicle = replace(case.study.vehicle, characteristics=dict(reversed(rows.items())))
-    write_study(Path("slippery.toml"), replace(case.study, vehicle=vehicle), "")
-    before = contents(copied)
-    command = ("study", "slippery.toml", "--runs", "2", "--out", str(copied), "--jobs", "1")
-    refused(*command, message=("another study",))
-    assert contents(copied) == before
-    assert "collide" in run("explain", str(copied), "--quick").stdout
 
 
 def contents(place: Path) -> dict[str, tuple[bytes, int]]:
