@@ -58,6 +58,7 @@ from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo import assemble, drive_and_score, settings_per_batch, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
 INTERRUPTED = "finished evaluations are kept in {}: run the same command again to continue"
@@ -183,7 +184,7 @@ def study(
     loaded, system = load_for_search(changed)
     if unsafe is not None:
         study_by(loaded, unsafe)  # refuses what no study has, before the search
-    for remark in dict.fromkeys(system.remarks):
+    for remark in dict.fromkeys(without_effect(system)):
         warn(remark)
     keys = _select_runs(all_runs(loaded), shard)
     if not keys:

@@ -20,6 +20,7 @@ from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, Study
 from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, vehicle_remarks
 from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.vehicles import CharacteristicSet
 
 REMARKS: Columns = {"remark": "what to know about this simulation"}
@@ -284,4 +285,4 @@ def _safety_comparison(simulation: Simulation) -> str:
 def remarks_of(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     pre_crash = pre_crash_sentence(system.points)
-    return [*remarks, *system.remarks, *vehicle_remarks(system), *filter(None, [pre_crash])]
+    return [*remarks, *without_effect(system), *vehicle_remarks(system), *filter(None, [pre_crash])]

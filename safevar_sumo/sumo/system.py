@@ -19,7 +19,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal, Quantity
-from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, equals_clear, weather_of
+from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.scenarios.mover import Mover, Part
@@ -31,10 +31,10 @@ from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.measuring import Measuring, measuring_of, own_criterion
 from safevar_sumo.sumo.models import create_driven, create_scenario, matrix_points
 from safevar_sumo.sumo.network import copied_network, network_for
-from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, check_network, network_remarks
+from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Scenes
-from safevar_sumo.sumo.simulated_study import check_matrix, noise_remarks
+from safevar_sumo.sumo.simulated_study import check_matrix
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.vehicle_check import check_plausible, check_units
 from safevar_sumo.vehicles import (
@@ -45,22 +45,9 @@ from safevar_sumo.vehicles import (
     calibration_drive,
     region_of,
 )
-from safevar_sumo.vehicles.base import Prepared
 
 _ONE_AT_A_TIME = RLock()
 """Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
-
-
-UNKNOWN_TO_DRIVER = (
-    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel"
-    " and minGap of the traffic file. He knows neither the delays of the vehicle and its sensors"
-    " nor its brakes: that can make him collide"
-)
-"""Remark on a controller written for TraCI."""
-DECEL = "decel"
-"""The characteristic that is the largest deceleration by the brakes [m/s^2]."""
-NEARLY = 0.999
-"""Share of the end of its domain at which the deceleration is lower if nothing else limits it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,103 +195,6 @@ class System:
             matrix=(),
             rater=None,
         )
-
-    @property
-    def remarks(self) -> list[str]:
-        """Remarks for the user on parts of networks and weathers that are not used or have no
-        effect.
-        """
-        if not self.mover.has("a driving system"):
-            return noise_remarks(self.characteristics, self.points)
-        # On networks, vehicles and drivers.
-        uses_traci = isinstance(self.ads, TraciController)
-        remarks = [
-            remark
-            for network in dict.fromkeys(point.scenario.network for point in self.points)
-            for remark in network_remarks(network, self._acting_attributes if uses_traci else ())
-        ]
-        remarks += self.vehicle.remarks
-        remarks += self._remarks_on_driver()
-        remarks += self._remarks_on_grip()
-
-        # On weathers without effect.
-        for weather in {point.weather.name: point.weather for point in self.points}.values():
-            if weather.visibility != 1 and uses_traci and not self._has_limited_range():
-                remarks.append(
-                    f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect:"
-                    " the vehicle has no sensor range, so a controller written for TraCI sees"
-                    " everything"
-                )
-            if equals_clear(weather) and not (self.ads.recognition_delay or self.ads.hesitation):
-                remarks.append(
-                    f"weather {weather.name!r} has no effect: its road and its visibility are those"
-                    " of clear weather, and no key of [ads.parameters] delays the ADS in it"
-                )
-        return remarks
-
-    @property
-    def _acting_attributes(self) -> set[str]:
-        """Attributes of the traffic file with which SUMO's driver drives under a controller written
-        for TraCI.
-        """
-        return {*ACTING_ATTRIBUTES} - ({"tau"} if self._has_tau else set())
-
-    @property
-    def _has_tau(self) -> bool:
-        return self.vehicle.sumo_type(self._prepared()).tau is not None
-
-    def _remarks_on_driver(self) -> list[str]:
-        """Remarks on the headway `tau` and on what SUMO's driver does not know."""
-        if isinstance(self.ads, TraciController):
-            return [UNKNOWN_TO_DRIVER]
-        if not self._has_tau:
-            return []
-        name = self.ads.tau_parameter
-
-        # A driver with a headway of its own takes the vehicle's tau.
-        if not name:
-            return [
-                "tau has no effect: it is the headway of SUMO's driver, and the study has"
-                " another ADS"
-            ]
-        is_default = getattr(self.ads, name) == getattr(type(self.ads)(), name)
-        return (
-            []
-            if is_default
-            else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
-        )
-
-    def _remarks_on_grip(self) -> list[str]:
-        """A remark on values of `decel` above what the tyres of the original vehicle carry."""
-        members = self.characteristics.vehicle
-        if DECEL not in members.names:
-            return []
-
-        # Does the largest deceleration still rise at the end of the domain?
-        upper = members.upper[members.names.index(DECEL)]
-        friction = max(point.weather.road_friction for point in self.points)
-        nearly, highest = (
-            self.vehicle.sumo_type(self._prepared(friction, decel=np.array([value]))).decel[0]
-            for value in (NEARLY * upper, upper)
-        )
-        if highest > nearly:
-            return []
-        return [
-            f"the tyres of the original vehicle carry at most {highest:.2f} m/s^2: a {DECEL} above"
-            " that acts on lighter braking alone, and a fully pressed pedal brakes no harder"
-        ]
-
-    def _has_limited_range(self) -> bool:
-        sensors = self.vehicle.sensors(self._prepared())
-        return sensors is not None and bool(np.isfinite(sensors.reach).all())
-
-    def _prepared(self, friction: float = 1.0, **changes: FloatArray) -> Prepared:
-        """The constants of the original vehicle with changes, on a road with this factor on its
-        friction.
-        """
-        members = self.characteristics.vehicle
-        original = members.columns(members.original_settings)
-        return self.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
 
 
 def simulate_command(study: Study) -> str:

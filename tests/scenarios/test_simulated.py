@@ -30,6 +30,7 @@ from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.repeats import joined
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.without_effect import without_effect
 from tests.in_process import InlinePool, json_of, refused, run
 
 MODELS = """
@@ -643,13 +644,13 @@ def test_repeats_are_for_simulators_of_the_users_own() -> None:
 def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:
     noisy = STUDY.replace("delay = {", 'delay = { meaning = "noise of the brake",')
     wall.write_text(noisy)
-    assert any("noise of one seed" in remark for remark in system_of(wall).remarks)
+    assert any("noise of one seed" in remark for remark in without_effect(system_of(wall)))
     (wall.parent / "models.py").write_text(
         MODELS.replace("    speed:", "    seed: int = 1\n    speed:")
     )
     wall.write_text(f'{noisy}\n[[matrix.tests]]\nname = "a"\nover = {{ seed = [1, 2, 3] }}\n')
     system = system_of(wall)
-    assert not system.remarks
+    assert not without_effect(system)
     assert [point.name for point in system.points] == ["a, seed 1", "a, seed 2", "a, seed 3"]
 
 

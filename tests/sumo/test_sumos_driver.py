@@ -18,6 +18,7 @@ from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.without_effect import without_effect
 from tests.sumo.test_traci_controller import changed, system
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -159,7 +160,7 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
     unused = (
         f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
     )
-    assert any(remark.startswith(unused) for remark in runs.remarks)
+    assert any(remark.startswith(unused) for remark in without_effect(runs))
     traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
     refuse_difference(runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6)
 
@@ -181,7 +182,9 @@ def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     run = drive_worst(runs, changed(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert last_gap(run) < 2  # of the 2.5 m that he wants
-    assert any("knows neither the delays of the vehicle" in remark for remark in runs.remarks)
+    assert any(
+        "knows neither the delays of the vehicle" in remark for remark in without_effect(runs)
+    )
     close, far = top_speeds(runs)
     assert close > far + 1  # m/s: the study's headway is his
 
@@ -244,7 +247,7 @@ def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> No
 def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> None:
     def remarks(model: str, **parameters: float) -> list[str]:
         study = load_study("native", ads={"model": model, "parameters": parameters})
-        *others, on_decel = assemble(study).remarks
+        *others, on_decel = without_effect(assemble(study))
         assert f"carry at most {0.9 * 9.81:.2f} m/s^2: a decel above" in on_decel
         return others
 
@@ -255,7 +258,7 @@ def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> Non
     hardest = drive_and_score(stops, np.concatenate(settings)).metrics["stopping_distance"]
     assert hardest[0] > hardest[1] == hardest[2] == hardest[3]
     grippy = load_study("native", vehicle={"parameters": {"tyre_friction": 1.0}})
-    assert assemble(grippy).remarks == []
+    assert without_effect(assemble(grippy)) == []
 
     fast, slow = top_speeds(assemble(load_study("native", ads={"model": "idm"})))
     assert fast > slow + 1

@@ -1,0 +1,124 @@
+"""Remarks for the user on parts of networks and weathers that are not used or have no effect."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safevar_sumo.records import FloatArray
+from safevar_sumo.scenarios import equals_clear
+from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, network_remarks
+from safevar_sumo.sumo.simulated_study import noise_remarks
+from safevar_sumo.sumo.system import System
+from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.vehicles.base import Prepared
+
+UNKNOWN_TO_DRIVER = (
+    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel"
+    " and minGap of the traffic file. He knows neither the delays of the vehicle and its sensors"
+    " nor its brakes: that can make him collide"
+)
+"""Remark on a controller written for TraCI."""
+DECEL = "decel"
+"""The characteristic that is the largest deceleration by the brakes [m/s^2]."""
+NEARLY = 0.999
+"""Share of the end of its domain at which the deceleration is lower if nothing else limits it."""
+
+
+def without_effect(system: System) -> list[str]:
+    """Remarks for the user on parts of networks and weathers that are not used or have no
+    effect.
+    """
+    if not system.mover.has("a driving system"):
+        return noise_remarks(system.characteristics, system.points)
+    # On networks, vehicles and drivers.
+    uses_traci = isinstance(system.ads, TraciController)
+    remarks = [
+        remark
+        for network in dict.fromkeys(point.scenario.network for point in system.points)
+        for remark in network_remarks(network, _acting_attributes(system) if uses_traci else ())
+    ]
+    remarks += system.vehicle.remarks
+    remarks += _remarks_on_driver(system)
+    remarks += _remarks_on_grip(system)
+
+    # On weathers without effect.
+    for weather in {point.weather.name: point.weather for point in system.points}.values():
+        if weather.visibility != 1 and uses_traci and not _has_limited_range(system):
+            remarks.append(
+                f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect:"
+                " the vehicle has no sensor range, so a controller written for TraCI sees"
+                " everything"
+            )
+        if equals_clear(weather) and not (system.ads.recognition_delay or system.ads.hesitation):
+            remarks.append(
+                f"weather {weather.name!r} has no effect: its road and its visibility are those"
+                " of clear weather, and no key of [ads.parameters] delays the ADS in it"
+            )
+    return remarks
+
+
+def _acting_attributes(system: System) -> set[str]:
+    """Attributes of the traffic file with which SUMO's driver drives under a controller written
+    for TraCI.
+    """
+    return {*ACTING_ATTRIBUTES} - ({"tau"} if _has_tau(system) else set())
+
+
+def _has_tau(system: System) -> bool:
+    return system.vehicle.sumo_type(_prepared(system)).tau is not None
+
+
+def _remarks_on_driver(system: System) -> list[str]:
+    """Remarks on the headway `tau` and on what SUMO's driver does not know."""
+    if isinstance(system.ads, TraciController):
+        return [UNKNOWN_TO_DRIVER]
+    if not _has_tau(system):
+        return []
+    name = system.ads.tau_parameter
+
+    # A driver with a headway of its own takes the vehicle's tau.
+    if not name:
+        return [
+            "tau has no effect: it is the headway of SUMO's driver, and the study has another ADS"
+        ]
+    is_default = getattr(system.ads, name) == getattr(type(system.ads)(), name)
+    return (
+        []
+        if is_default
+        else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
+    )
+
+
+def _remarks_on_grip(system: System) -> list[str]:
+    """A remark on values of `decel` above what the tyres of the original vehicle carry."""
+    members = system.characteristics.vehicle
+    if DECEL not in members.names:
+        return []
+
+    # Does the largest deceleration still rise at the end of the domain?
+    upper = members.upper[members.names.index(DECEL)]
+    friction = max(point.weather.road_friction for point in system.points)
+    nearly, highest = (
+        system.vehicle.sumo_type(_prepared(system, friction, decel=np.array([value]))).decel[0]
+        for value in (NEARLY * upper, upper)
+    )
+    if highest > nearly:
+        return []
+    return [
+        f"the tyres of the original vehicle carry at most {highest:.2f} m/s^2: a {DECEL} above"
+        " that acts on lighter braking alone, and a fully pressed pedal brakes no harder"
+    ]
+
+
+def _has_limited_range(system: System) -> bool:
+    sensors = system.vehicle.sensors(_prepared(system))
+    return sensors is not None and bool(np.isfinite(sensors.reach).all())
+
+
+def _prepared(system: System, friction: float = 1.0, **changes: FloatArray) -> Prepared:
+    """The constants of the original vehicle with changes, on a road with this factor on its
+    friction.
+    """
+    members = system.characteristics.vehicle
+    original = members.columns(members.original_settings)
+    return system.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
