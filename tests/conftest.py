@@ -147,7 +147,7 @@ def any_system(request: pytest.FixtureRequest) -> System:
     cells, and that in another simulator.
     """
     system = assemble(load_study(request.param))
-    return replace(system, matrix=system.matrix[::30])  # only some points of a long matrix
+    return replace(system, points=system.points[::30])  # only some points of a long matrix
 
 
 @pytest.fixture

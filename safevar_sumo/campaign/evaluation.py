@@ -64,7 +64,7 @@ class Selection(msgspec.Struct, frozen=True):
         """The system at the selected points."""
         if self.points is None:
             return system
-        return replace(system, matrix=tuple(system.points[number] for number in self.points))
+        return replace(system, points=tuple(system.points[number] for number in self.points))
 
 
 EVERYTHING = Selection()

@@ -78,7 +78,7 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
     """
     system = system_of(study)
     rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
-    backwards = Selection(points=tuple(range(len(system.matrix)))[::-1])
+    backwards = Selection(points=tuple(range(len(system.points)))[::-1])
     jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
     if pool.workers > 1:  # the second one has simulated nothing yet
         here, there = carry_out(evaluate_settings, jobs, pool)
@@ -118,7 +118,7 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
     with open_pool(1) as pool:  # first, as a simulator may end its process
         (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(replace(system, matrix=system.matrix[::-1]), settings)
+    here = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(here.results, there.results):
         from safevar_sumo.check.trials import Finding  # slow to import, and rarely needed
 

@@ -259,9 +259,8 @@ def _system(study: Study) -> System:
     again.
     """
     system = assemble(study)
-    return replace(
-        system, matrix=system.matrix[:: max(len(system.matrix) // MATRIX_POINTS, 1)], rater=None
-    )
+    points = system.points[:: max(len(system.points) // MATRIX_POINTS, 1)]
+    return replace(system, points=points, rater=None)
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:

@@ -136,7 +136,7 @@ def _recorded_world(
 
     # Paired vehicles share a scene.
     size = _vehicles_per_encounter(encounters)
-    scenario = system.at_encounters(encounters[::size]).scenario
+    scenario = system.at_encounters(encounters[::size]).points[0].scenario
     assert isinstance(scenario, WorldScenario)
     return RecordedWorld(scenes_of_encounters(scene, scenario, len(encounters) // size), size)
 

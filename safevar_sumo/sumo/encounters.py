@@ -146,11 +146,13 @@ def where_met(system: System, setting: FloatArray) -> System:
         If there is none.
     """
     settings = setting[np.newaxis]
-    matrix = tuple(point for point in system.matrix if met_at(point, system, settings).all())
-    if system.matrix and not matrix:
+    points = tuple(
+        point for point in system.points if not point.name or met_at(point, system, settings).all()
+    )
+    if not points:
         problem = f"no test has the encounter of {system.characteristics.options(setting)}"
         raise InputError(system.source, problem, "values in the ranges of one test")
-    return replace(system, matrix=matrix)
+    return replace(system, points=points)
 
 
 def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:

@@ -276,7 +276,7 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     if not reason_for_sumo(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
-        here = replace(system, matrix=points)
+        here = replace(system, points=points)
         # Settings that have no encounter of these points keep their rows, for the others' sake.
         met = met_at(points[0], system, settings)
         vehicles = settings if met.all() else in_place_of_unmet(points[0], system, settings, met)

@@ -4,7 +4,6 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,13 +17,13 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
-from safevar_sumo.records import FloatArray, Nominal, Quantity
+from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, weather_of
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.scenarios.mover import Mover, Part
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WORST, Domain, MetricsTable, Study, Weather
+from safevar_sumo.study import WORST, MetricsTable, Study
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter, original_encounter
 from safevar_sumo.sumo.engine import open_world
@@ -61,7 +60,7 @@ class System:
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - `allowed_impact_speed` [m/s], `phase` and `ranges` are those of the only point; see `Point`.
+    - Settings are simulated at `points`: those of the matrix, or the study's only scenario.
     - A simulator of the user's own simulates each setting `repeats` times.
     - `criterion` is the study's own.
     - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
@@ -73,43 +72,27 @@ class System:
     characteristics: CharacteristicSet
     vehicle: Vehicle
     ads: Ads
-    scenario: Scenario
-    weather: Weather
+    points: tuple[Point, ...]
     metrics_table: MetricsTable
     nominal: Nominal
     measuring: Measuring
     region: FeasibleRegion
     source: str = "study"
-    matrix: tuple[Point, ...] = ()
     rater: Rater | None = None
     scenes: Scenes = field(default_factory=Scenes)
     time_limit: float = 300.0
     sees_nobody: bool = False
     in_sumo: bool = False
     aggregate: str = WORST
-    allowed_impact_speed: float = 0.0
-    phase: Quantity = 0.0
-    ranges: Mapping[str, Domain] | None = None
     repeats: int = 1
     command: str = ""
     skips_failed: bool = False
     criterion: Unsafe = field(default_factory=Unsafe)
 
     @property
-    def points(self) -> tuple[Point, ...]:
-        """Points at which a setting is simulated: the points of the matrix, or the study's only
-        scenario.
-        """
-        if self.matrix:
-            return self.matrix
-        only = Point(
-            self.scenario,
-            self.weather,
-            allowed_impact_speed=self.allowed_impact_speed,
-            phase=self.phase,
-            ranges=self.ranges,
-        )
-        return (only,)
+    def matrix(self) -> tuple[Point, ...]:
+        """The points of a matrix, which have names; none in a study with a single scenario."""
+        return tuple(point for point in self.points if point.name)
 
     @property
     def mover(self) -> Mover:
@@ -180,21 +163,12 @@ class System:
             return self
         values = self.characteristics.scenario.columns(encounters)
         points = tuple(encounter(point, values) for point in self.points)
-        here = self.at(points[0]) if len(points) == 1 else replace(self, matrix=points)
-        return replace(here, characteristics=self.characteristics.vehicle)
+        return replace(self, points=points, characteristics=self.characteristics.vehicle)
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
-        return replace(
-            self,
-            scenario=point.scenario,
-            weather=point.weather,
-            allowed_impact_speed=point.allowed_impact_speed,
-            phase=point.phase,
-            ranges=point.ranges,
-            matrix=(),
-            rater=None,
-        )
+        alone = point._replace(name="", parameters=(), constraints=())
+        return replace(self, points=(alone,), rater=None)
 
 
 def simulate_command(study: Study) -> str:
@@ -265,31 +239,29 @@ def _assemble(study: Study) -> System:
     if not (matrix or study.ranges):
         scenario.check()
 
-    points = _original_points(study, lookup, Point(scenario, weather))
-    if points:
-        scenario, weather, *_ = points[0]
-        matrix = points if matrix else ()
+    only = Point(scenario, weather)
+    points = _original_points(study, lookup, only) or matrix or (only,)
+    if not matrix:
+        points = (Point(points[0].scenario, points[0].weather),)
 
     # What the driving system knows of the original vehicle.
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
-    for one in (scenario, *(point.scenario for point in matrix)):
-        _check_speed(one, nominal)
+    for point in points:
+        _check_speed(point.scenario, nominal)
     if study.vehicle.model not in {*VEHICLES, ""}:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(
         characteristics=region.characteristics,
         vehicle=vehicle,
         ads=ads,
-        scenario=scenario,
-        weather=weather,
+        points=points,
         metrics_table=study.metrics,
         nominal=nominal,
         measuring=measuring,
         region=region,
         source=study.source,
         scenes=Scenes(study.step_length),
-        matrix=matrix,
         rater=rater,
         time_limit=study.search.time_limit,
         aggregate=WORST if study.matrix is None else study.matrix.aggregate,

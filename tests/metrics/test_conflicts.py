@@ -70,7 +70,7 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
     paper's TTC.
     """
     values = {"test": "CPNA", "speed": 12.26, "impact_location": 4.88, "target_speed": 11.99}
-    scenario: Any = WEAR.scenario.at(values)
+    scenario: Any = WEAR.points[0].scenario.at(values)
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
     assert measured(runs)[:, 0] == pytest.approx([0.577, 2.84], abs=3e-3)
     assert time_to_collision(runs).min() == pytest.approx(0.489, abs=5e-4)

@@ -38,7 +38,7 @@ WITH_EXTRAS = {"metadrive_expert"}  # CI installs all others
 
 def at_phase(system: System, phase: float | FloatArray) -> System:
     points = tuple(point._replace(phase=phase) for point in system.points)
-    return replace(system, matrix=points) if system.matrix else replace(system, phase=phase)
+    return replace(system, points=points)
 
 
 def degrees(system: System, settings: FloatArray) -> FloatArray:
@@ -70,7 +70,7 @@ def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
     for phase in (0.25, 0.8, 1.0):
         scenario = system.points[0].scenario.at({"time_to_impact": 6 + phase * STEP})
         later = system.points[0]._replace(scenario=scenario)
-        expected = degrees(replace(system, matrix=(later,)), settings)
+        expected = degrees(replace(system, points=(later,)), settings)
         assert_allclose(degrees(at_phase(system, phase), settings), expected, atol=1e-9)
 
 

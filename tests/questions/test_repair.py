@@ -381,7 +381,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
     names, system = (
         tuple(CHANGEABLE[model]),
-        replace(assemble(study), matrix=assemble(study).points[-1:]),
+        replace(assemble(study), points=assemble(study).points[-1:]),
     )
     ends = np.array([(row.lower, row.upper) for row in CHANGEABLE[model].values()])
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
@@ -400,7 +400,7 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
     system = assemble(sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}}))
-    benign = replace(system, matrix=tuple(benign_scenes(sv.load_study(name), system)))
+    benign = replace(system, points=tuple(benign_scenes(sv.load_study(name), system)))
     assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
     for result in simulate_all_points(benign, system.characteristics.original[None]):
         assert not result.evaluations.collided[0], result.point.name

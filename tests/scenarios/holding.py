@@ -53,7 +53,8 @@ def driven(
     """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the
     vehicle keeps its speed.
     """
-    system = replace(system, scenario=scenario, matrix=(), ads=ads or Hold())
+    alone = system.at(system.points[0]._replace(scenario=scenario))
+    system = replace(alone, ads=ads or Hold())
     return drive_worst(
         system, system.characteristics.original_settings if settings is None else settings
     )

@@ -68,11 +68,11 @@ def ideal(system: System) -> System:
 def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> SimulationRuns:
     """Runs of the original vehicle in N encounters, whose parameters are arrays."""
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
-    points = [Point(scenario, system.weather)]
+    points = (Point(scenario, system.points[0].weather),)
     traffic = Traffic(points, np.arange(n), n_encounters=n, n_samples=samples, step=STEP)
     settings = np.tile(system.characteristics.original, (n, 1))
     world = LaneWorld(traffic, np.zeros(n) + scenario.start_speed, STEP)
-    return drive(replace(system, ads=ads, scenario=scenario), settings, world, traffic)
+    return drive(replace(system, ads=ads, points=points), settings, world, traffic)
 
 
 class Mass(NamedTuple):

@@ -162,7 +162,7 @@ def middle_beside(scenario: Any) -> float:
 
 def check(cells: list[Cell]) -> None:
     points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
-    system = replace(CARLA, ads=Hold(), matrix=points)
+    system = replace(CARLA, ads=Hold(), points=points)
     for cell, there in zip(cells, simulate_all_points(system, original_of(system)), strict=True):
         run = there.runs
         scenario = cell.scenario
@@ -211,7 +211,7 @@ def hit_at_any_time(scenario: Any) -> list[str]:
     n = 30
     arrival = driven(scenario).trace.time[-1]
     brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
-    system = replace(CARLA, ads=Hold(brakes_at), matrix=(Point(scenario, WEATHERS["clear"]),))
+    system = replace(CARLA, ads=Hold(brakes_at), points=(Point(scenario, WEATHERS["clear"]),))
     return assert_same(system, np.repeat(original_of(system), n, axis=0))
 
 

@@ -114,7 +114,7 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
         "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0},
     }
     system = assemble(load_study(wear, scenario=scenario))
-    assert system.scenario.duration >= 3 + (speed - 2 / 3.6) / 2
+    assert system.points[0].scenario.duration >= 3 + (speed - 2 / 3.6) / 2
     run = drive_worst(system, original_of(system))
     end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
     assert run.outcome[0] == Outcome.PASSED

@@ -129,7 +129,7 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
             base,
             matrix=None,
             scenario={"model": scenario["model"], "parameters": parameters},
-            weather={**msgspec.to_builtins(system.weather), **weather},
+            weather={**msgspec.to_builtins(system.points[0].weather), **weather},
         )
         other = assemble(plain)
         both = np.stack([setting[of_vehicle], other.characteristics.original])

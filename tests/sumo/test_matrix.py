@@ -78,7 +78,8 @@ HOLDS_HALF = Pedals(lambda seen: (0.5, 0))
 def run(
     scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
 ) -> SimulationRuns:
-    system = replace(system, scenario=scenario, ads=ads or HOLDS_HALF)
+    alone = system.at(system.points[0]._replace(scenario=scenario))
+    system = replace(alone, ads=ads or HOLDS_HALF)
     return drive_worst(system, original_of(system) if settings is None else settings)
 
 
@@ -133,7 +134,9 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
     prepared = vehicle.prepare(original, 1.0, 0.05)
     state = vehicle.at_speed(prepared, np.array([50 / 3.6]))
     all_open = np.ones(1, dtype=bool)
-    robot = DrivingRobot([Point(CarToCar(speed=50), SUN.weather)], vehicle, prepared, state, 0.05)
+    robot = DrivingRobot(
+        [Point(CarToCar(speed=50), SUN.points[0].weather)], vehicle, prepared, state, 0.05
+    )
     robot.drive(
         Command(state.throttle, state.brake),
         state._replace(speed=np.array([(50 + error) / 3.6])),

@@ -28,9 +28,10 @@ def creeping() -> System:
 
 
 def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> None:
-    scenario = creeping.scenario
+    scenario = creeping.points[0].scenario
     assert isinstance(scenario, CarToCar)
-    patient = replace(creeping, scenario=replace_in(scenario, time_after=35.0))
+    longer = replace_in(scenario, time_after=35.0)
+    patient = creeping.at(creeping.points[0]._replace(scenario=longer))
     population = drawn(creeping, 60, 3)
     found = drive_and_score(creeping, population)
     assert set(found.outcome) <= {Outcome.STOPPED, Outcome.COLLISION}
@@ -40,7 +41,7 @@ def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> N
 def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
     population = drawn(creeping, 60, 3)
     ends = drive_all(creeping, population).trace.last_active * 0.05
-    went_on = ends > float(np.max(creeping.scenario.duration))
+    went_on = ends > float(np.max(creeping.points[0].scenario.duration))
     assert 0 < went_on.sum() < len(population)
     alone = drive_and_score(creeping, population[~went_on]).results
     together = drive_and_score(creeping, population).take(~went_on).results
@@ -60,7 +61,8 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, in_sumo: bool) ->
 @pytest.mark.slow
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
     system = assemble(at_point(load_study("alks", encounters="ranges"), "cut_in"))
-    patient = replace(system, scenario=replace_in(system.scenario, duration=60.0))
+    (point,) = system.points
+    patient = system.at(point._replace(scenario=replace_in(point.scenario, duration=60.0)))
     population = drawn(system, 300, 1)
     found = drive_and_score(system, population, with_originals=False)
     assert not [

@@ -90,7 +90,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 ) -> None:
     """In an empty cache: SUMO plays the scene, and the next process reads the file."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
-    scenario = assemble(load_study("sun")).scenario
+    scenario = assemble(load_study("sun")).points[0].scenario
 
     def scene() -> str:
         return repr(Scenes().of(scenario))

@@ -111,7 +111,7 @@ def needless_braking(system: System, benign: list[Point]) -> list[bool]:
         for result in simulate_all_points(
             replace(
                 system,
-                matrix=tuple(points),
+                points=tuple(points),
                 rater=None,
                 sees_nobody=sees_nobody,
                 characteristics=vehicle,
