@@ -27,7 +27,7 @@ from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names, without_skipping
-from safevar_sumo.sumo.kept import number_simulated
+from safevar_sumo.sumo.kept import KEPT
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.vehicles import region_of
 
@@ -133,7 +133,7 @@ def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
     from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
 
     unload_user_modules()
-    before = number_simulated()
+    before = KEPT.simulated
     with record_use(task.study.origin.places) as use:
         refuse_defects(task.study, most)
-    return use, number_simulated() - before
+    return use, KEPT.simulated - before

@@ -106,7 +106,7 @@ class Comparison:
     def refuse_without_position(self) -> None:
         """Refuse to draw runs without positions."""
         if not self.has_position:
-            self.system.require("a picture", "this figure or animation")
+            self.system.require("a picture", "--plot or --animate")
 
     @property
     def network(self) -> NetworkFiles:

@@ -38,8 +38,7 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
             left -= int(options[options.index(SIMULATIONS.flag) + 1])
             continue
         key = tuple(options) if name in ONE_SAMPLE else (text,)
-        is_refused = name == "repair" and not system.mover.has("a driving system")
-        is_free = is_refused or (system.mover.takes_long and key in known)
+        is_free = system.mover.takes_long and (key in known or name == "repair")  # which it refuses
         (others if is_free else own).append(text)
         known.add(key)
 

@@ -27,8 +27,9 @@ class Mover(NamedTuple):
     kind
         What a scenario of it is, in words. All tests of a matrix have one kind.
     at_once
-        How many settings it simulates at once; 0 is as many as fit into memory. With 1 a simulation
-        takes long: questions say how many they take, and do as many as they may.
+        How many settings it simulates at once; 0, for SUMO alone, is as many as fit into memory.
+        With 1 a simulation takes long: questions say how many they take, and do as many as they
+        may.
     is_exact
         Whether it repeats itself to the bit. If not, a study may say how often each setting is
         repeated, or it is tried that results are the same in another process.

@@ -176,14 +176,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     """The speeds at the start of n vehicles at each point."""
-    scenarios = (point.scenario for point in points)
-    return np.concatenate(
-        [
-            np.zeros(n) + scenario.start_speed
-            for scenario in scenarios
-            if isinstance(scenario, TrackScenario)
-        ]
-    )
+    return np.concatenate([np.zeros(n) + point.scenario.start_speed for point in points])
 
 
 def _vehicles_per_encounter(encounters: FloatArray) -> int:

@@ -24,7 +24,8 @@ PLAIN = (bool, int, float, complex, str, bytes, tuple, list, dict, set, Random, 
 
 class Kept:
     """What this process keeps of the simulators of the user's own: of each class the handle that
-    its `open_worker` returned, and the object that simulated last.
+    its `open_worker` returned, and the object that simulated last; and how often it has
+    `simulated`.
     """
 
     def __init__(self) -> None:
@@ -101,11 +102,6 @@ def _deep_copy(value: Any) -> Any:
 
 KEPT = Kept()
 """What this process keeps."""
-
-
-def number_simulated() -> int:
-    """How often this process has simulated in simulators of the user's own."""
-    return KEPT.simulated
 
 
 @atexit.register

@@ -25,8 +25,8 @@ from safevar_sumo.plugins.process import (
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
+    NO_CONTACT,
     QUANTITIES,
-    Contact,
     Encounter,
     FloatArray,
     Outcome,
@@ -34,7 +34,7 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import Simulator
-from safevar_sumo.scenarios.simulated import IMPACT_SPEED, OUTCOME, STRUCK_SPEED, TIME
+from safevar_sumo.scenarios.simulated import ALSO_SAMPLED, IMPACT_SPEED, OUTCOME, STRUCK_SPEED, TIME
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.kept import KEPT
@@ -177,7 +177,8 @@ def _runs_of(
         return np.array([result.get(name, np.nan) for result in of], dtype=float)
 
     # How hard the collisions were, and other metrics that a run without a trace states.
-    collided = np.array([result[OUTCOME] == Outcome.COLLISION for result in results])
+    outcome = np.array([result[OUTCOME] for result in results], dtype="U16")
+    collided = outcome == Outcome.COLLISION
     struck = np.nan_to_num(number(STRUCK_SPEED))
     impact = np.where(np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED))
     closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
@@ -188,32 +189,26 @@ def _runs_of(
     stated["impact_excess"] = np.where(collided, excess, number("impact_excess", rigs))
 
     # One batch, as of SUMO.
-    speed, gap, obstacle_speed = map(column, ("speed", "gap", "obstacle_speed"))
+    columns: dict[str, Any] = {name: column(name) for name in ("speed", *ALSO_SAMPLED)}
+    closing = columns["speed"] - columns["obstacle_speed"]
     separation = column("separation")
-    nothing = np.zeros(speed.shape)
+    nothing = np.zeros(closing.shape)
     return SimulationRuns(
         trace=Trace(
             step=step,
             vehicle_length=0.0,
             time=samples * step,
-            position=column("position"),
-            speed=speed,
-            gap=gap,
             lateral=nothing,
             lateral_speed=nothing,
-            throttle=column("throttle"),
-            brake=column("brake"),
             gear=nothing,
             active=samples[:, np.newaxis] < lengths,
-            obstacle_speed=obstacle_speed,
+            **columns,
         ),
-        encounter=Encounter(separation, gap, speed - obstacle_speed, np.isfinite(separation)),
-        outcome=np.array([result[OUTCOME] for result in results], dtype="U16"),
+        encounter=Encounter(separation, columns["gap"], closing, np.isfinite(separation)),
+        outcome=outcome,
         collision_speed=np.where(collided, impact, np.nan),
-        contact=Contact(
-            np.full(len(results), "", dtype="U5"), np.full(len(results), np.nan), struck
-        ),
-        allowed_impact_speed=np.full(len(results), allowed_impact_speed),
+        contact=NO_CONTACT._replace(speed=struck),
+        allowed_impact_speed=np.array(allowed_impact_speed),
         lacks={name: np.array([name not in trace for trace in traces]) for name in QUANTITIES},
         stated=stated,
     )

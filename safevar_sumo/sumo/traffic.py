@@ -119,8 +119,7 @@ class Traffic:
         samples = slice(self._sample, self._sample + 1)
         closes = np.zeros(self.n, dtype=bool)
         for k in self._encountered:
-            apart, rate = self._apart(k, samples, front, speed)
-            counts = ~self._ended[k, samples] & self._table(self._counts[k], samples)
+            apart, rate, counts = self._apart(k, samples, front, speed)
             closes |= (counts & (rate > STEADY) & (apart < OVERTIME * rate))[0]
         return closes
 
@@ -336,8 +335,9 @@ class Traffic:
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
             for k in self._encountered:
-                apart, rate = self._apart(k, samples, trace.position[samples], trace.speed[samples])
-                counts = ~self._ended[k, samples] & self._table(self._counts[k], samples)
+                apart, rate, counts = self._apart(
+                    k, samples, trace.position[samples], trace.speed[samples]
+                )
                 is_nearer = (
                     counts & (apart < distance[samples]) if len(self._encountered) > 1 else counts
                 )
@@ -350,8 +350,10 @@ class Traffic:
 
     def _apart(
         self, number: int, samples: slice, front: FloatArray, speed: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The distances of vehicles to a body at some samples, and how fast they shrink."""
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """The distances of vehicles to a body at some samples, how fast they shrink, and whether
+        they count.
+        """
         body = self._bodies[number]
         edge, far, vx, vy, y, half_width = (
             self._table(column, samples)
@@ -369,7 +371,8 @@ class Traffic:
                 *body.track[:2], *(self._table(column, samples) for column in body.track[2:])
             )
             apart = distance_between(track, front - self.length / 2, self.length, self.width)
-        return apart, rate
+        counts = ~self._ended[number, samples] & self._table(self._counts[number], samples)
+        return apart, rate, counts
 
     def _table(self, column: Sampled, samples: slice) -> Sampled:
         """A column at some samples, for each vehicle or for all of them."""
