@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import xml.etree.ElementTree as ET
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -119,19 +120,10 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
         ego, foe = shared(rows, f"ego{i}", f"foe{i}")
         gap, closing = (foe - ego)[:, [0]] - LENGTH, (ego - foe)[:, [2]]
         run = made_up_runs(STEP, ego[:, [2]], gap)
-        run = SimulationRuns(
-            trace=run.trace,
-            encounter=Encounter(gap, gap, closing, gap > 0),
-            outcome=run.outcome,
-            collision_speed=run.collision_speed,
-        )
-        conflict = conflicts[f"ego{i}foe{i}"]
-        assert measured("ttc_min", run) == pytest.approx(
-            float(conflict.find("minTTC").attrib["value"]), rel=2e-3
-        )
-        assert measured("drac", run) == pytest.approx(
-            float(conflict.find("maxDRAC").attrib["value"]), rel=2e-3
-        )
+        run = replace(run, encounter=Encounter(gap, gap, closing, gap > 0))
+        for name, tag in (("ttc_min", "minTTC"), ("drac", "maxDRAC")):
+            of_device = float(conflicts[f"ego{i}foe{i}"].find(tag).attrib["value"])
+            assert measured(name, run) == pytest.approx(of_device, rel=2e-3)
 
 
 @pytest.mark.slow
@@ -171,12 +163,6 @@ def test_before_and_behind_who_crosses_pet_is_that_of_the_device(tmp_path: Path)
             active=np.logical_not(np.logical_or.accumulate(is_over, axis=0)),
         )
         run.outcome[:] = Outcome.PASSED
-        trace = dict(vars(run.trace), vehicle_width=WIDTH)
-        run = SimulationRuns(
-            trace=type(run.trace)(**trace),
-            encounter=run.encounter,
-            outcome=run.outcome,
-            collision_speed=run.collision_speed,
-        )
+        run = replace(run, trace=replace(run.trace, vehicle_width=WIDTH))
         device = float(conflicts[f"ego{i}foe{i}"].find("PET").attrib["value"])
         assert measured("pet", run) == pytest.approx(device, abs=STEP)

@@ -19,13 +19,13 @@ from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import tolerance
-from safevar_sumo.records import ROUNDING
+from safevar_sumo.records import ROUNDING, FloatArray
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
-from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, searched, verify_everywhere
 from tests.made_up import case_of, drawn
 from tests.sumo.planted import BRAKING, GAP
@@ -158,10 +158,16 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )
-    in_sumo = drive_and_score(replace(system, in_sumo=True), settings)
-    assert in_sumo.outcome.tolist() == together.outcome.tolist()
-    assert_allclose(in_sumo.f_safe, together.f_safe, rtol=0, atol=ROUNDING)
     assert settings_per_batch(system) > len(settings)
+    assert_the_same_in_sumo(system, settings)
+
+
+def assert_the_same_in_sumo(system: System, settings: FloatArray) -> None:
+    recorded, in_sumo = (
+        drive_and_score(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
+    )
+    assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
+    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("case", ["walker", "parked"])
@@ -175,11 +181,7 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     )
     corners = product(*((one.lower, one.upper) for one in system.characteristics.scenario))
     settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
-    recorded, in_sumo = (
-        drive_and_score(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
-    )
-    assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
-    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
+    assert_the_same_in_sumo(system, settings)
 
 
 def planted(**changes: Any) -> Study:
