@@ -98,18 +98,12 @@ def trace_frame(
     # What its driving system saw at the same times; one of a simulator of the user's own is inside.
     if not observations:
         return frame.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")
-    observed = pd.DataFrame(
-        [
-            {
-                "time [s]": round(float(observation.time), TIME_DECIMALS),
-                **{
-                    head: float(getattr(observation, name)[row])
-                    for name, head in OBSERVATION_HEADS.items()
-                },
-            }
-            for observation in observations
-        ]
-    )
+    seen: dict[str, list[float]] = {
+        head: [float(getattr(one, name)[row]) for one in observations]
+        for name, head in OBSERVATION_HEADS.items()
+    }
+    seen["time [s]"] = [round(float(one.time), TIME_DECIMALS) for one in observations]
+    observed = pd.DataFrame(seen)
     return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 

@@ -81,26 +81,9 @@ PAIR_COLUMNS: Columns = {
 
 @question
 @contents(
-    *(
-        "decision",
-        "unsafe",
-        "margin",
-        "settings",
-        *UNSAFE_IN.values(),
-        "p",
-        "a12",
-        "better_in",
-        "worse_in",
-    ),
-    *(
-        "limits_grown",
-        "limits_shrunk",
-        "outside",
-        "not_simulated",
-        *ENDS,
-        "metres_earlier",
-        "metres_later",
-    ),
+    *("decision", "unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12"),
+    *("better_in", "worse_in", "limits_grown", "limits_shrunk", "outside", "not_simulated"),
+    *(*ENDS, "metres_earlier", "metres_later"),
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
     "benign_scenes",
     lead="summary",
