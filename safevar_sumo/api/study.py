@@ -29,10 +29,11 @@ from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.ask import Criterion
 from safevar_sumo.questions.by_criterion import cases_by, study_by
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
 from safevar_sumo.questions.counterexamples import fewest_changes
-from safevar_sumo.questions.options import Criterion, Jobs, PointName, Range, UpTo
+from safevar_sumo.questions.options import Jobs, PointName, Range, UpTo
 from safevar_sumo.questions.part import part_of_study
 from safevar_sumo.questions.research_questions.answer import (
     REMARKS,

@@ -15,7 +15,7 @@ from functools import cached_property, update_wrapper
 from importlib import import_module, invalidate_caches
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 
@@ -55,6 +55,11 @@ QUESTIONS = {
 """The module of each question, whose function has the question's name."""
 
 
+Criterion = Annotated[Unsafe | None, CRITERION]
+"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
+metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
+setting collides, else half of the original's safety degree; of a rated study, any point lost.
+"""
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (

@@ -42,11 +42,7 @@ Fraction = Annotated[float, Range(0, 1, is_open=True)]
 Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""
 CRITERION = '"METRIC < X"|collision|below=X|points=X'
-Criterion = Annotated[Unsafe | None, CRITERION]
-"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
-metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
-setting collides, else half of the original's safety degree; of a rated study, any point lost.
-"""
+"""The form of a criterion."""
 CARS_FILE = "FILE.csv"
 """A list of cars: its path, or in the library also a DataFrame or a mapping."""
 LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']

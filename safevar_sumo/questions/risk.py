@@ -18,7 +18,7 @@ from numpy.random import default_rng
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import HIGH, LOW, Answer, contents
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.indices import (
@@ -34,7 +34,7 @@ from safevar_sumo.questions.indices import (
     regression_indices,
     sobol_indices,
 )
-from safevar_sumo.questions.options import Count, Criterion, Fraction
+from safevar_sumo.questions.options import Count, Fraction
 from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson

@@ -18,10 +18,10 @@ import pandas as pd
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.options import Count, Criterion
+from safevar_sumo.questions.options import Count
 from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson

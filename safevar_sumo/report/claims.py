@@ -40,7 +40,7 @@ from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedSt
 from safevar_sumo.report.page import make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.sheet import with_speed
-from safevar_sumo.report.texts import answer_about, completed, parse_question, with_criterion
+from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import (
     MANIFEST,
     SOLUTIONS,
@@ -202,7 +202,6 @@ class Packed:
             return self._answers[text]
         add_import_folders(self._places)
         shown = self.shown
-        usual = {with_criterion(one, self.unsafe) for one in usual_questions(shown)}
         question, values = asked or parse_question(text)
         part = self.packed.simulations.get(text)
         values = completed(question, values, self.unsafe, part, quick=False)
@@ -217,7 +216,7 @@ class Packed:
                 question,
                 values,
                 *([case], [self._directory], None, self._jobs, self._progress),
-                is_asked=text in {*self.packed.questions} - usual,
+                is_asked=text in {*self.packed.questions} - {*usual_questions(shown)},
                 pool=self.pool,
                 questions=len(self.packed.questions) + 1,
             )

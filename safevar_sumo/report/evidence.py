@@ -19,9 +19,10 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, temporary_folder
 from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
 from safevar_sumo.questions.answer import Answer, contents
+from safevar_sumo.questions.ask import Criterion
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
+from safevar_sumo.questions.options import Cluster, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
@@ -65,7 +66,7 @@ from safevar_sumo.report.pack import (
     write_pack,
 )
 from safevar_sumo.report.page import speed_part, usual_questions
-from safevar_sumo.report.texts import parse_question, with_criterion
+from safevar_sumo.report.texts import parse_question
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
@@ -165,10 +166,9 @@ def _pack_study(
     stored = {**read_manifest(directory), "study": tables_of(study)}
     manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
 
-    # The questions, by the criterion that the user gave.
+    # The questions, which are asked by the criterion that the user gave.
     (shown,) = cases_by([case], unsafe, progress=show_no_progress, **how)
-    asked = [with_criterion(text, unsafe) for text in ask or usual_questions(shown)]
-    questions, lists = _with_lists(list(dict.fromkeys(asked)))
+    questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(shown))))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
     parts = dict[str, int]()

@@ -22,10 +22,10 @@ from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Question
+from safevar_sumo.questions.ask import Criterion, Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.options import Cluster, Criterion, Jobs, Simulations
+from safevar_sumo.questions.options import Cluster, Jobs, Simulations
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote, split
+from shlex import split
 from typing import Any
 
 from safevar_sumo.campaign.pool import Pool
@@ -57,18 +57,6 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     return asked, values
 
 
-def takes_criterion(question: Question) -> bool:
-    """Whether it is asked by a criterion."""
-    return any(option.metavar == CRITERION for option in question.options)
-
-
-def with_criterion(text: str, unsafe: Unsafe | None) -> str:
-    """A question with a criterion, if it takes one and states none."""
-    question, values = parse_question(text)
-    is_given = unsafe is not None and takes_criterion(question) and "unsafe" not in values
-    return f"{text} --unsafe {quote(str(unsafe))}" if is_given else text
-
-
 def completed(
     question: Question, values: JsonObject, unsafe: Unsafe | None, part: int | None, *, quick: bool
 ) -> JsonObject:
@@ -76,7 +64,7 @@ def completed(
     simulations, and whether its answer is rough.
     """
     usual: JsonObject = {SIMULATIONS.name: part}
-    if unsafe is not None and takes_criterion(question):
+    if unsafe is not None and any(option.metavar == CRITERION for option in question.options):
         usual["unsafe"] = unsafe
     if quick and question.has_rough_answer:
         usual[QUICK] = True

@@ -18,7 +18,7 @@ import pandas as pd
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import RATING_POINTS, Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare.differences import (
     BOTH,
@@ -48,7 +48,7 @@ from safevar_sumo.questions.compare.settings import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import check_margin, distance_to_keep
-from safevar_sumo.questions.options import Count, Criterion, LimitTexts, Margin
+from safevar_sumo.questions.options import Count, LimitTexts, Margin
 from safevar_sumo.questions.pairs import (
     ENDS,
     SETTING_COLUMNS,

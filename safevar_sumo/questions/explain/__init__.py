@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import pandas as pd
 
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Case, Subject, are_collisions
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
@@ -47,7 +47,7 @@ from safevar_sumo.questions.explain.tables import (
     statistics_tables,
 )
 from safevar_sumo.questions.explain.words import others_in_words, verdict_on_failures
-from safevar_sumo.questions.options import Criterion, Range
+from safevar_sumo.questions.options import Range
 from safevar_sumo.questions.over_sets import planned_over_sets
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,

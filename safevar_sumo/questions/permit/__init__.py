@@ -15,20 +15,12 @@ from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
-from safevar_sumo.questions.options import (
-    CARS_FILE,
-    Criterion,
-    Fits,
-    LimitTexts,
-    Margin,
-    Range,
-    ValueTexts,
-)
+from safevar_sumo.questions.options import CARS_FILE, Fits, LimitTexts, Margin, Range, ValueTexts
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of

@@ -9,13 +9,13 @@ from typing import Annotated
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import question
+from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.cause_limits import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import limit_criterion
-from safevar_sumo.questions.options import Criterion, Fits, LimitTexts, Margin
+from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
 from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
 from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
