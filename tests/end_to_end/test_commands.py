@@ -237,12 +237,6 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
     assert [name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
         "a file that the manual does not list"
     )
-    for name, text in files.items():
-        Path("..", name).write_text(f"{text}\n# a comment\n")
-        assert f"{name} has changed since" in refusal(
-            "study", "../mine.toml", "--out", "../out", "--runs", "3"
-        )
-        Path("..", name).write_text(text)
     Path("../far.txt").write_text("another")
     for words in ("simulate ../out --solution most-severe", "explain ../out", "report ../out"):
         result = refusal(*words.split())
