@@ -65,7 +65,7 @@ from safevar_sumo.report.pack import (
     versions_here,
     write_pack,
 )
-from safevar_sumo.report.page import speed_part, usual_questions
+from safevar_sumo.report.page import usual_questions, with_speed_part
 from safevar_sumo.report.texts import parse_question
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
@@ -175,7 +175,7 @@ def _pack_study(
     if simulations is not None:
         system = assemble(shown.study)
         again = len(case.settings) * (shown.study != case.study) * simulations_of_setting(system)
-        parts = divided([*questions, *speed_part(questions, case)], simulations - again, system)
+        parts = divided(with_speed_part(questions, case), simulations - again, system)
     outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
     described = PackedStudy(
         folder, questions, runs, outcomes, solutions, str(unsafe) if unsafe else None, parts

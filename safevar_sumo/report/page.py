@@ -11,7 +11,7 @@ from functools import partial
 from io import BytesIO
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -22,10 +22,10 @@ from safevar_sumo.errors import InputError, check_text, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Criterion, Question
+from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.options import Cluster, Jobs, Simulations
+from safevar_sumo.questions.options import CRITERION, Cluster, Jobs, PointName, Simulations
 from safevar_sumo.questions.subject import Results, case_at, changes_since
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
@@ -62,8 +62,8 @@ def report(
     *results: Results | str | Path,
     out: str | Path = "report.html",
     ask: tuple[str, ...] = (),
-    unsafe: Criterion = None,
-    point: str | None = None,
+    unsafe: Annotated[Unsafe | str | None, CRITERION] = None,
+    point: PointName = None,
     jobs: Jobs = None,
     cluster: Cluster = None,
     progress: bool | Progress = False,
@@ -140,7 +140,7 @@ def report(
     with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
-        texts = [*chain(*map(_with_speed_part, asked, by_criterion)), *joint]
+        texts = [*chain(*map(with_speed_part, asked, by_criterion)), *joint]
         budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
@@ -203,7 +203,7 @@ def _budgets(
             by_criterion[number].study != at_point[number].study
         )
         spent = again * len(case.settings) * simulations_of_setting(system)
-        texts = [*_with_speed_part(asked[number], case), *(joint if number == 0 else [])]
+        texts = [*with_speed_part(asked[number], case), *(joint if number == 0 else [])]
         found.append(divided(texts, (simulations or 0) // len(cases) - spent, system))
     return found
 
@@ -223,15 +223,12 @@ def _pool_of(
     return pool
 
 
-def _with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
-    """The questions about results, with that of the greatest speed that their sheet has."""
-    return [*asked, *speed_part(asked, case)]
-
-
-def speed_part(asked: Sequence[str], case: Case) -> list[str]:
-    """The name of the question of the greatest speed, if the sheet of a page has it."""
+def with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
+    """The questions about results, with the name of that of the greatest speed if the sheet of
+    their page has it.
+    """
     has_sheet = any(text.startswith("tolerance") for text in asked)
-    return [SPEED] if has_sheet and speeds_of(case) else []
+    return [*asked, *([SPEED] if has_sheet and speeds_of(case) else [])]
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
