@@ -206,15 +206,7 @@ def where_in_words(
     numbers = {**{name: value for name, value in own.items() if name not in OF_ENCOUNTER}, **values}
     if not numbers.get(PHASE, 1):
         del numbers[PHASE]
-    units = searchable_in(point.scenario)
-    texts = {
-        name: (
-            f"{value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
-            if isinstance(value, int | float)
-            else str(value)
-        )
-        for name, value in numbers.items()
-    }
+    texts = texts_of(point, numbers)
     speed = texts.pop(SPEED_DIMENSION, "")
     if not speed and scenario.test_speed is not None:
         speed = f"{KMH_PER_MS * scenario.test_speed:.4g} km/h"
@@ -227,6 +219,19 @@ def where_in_words(
     if test:
         return f" in the test {test}{at}{beside}"
     return f" in an encounter{at}{beside}" if at or beside else ""
+
+
+def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
+    """Values of an encounter at a point, by name, as they are printed."""
+    units = searchable_in(point.scenario)
+    return {
+        name: (
+            f"{value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
+            if isinstance(value, int | float)
+            else str(value)
+        )
+        for name, value in values.items()
+    }
 
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:

@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.counterexamples import failures_at
+from safevar_sumo.questions.counterexamples import failures_at, texts_of
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.search import Permit
 from safevar_sumo.questions.permit.speeds import LimitingFailure
 from safevar_sumo.questions.tables import Column, Columns, Rows
-from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
-from safevar_sumo.scenarios import searchable_in
+from safevar_sumo.questions.words import change_texts, join_phrases
 from safevar_sumo.study import PHASE, unit_text
 
 PHASE_COLUMN = Column("-", "steps by which that encounter begins later", ".4f")
@@ -89,15 +88,9 @@ def failures_in_words(
                 for name, value in point.parameters
                 if name not in ("test", "weather") and name not in members.names
             }
-            units = searchable_in(point.scenario)
             numbers_of = {**axes, **members.scenario.named(setting[~members.of_vehicle])}
             phase = numbers_of.pop(PHASE, None)
-            texts = [
-                f"{name} {value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
-                if isinstance(value, int | float)
-                else f"{name} {value}"
-                for name, value in numbers_of.items()
-            ]
+            texts = [f"{name} {text}" for name, text in texts_of(point, numbers_of).items()]
             found[number] = FailureInWords(
                 test=known[row].encounters.test or None,
                 encounter=", ".join(texts) or None,
