@@ -13,13 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import about
-from safevar_sumo.metrics import (
-    IMPACT_EXCESS,
-    IMPACT_SPEED,
-    Scoring,
-    impact_in_words,
-    time_to_collision,
-)
+from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, Scoring, impact_in_words
 from safevar_sumo.metrics.unsafe import runs_in_words
 from safevar_sumo.questions.between import with_encounters
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
@@ -72,7 +66,7 @@ def trace_frame(
 
     # What the simulation logged.
     trace = runs.trace
-    ttc = np.where(trace.speed > STANDSTILL, time_to_collision(runs), np.inf)
+    ttc = np.where(trace.speed > STANDSTILL, runs.time_to_collision, np.inf)
     columns = {
         "position [m]": trace.position,
         "speed [m/s]": trace.speed,

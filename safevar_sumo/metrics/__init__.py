@@ -29,7 +29,6 @@ from safevar_sumo.metrics.measures import (
     TIT,
     TTC_MIN,
     UNSAFE_SHARE as UNSAFE_SHARE,
-    time_to_collision as time_to_collision,
 )
 from safevar_sumo.metrics.unsafe import (
     CriterionLike as CriterionLike,

@@ -40,17 +40,6 @@ SAFETY_DEGREE_METRIC = Measure(
 )
 
 
-def time_to_collision(runs: SimulationRuns) -> FloatArray:
-    """TTC(t) = L_s / v_L, the distance between both over the speed at which it shrinks [s]; shape
-    (T, N).
-
-    Infinite while the distance does not shrink, outside the encounter, and once the vehicle has
-    stopped after moving. The distance is that of the published data (method section 4): it also
-    shrinks by the speed of who crosses the path. `conflicts.conflict` is along the path alone.
-    """
-    return runs.time_to_collision
-
-
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a
     collision.
@@ -76,7 +65,7 @@ def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[Float
     [s].
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
-    ttc = time_to_collision(runs)[::stride]
+    ttc = runs.time_to_collision[::stride]
     return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
 
 

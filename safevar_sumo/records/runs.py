@@ -176,7 +176,13 @@ class SimulationRuns:
 
     @cached_property
     def time_to_collision(self) -> FloatArray:
-        """TTC at every sample, which several metrics read [s]; see `metrics.time_to_collision`."""
+        """TTC(t) = L_s / v_L, the distance between both over the speed at which it shrinks [s];
+        shape (T, N).
+
+        Infinite while the distance does not shrink, outside the encounter, and once the vehicle has
+        stopped after moving. The distance is that of the published data (method section 4): it also
+        shrinks by the speed of who crosses the path. `metrics.conflicts` is along the path alone.
+        """
         _, distance, closing_speed, _ = self.encounter
         is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
         return np.divide(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.metrics import time_to_collision
 from safevar_sumo.records import STANDSTILL, JsonObject, SimulationRuns
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 
@@ -48,7 +47,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     runs = comparison.runs
     divergence = find_divergence(comparison.runs)
     trace = runs.trace
-    ttc = time_to_collision(runs)
+    ttc = runs.time_to_collision
     divergence_time = None if divergence is None else float(trace.time[divergence])
     quantities = {
         "speed [m/s]": trace.speed,

@@ -43,21 +43,11 @@ VIEW_SETTINGS = """<viewsettings>
 """
 
 
-def show_in_gui(
-    comparison: Comparison,
-    *,
-    slower: float = 1.0,
-    rest: float = PAUSE,
-    pictures: Path | None = None,
-) -> None:
+def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 
     Parameters
     ----------
-    slower
-        Factor by which to play slower than real time.
-    rest
-        Duration of each pause [s].
     pictures
         Folder for pictures of the window at every pause; no pictures by default.
 
@@ -94,9 +84,9 @@ def show_in_gui(
 
         # Pauses, and the pace.
         if sample in pauses:
-            time.sleep(rest)
-            start += rest
-        time.sleep(max(0.0, start + (sample + 1) * runs.trace.step * slower - time.monotonic()))
+            time.sleep(PAUSE)
+            start += PAUSE
+        time.sleep(max(0.0, start + (sample + 1) * runs.trace.step - time.monotonic()))
 
     drive_again(comparison.system, comparison.evaluations.settings, runs, watch, _open_view)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -254,23 +254,27 @@ class Vehicle:
 
 
 def led_state(is_led: BoolArray, steady: State, state: State) -> State:
-    """The state of vehicles that move as in a steady state where `is_led` is true; a delayed
-    signal, the only part of a state with a method `where`, keeps what it was before.
+    """The state of vehicles that move as in a steady state where `is_led` is true; a delayed signal
+    keeps what it was before.
     """
-    if isinstance(state, tuple):
-        columns = [led_state(is_led, *states) for states in zip(steady, state, strict=True)]
-        return type(state)(*columns) if hasattr(state, "_fields") else tuple(columns)
-    is_kept = steady is None or state is None or hasattr(state, "where")
-    return state if is_kept else np.where(is_led, steady, state)
+    return _selected(is_led, steady, state, lambda steady, state: state)
 
 
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
-    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
-    of states, and a delayed signal selects by its own method `where`.
+    """The state `steady` of the vehicles that roll, and `rest` of the others."""
+    return _selected(is_rolling, steady, rest, lambda steady, rest: steady.where(is_rolling, rest))
+
+
+def _selected(
+    chosen: BoolArray, first: State, second: State, of_signals: Callable[[State, State], State]
+) -> State:
+    """The state `first` of the `chosen` vehicles, and `second` of the others; a state may consist
+    of states, and a delayed signal, the only part with a method `where`, has a way of its own.
     """
-    if hasattr(steady, "where"):
-        return steady.where(is_rolling, rest)
-    if isinstance(steady, tuple):
-        columns = [_select_state(is_rolling, *states) for states in zip(steady, rest, strict=True)]
-        return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
-    return steady if steady is None else np.where(is_rolling, steady, rest)
+    if hasattr(second, "where"):
+        return of_signals(first, second)
+    if isinstance(first, tuple):
+        pairs = zip(first, second, strict=True)
+        columns = [_selected(chosen, *pair, of_signals) for pair in pairs]
+        return type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
+    return second if first is None or second is None else np.where(chosen, first, second)

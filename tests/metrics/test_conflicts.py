@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import OPTIONAL_METRICS, time_to_collision
+from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.scenarios.ahead import Along, CarToCar
@@ -73,7 +73,7 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
     scenario: Any = WEAR.points[0].scenario.at(values)
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
     assert measured(runs)[:, 0] == pytest.approx([0.577, 2.84], abs=3e-3)
-    assert time_to_collision(runs).min() == pytest.approx(0.489, abs=5e-4)
+    assert runs.time_to_collision.min() == pytest.approx(0.489, abs=5e-4)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
 )
 def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(scenario: Any) -> None:
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
-    ttc = time_to_collision(runs)
+    ttc = runs.time_to_collision
     assert measured(runs)[:, 0].tolist() == [
         ttc.min(),
         np.nanmax(runs.encounter.closing_speed / (2 * ttc)),

@@ -21,7 +21,6 @@ from safevar_sumo.metrics import (
     Scoring,
     Unsafe,
     impact_in_words,
-    time_to_collision,
 )
 from safevar_sumo.records import (
     NO_CONTACT,
@@ -107,7 +106,7 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
     time = np.arange(0, 5 + STEP / 2, STEP)[:, np.newaxis]
     run = made_up_runs(STEP, np.full_like(time, 4.0), 20 - 4.0 * time)
     run = dataclasses.replace(run, encounter=run.encounter._replace(in_conflict=run.trace.gap > -1))
-    assert time_to_collision(run)[0, 0] == pytest.approx(5.0)
+    assert run.time_to_collision[0, 0] == pytest.approx(5.0)
     assert value("tet", run) == pytest.approx(2.0, abs=2 * STEP)
     assert value("tit", run) == pytest.approx(2.0, abs=4 * STEP)
 
@@ -204,7 +203,7 @@ def test_exposure_is_undefined_on_a_collision() -> None:
 
 
 def test_time_to_collision_ends_with_the_first_standstill() -> None:
-    ttc = time_to_collision(meeting(closing_speed=np.ones_like(RUN.encounter.distance)))
+    ttc = meeting(closing_speed=np.ones_like(RUN.encounter.distance)).time_to_collision
     assert np.all(np.isinf(ttc[RUN.trace.time > 2.0]))
 
 
@@ -212,7 +211,7 @@ def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_driv
     speed = np.where(FIRST_SECOND, 0.0, 2.0)
     gap = 20.0 + 0 * speed
     later = dataclasses.replace(driving(speed=speed), encounter=Encounter(gap, gap, speed, gap > 0))
-    ttc = time_to_collision(later)[:, 0]
+    ttc = later.time_to_collision[:, 0]
     assert np.isinf(ttc[RUN.trace.time < 1.0]).all()
     assert ttc[RUN.trace.time >= 1.0] == pytest.approx(10.0)
 
@@ -237,7 +236,7 @@ def test_what_opens_or_lies_behind_has_no_time_to_collision(
     encounter: dict[str, FloatArray],
 ) -> None:
     run = meeting(**encounter)
-    assert np.isinf(time_to_collision(run)).all()
+    assert np.isinf(run.time_to_collision).all()
     assert value("tet", run) == value("tit", run) == 0
 
 

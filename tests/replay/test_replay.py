@@ -131,7 +131,7 @@ def of_colour(picture: np.ndarray, colour: str) -> np.ndarray:
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(
     comparison: Comparison, tmp_path: Path
 ) -> None:
-    show_in_gui(comparison, slower=0.01, rest=0.0, pictures=tmp_path)
+    show_in_gui(comparison, tmp_path)
     first, second = comparison.moments
     assert {path.stem for path in tmp_path.iterdir()} == {
         f"{sample:04d}" for sample in (first.nearest, second.nearest, first.end)
@@ -167,8 +167,8 @@ def test_the_window_plays_from_the_moment_that_it_is_there(
 
     monkeypatch.setattr(gui, "drive_again", drive_again)
     monkeypatch.setattr(gui, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
-    show_in_gui(comparison, slower=2.0)
-    assert waits == pytest.approx([2.0 * comparison.runs.trace.step] * 3)
+    show_in_gui(comparison)
+    assert waits == pytest.approx([comparison.runs.trace.step] * 3)
 
 
 def frame(scene: FlatScene, sample: int) -> np.ndarray:
