@@ -192,22 +192,17 @@ class SimulationRuns:
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:
         """The runs of some of the vehicles."""
 
-        def select(values: np.ndarray) -> np.ndarray:
-            return values[vehicles] if values.ndim else values
+        def select(value: Any) -> Any:
+            if isinstance(value, Trace):
+                return value.of(vehicles)
+            if isinstance(value, Encounter | Contact):
+                return type(value)(*map(select, value))
+            if isinstance(value, Mapping):
+                return {name: select(inner) for name, inner in value.items()}
+            return value[..., vehicles] if np.ndim(value) else value
 
-        return SimulationRuns(
-            trace=self.trace.of(vehicles),
-            encounter=Encounter._make(values[:, vehicles] for values in self.encounter),
-            outcome=self.outcome[vehicles],
-            collision_speed=self.collision_speed[vehicles],
-            contact=Contact._make(map(select, self.contact)),
-            test_speed_error=select(self.test_speed_error),
-            acted_early=select(self.acted_early),
-            warning_ttc=select(self.warning_ttc),
-            centre_to_centre=self.centre_to_centre,
-            allowed_impact_speed=select(self.allowed_impact_speed),
-            lacks={name: select(values) for name, values in self.lacks.items()},
-            stated={name: select(values) for name, values in self.stated.items()},
+        return replace(
+            self, **{item.name: select(getattr(self, item.name)) for item in fields(self)}
         )
 
     def lacking(self, *quantities: str) -> BoolArray:
