@@ -279,10 +279,10 @@ class Question:
 
     def _criterion(self, values: JsonObject, study: Study) -> tuple[Unsafe | None, JsonObject, str]:
         """What is unsafe, the values of options with it, and where it comes from: a study's own
-        criterion stands where nothing else is asked for, and a margin, too, is asked for: it is
-        that of a collision.
+        criterion stands where neither a criterion nor a margin is asked for.
         """
         option = next((one.name for one in self.options if one.metavar == CRITERION), "")
+        # Who states a distance to keep means a collision, whatever the study calls unsafe.
         if not option or any(values.get(name) is not None for name in (option, "margin")):
             return values.get(option), values, ""
         own = study.unsafe

@@ -301,6 +301,7 @@ class Evaluator:
     @cached_property
     def _originals(self) -> Evaluations:
         """Evaluations of the original vehicle in encounters over the domain."""
+        # Of few simulations an eighth chooses encounters, and the others are of vehicles there.
         drawn = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
         return self.evaluate(
             self.characteristics.with_original_vehicle(drawn), "encounters of the original"

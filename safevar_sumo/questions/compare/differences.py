@@ -128,6 +128,7 @@ def limits_of_both(
     columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
     alone = list[Sequence[AloneLimit]]()
     is_rough = evaluators[0].left is not None
+    # Of few simulations the scans of both systems together take a sixth of what is left.
     number = evaluators[0].at_most(SCAN_VALUES, 12 * len(columns))
     for side, unsafe in zip(evaluators, criteria, strict=True):
         own = Model(0, side, unsafe)

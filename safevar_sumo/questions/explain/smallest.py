@@ -86,6 +86,8 @@ class Smallest(NamedTuple):
     def of(cls, evaluator: Evaluator, unsafe: Unsafe, fits: int) -> Self:
         """Enumerate them within what may be simulated, and see how sure they are."""
         most = MAX_RATED_SETTINGS if evaluator.study.is_rated else MAX_SETTINGS
+        # Of few simulations half enumerate and a third of the others find the staircase, as what is
+        # not enumerated cannot be made smaller; the rest says how sure the causes are.
         at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(most, 2))
         steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(most, 3))
         return cls(at_ends, steps, _table(evaluator, unsafe, at_ends.causes, fits))
@@ -275,6 +277,7 @@ def _table(
     settings = settings_of(evaluator.characteristics, causes)
     starts = evaluator.characteristics.with_original_vehicle(settings)
     parts = PARTS if evaluator.left is None else COARSE_PARTS
+    # Of few simulations half are left for the neighbours and the other parameter sets.
     known = evaluator.at_most(len(causes) * settings_of_line(parts), 2) // settings_of_line(parts)
     begins = np.full(len(causes), np.nan)
     if known:
