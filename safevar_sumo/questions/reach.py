@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,15 +30,6 @@ End = tuple[int, int]
 """An end of a box: 0, the lower one, or 1, the upper one; and the column."""
 
 
-class Reach(NamedTuple):
-    """The furthest value that holds, None if none does; and all unsafe settings that were found
-    beyond it, with the numbers of their judges.
-    """
-
-    value: float | None
-    failures: Sequence[tuple[int, FloatArray]]
-
-
 def falsify_limits(
     box: Box, judges: Sequence[Judge], budget: int, seed: tuple[int, ...], end: End | None = None
 ) -> Falsification:
@@ -62,16 +52,10 @@ def falsify_limits(
 
 
 def reach(
-    box: Box,
-    end: End,
-    start: float,
-    judges: Sequence[Judge],
-    budget: int,
-    seed: tuple[int, ...],
-    known: Mapping[int, FloatArray] | None = None,
-) -> Reach:
+    box: Box, end: End, start: float, judges: Sequence[Judge], budget: int, seed: tuple[int, ...]
+) -> float | None:
     """The furthest value of an end of a box, from `start` on, up to which a falsification finds
-    nothing; `known` are unsafe settings by the number of their judge.
+    nothing; None if it fails at the start.
 
     Where a setting fails, the value moves back to the last one before it with which its encounter
     is safe. A value is rounded towards the start as it is printed, and falsified again.
@@ -79,18 +63,15 @@ def reach(
     side, column = end
     item = box.region.characteristics.members[column]
     value = box.end(*end)
-    failures = list[tuple[int, FloatArray]]()
-    new = dict(known or {})
+    new: Mapping[int, FloatArray] = {}
     for number in range(MAX_STEPS):
         # The last value before all failures with which their encounters are safe.
         for judge, rows in new.items():
-            failures.append((judge, rows))
             values = rows[:, column]
             inside = rows[values >= value if side == 0 else values <= value]
             if len(inside) and value != start:
                 group = Failing(column, start, inside)
-                [(last, failure)] = last_safe_values([group], partial(_are_unsafe, judges[judge]))
-                failures.append((judge, failure[np.newaxis]))
+                [(last, _)] = last_safe_values([group], partial(_are_unsafe, judges[judge]))
                 value = rounded_towards(start, last, item)
         # The failures within the limits with this value: first with the judges that failed last.
         limits = box.with_end(*end, value)
@@ -105,10 +86,10 @@ def reach(
             found = falsify_limits(limits, judges, budget, stream, end)
             new = found.failures
         if not new:
-            return Reach(value, failures)
+            return value
         if value == start:
             break
-    return Reach(None, [*failures, *new.items()])
+    return None
 
 
 def _are_unsafe(judge: Judge, settings: FloatArray) -> BoolArray:
@@ -150,5 +131,5 @@ def nearest_limits(
         item = members.members[column]
         stream = seed, Stream.NEAREST_LIMIT, side, column
         found = reach(box, (side, column), item.original, judges, LEAST_SIMULATIONS, stream)
-        rows.append((item.name, item.unit, value, found.value))
+        rows.append((item.name, item.unit, value, found))
     return rows

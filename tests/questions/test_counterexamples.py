@@ -64,9 +64,9 @@ def test_a_reach_ends_just_before_a_planted_boundary_at_its_start_or_nowhere(
         Box(model.evaluator.region, *ends), (int(side > 0), 0), 5.0, judges, LEAST_SIMULATIONS, (1,)
     )
     if edge < 0:
-        assert found.value is None
+        assert found is None
         return
-    assert edge - 0.11 <= side * (found.value - 5) <= edge
+    assert edge - 0.11 <= side * (found - 5) <= edge
     assert edge == 0 or model.evaluator.simulated >= LEAST_SIMULATIONS
 
 

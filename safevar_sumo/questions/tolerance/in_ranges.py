@@ -7,23 +7,20 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import Falsification
-from safevar_sumo.questions.models import Model, Models, judges_of, limit_criterion, models_of
-from safevar_sumo.questions.reach import falsify_limits, reach
+from safevar_sumo.questions.models import Models, judges_of, limit_criterion, models_of
+from safevar_sumo.questions.reach import falsify_limits
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.together import LimitsTogether
-from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 
 RANGES_STAGE = "counterexamples in the ranges"
-USUAL_ATTACKS, NEW_SETTINGS = 5, 384
-"""Usual number of attacks, until limits hold up to some speed, and number of settings with which
-each begins in a parameter set.
-"""
+NEW_SETTINGS = 384
+"""Number of settings with which the attack begins in a parameter set."""
 SLOWNESS = 2.5
 """How much longer a simulation takes there, as benchmarks/progress.py showed for `wear`: fewer of
 them are simulated at a time.
@@ -50,7 +47,7 @@ def usual_settings(evaluator: Evaluator, budget: int, sets: int) -> float:
     if study is None:
         return 0.0
     there = evaluator.for_study(study).system.points
-    number = USUAL_ATTACKS * (budget + NEW_SETTINGS * sets)
+    number = budget + NEW_SETTINGS * sets
     return number * len(there) / len(evaluator.system.points)
 
 
@@ -73,32 +70,17 @@ def rows_in_ranges(asked: Asked, together: LimitsTogether | None) -> Rows:
     models = models_of(other, unsafe, asked.fits)
     limits = together.specified if together.box is None else together.box
     box = limits.in_encounters_of(other.region)
-    seed = study.search.seed
     judges = judges_of(models.members, RANGES_STAGE)
-    stream = seed, Stream.WIDER_SCOPE
-    lowest = None
     with evaluator.phases.stage(RANGES_STAGE, usual_settings(evaluator, budget, len(judges))):
-        found = falsify_limits(box, judges, budget, stream)
-        if found.failures:
-            searched = study.ranges
-            leading = SPEED_DIMENSION if SPEED_DIMENSION in searched else next(iter(searched))
-            column = other.characteristics.names.index(leading)
-            start = float(box.lower[column])
-            below = reach(box, (1, column), start, judges, budget, stream, found.failures)
-            failing = [
-                (models.members[judge], row) for judge, rows in below.failures for row in rows
-            ]
-            lowest = min(failing, key=lambda pair: float(pair[1][column]))
-    verdict, failure = _verdict(models, box, found, lowest)
+        found = falsify_limits(box, judges, budget, (study.search.seed, Stream.WIDER_SCOPE))
+    verdict, failure = _verdict(models, box, found)
     fails_at = None if failure is None else other.characteristics.named(failure.setting)
     command = None if failure is None else failure.command
     return [(scope_of(study), not found.failures, verdict, fails_at, command)]
 
 
-def _verdict(
-    models: Models, box: Box, found: Falsification, lowest: tuple[Model, FloatArray] | None
-) -> tuple[str, Failure | None]:
-    """What the falsification found, in words: the failure at the lowest speed, else the worst."""
+def _verdict(models: Models, box: Box, found: Falsification) -> tuple[str, Failure | None]:
+    """What the falsification found, in words: of several failures that at the lowest speed."""
     if not len(found.robustness):
         return f"none of {found.simulated:,} simulations met an encounter that counts.", None
     model = models.members[int(found.judges[0])]
@@ -106,7 +88,11 @@ def _verdict(
         keeps = model.unsafe.value_in_words(model.unsafe.value(found.robustness[0]))
         simulated = f"{found.simulated:,} simulations that search for a counterexample"
         return f"the limits hold: the worst of {simulated} {keeps}.", None
-    where, setting = (model, found.settings[0]) if lowest is None else lowest
-    described = [*describe(where, {"": setting}, box).values()]
+    names = model.characteristics.names
+    axes = model.characteristics.scenario.names
+    column = names.index(SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0])
+    failing = [(judge, row) for judge, rows in found.failures.items() for row in rows]
+    judge, setting = min(failing, key=lambda pair: float(pair[1][column]))
+    described = [*describe(models.members[judge], {"": setting}, box).values()]
     first = described[0].words if described else "a car within them is unsafe"
     return f"they do not hold: {first}.", described[0] if described else None
