@@ -98,26 +98,24 @@ class Evaluations:
 
     @property
     def collided(self) -> BoolArray:
-        return np.asarray(self.outcome == Outcome.COLLISION.value)
+        return np.asarray(self.outcome == Outcome.COLLISION)
 
     @property
     def valid(self) -> BoolArray:
         """Where the setting can be scored: it is feasible, the test was valid, and the simulator
         reported no error.
         """
-        return np.asarray(
-            ~self.failed & (self.outcome != Outcome.INVALID_TEST.value) & ~self.infeasible
-        )
+        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
 
     @property
     def infeasible(self) -> BoolArray:
         """Where a constraint of the study is violated, so that nothing was simulated."""
-        return np.asarray(self.outcome == Outcome.INFEASIBLE.value)
+        return np.asarray(self.outcome == Outcome.INFEASIBLE)
 
     @property
     def failed(self) -> BoolArray:
         """Where the simulation failed."""
-        return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR.value)
+        return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR)
 
     def reason(self, row: int) -> str:
         """Why a setting that is not valid could not be scored."""

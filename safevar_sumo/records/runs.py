@@ -105,8 +105,10 @@ class Trace:
 QUANTITIES: Mapping[str, tuple[str, ...]] = {
     "gap": ("gap", "lateral", "lateral_speed", "distance"),
     "obstacle_speed": ("obstacle_speed", "closing_speed"),
-    **{name: (name,) for name in ("speed", "separation", "position")},
-    **{name: (name,) for name in ("throttle", "brake", "pedal", "gear")},
+    **{
+        name: (name,)
+        for name in ("speed", "separation", "position", "throttle", "brake", "pedal", "gear")
+    },
 }
 """What a metric may need of a run, and the columns of its trace and its encounter that have it. A
 run with a `gap` alone meets who is ahead in its path: `lateral` is 0.
@@ -217,12 +219,14 @@ class SimulationRuns:
         """
 
         def changed(record: Trace | Encounter) -> dict[str, Any]:
-            names = [name for name in QUANTITIES[quantity] if hasattr(record, name)]
-            columns = {name: getattr(record, name) for name in names}
-            return {name: np.where(np.isnan(columns[name]), 0.0, np.nan) for name in names}
+            return {
+                name: np.where(np.isnan(getattr(record, name)), 0.0, np.nan)
+                for name in QUANTITIES[quantity]
+                if hasattr(record, name)
+            }
 
         trace = replace(self.trace, **changed(self.trace))
-        encounter = Encounter(**{**self.encounter._asdict(), **changed(self.encounter)})
+        encounter = self.encounter._replace(**changed(self.encounter))
         runs = replace(self, trace=trace, encounter=encounter)
         vars(runs)["relative_speed"] = self.relative_speed
         return runs
