@@ -237,7 +237,7 @@ class SimulationRuns:
         """
         active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
-            return int(np.flatnonzero(active)[-1])
+            return int(self.trace.last_active[vehicle])
         in_conflict = active & self.encounter.in_conflict[:, vehicle]
         if not in_conflict.any():
             return None

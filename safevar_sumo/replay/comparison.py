@@ -91,7 +91,7 @@ class Comparison:
             Moments(
                 braking_start=brake_onset(self.runs, row),
                 nearest=self.runs.nearest(row),
-                end=int(np.flatnonzero(self.runs.trace.active[:, row])[-1]),
+                end=int(self.runs.trace.last_active[row]),
             )
             for row in self.rows
         ]
@@ -219,7 +219,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
     pedals = np.stack([trace.throttle, trace.brake])
     has_collided = ~np.isnan(pair.runs.collision_speed) & trace.active.any(axis=0)
     for row in np.flatnonzero(has_collided).tolist():
-        end = int(np.flatnonzero(trace.active[:, row])[-1])
+        end = trace.last_active[row]
         pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
     return Comparison(
         title=f"{title} ({pair.point.name})" if pair.point.name else title,
