@@ -186,9 +186,8 @@ def test_a_metric_gets_the_runs_alone_that_have_what_it_needs(wall: Path) -> Non
     (wall.parent / "needing.py").write_text(NEEDS_GAP)
     change = "lambda r: r if r['time'][-1] > 3 else {k: r[k] for k in r if k != 'gap'}"
     system = wrong_system(wall, change, metrics={"also": ["needing:FIRST"]})
-    found = simulators.simulate_each(system, np.array([[8.0, 0.0], [4.0, 0.0]]))
-    measure = system.measuring.measures["first"]
-    assert str(measure.of_runs(found, system.metrics_table)) == "[nan 40.]"
+    found = drive_and_score(system, np.array([[8.0, 0.0], [4.0, 0.0]]))
+    assert str(found.metrics["first"]) == "[nan 40.]"
 
 
 def test_a_rig_states_its_metrics_itself(wall: Path) -> None:

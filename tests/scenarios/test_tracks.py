@@ -67,7 +67,7 @@ def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
     ]
     run = held(*cast)
     assert run.outcome[0] == Outcome.COLLISION
-    end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
+    end = run.trace.last_active[0]
     assert run.trace.time[end] == pytest.approx(math.ceil((60 - 0.25) / SPEED / 0.05) * 0.05)
     assert run.trace.lateral[end, 0] == pytest.approx(-4.0 + 1.2 * run.trace.time[end])
     gone = held(*cast[:4])
@@ -116,7 +116,7 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     system = assemble(load_study(wear, scenario=scenario))
     assert system.points[0].scenario.duration >= 3 + (speed - 2 / 3.6) / 2
     run = drive_worst(system, original_of(system))
-    end = int(np.flatnonzero(run.trace.active[:, 0])[-1])
+    end = run.trace.last_active[0]
     assert run.outcome[0] == Outcome.PASSED
     assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], (
         "it ends when it is slower for good"
