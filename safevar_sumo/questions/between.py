@@ -7,7 +7,7 @@ has the vehicle's characteristics, then a place on each axis.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace as replace_in
@@ -24,8 +24,6 @@ from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
 from safevar_sumo.study.encounters import Axes, at_values
 from safevar_sumo.sumo.system import System, assemble
 
-DECIMALS = 2
-"""Decimals of a place on an axis, as it is printed."""
 PLACES = 8
 """Number of random places on the axes that each vehicle meets first."""
 MOST_ENCOUNTERS = 8
@@ -34,33 +32,22 @@ first.
 """
 
 
-class MovingTest:
+class MovingTest(NamedTuple):
     """A test of a model's matrix, whose axes are ranges.
 
     Attributes
     ----------
     test
-        The test of the matrix.
-    axes
-        The names of the axes that move.
+        The test of the matrix, with the values of its axes.
+    base
+        The model in all tests, at their points.
     model
         The model in this test alone. An encounter counts only where the original is safe, too.
     """
 
-    def __init__(self, model: Model, test: MatrixTest, domains: dict[str, Domain], new_car: Unsafe):
-        study = model.evaluator.study
-        self.test = replace_in(test, over={**study.lists_of(test)})
-        self.axes = tuple(domains)
-        self._base = model
-        moving = in_ranges(study, [(self.test, domains)])
-        evaluator = model.evaluator.for_study(moving, verified=0)
-        # Originals drive beside failures alone.
-        self.model = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
-
-    @property
-    def original(self) -> FloatArray:
-        """The original vehicle, shape (n,)."""
-        return self._base.evaluator.characteristics.original
+    test: MatrixTest
+    base: Model
+    model: Model
 
     def box(self, box: Box) -> Box:
         """A box of vehicles, at all places."""
@@ -68,39 +55,29 @@ class MovingTest:
 
     def spread(self, vehicles: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Vehicles, shape (K, n), each at `PLACES` random places, shape (K PLACES, n + axes)."""
-        members = self.model.characteristics
-        settings = np.zeros((PLACES * len(vehicles), len(members)))
-        settings[:, : vehicles.shape[1]] = np.repeat(vehicles, PLACES, axis=0)
-        places = rng.random((len(settings), len(self.axes)))
-        low, high = (ends[-len(self.axes) :] for ends in (members.lower, members.upper))
-        settings[:, -len(self.axes) :] = low + places * (high - low)
-        return settings
+        axes = self.model.characteristics.scenario
+        settings = np.repeat(vehicles, PLACES, axis=0)
+        places = rng.random((len(settings), len(axes)))
+        return np.hstack([settings, axes.lower + places * (axes.upper - axes.lower)])
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What settings leave to the limit, shape (M,), at places as they are printed."""
-        return self.model.robustness(self.at_printed_places(settings), stage)
+        """What settings leave to the limit, shape (M,), in encounters as they are printed."""
+        return self.model.robustness(self.as_printed(settings), stage)
 
-    def at_printed_places(self, settings: FloatArray) -> FloatArray:
-        """Settings whose places on the axes are rounded."""
-        rounded = settings.copy()
-        rounded[:, -len(self.axes) :] = np.round(settings[:, -len(self.axes) :], DECIMALS)
-        return rounded
+    def as_printed(self, settings: FloatArray) -> FloatArray:
+        """Settings in encounters as they are printed."""
+        return self.model.characteristics.with_printed_encounters(settings)
 
     def failures(self, settings: FloatArray) -> tuple[Model, FloatArray]:
         """The vehicles of unsafe settings, the worst first, shape (K, n), and the model at their
         first encounters alone, as tests of a matrix; settings in other encounters are left out.
         """
-        settings = self.at_printed_places(settings)
-        places = settings[:, -len(self.axes) :].tolist()
-        first = [list(place) for place in [*dict.fromkeys(map(tuple, places))][:MOST_ENCOUNTERS]]
-        settings = settings[[place in first for place in places]]
-        model = meeting(self._base, self.encounters(settings), alone=True)
-        return model, settings[:, : -len(self.axes)]
-
-    def encounters(self, settings: FloatArray) -> list[MatrixTest]:
-        """The encounters of settings, as tests of a matrix."""
-        places = np.unique(settings[:, -len(self.axes) :], axis=0).tolist()
-        return [at_values(self.test, dict(zip(self.axes, place, strict=True))) for place in places]
+        vehicles, places = self.model.evaluator.system.cut(self.as_printed(settings))
+        first = [*dict.fromkeys(map(tuple, places.tolist()))][:MOST_ENCOUNTERS]
+        axes = self.model.characteristics.scenario.names
+        tests = [at_values(self.test, dict(zip(axes, place, strict=True))) for place in first]
+        is_first = [tuple(place) in first for place in places.tolist()]
+        return meeting(self.base, tests, alone=True), vehicles[is_first]
 
 
 def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
@@ -111,13 +88,14 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
     tests = list[MovingTest]()
     for test, points in points_of_tests(study, assemble(study).points):
         axes = moving_axes(study, test, points)
-        domains = {
-            name: axes[name]
-            for name, at in study.lists_of(test).items()
-            if len(at) > 1 and name in axes
-        }
+        lists = study.lists_of(test)
+        domains = {name: axes[name] for name in axes if len(lists[name]) > 1}
         if test and domains:
-            tests.append(MovingTest(model, test, domains, new_car))
+            listed = replace_in(test, over={**lists})
+            evaluator = model.evaluator.for_study(in_ranges(study, [(listed, domains)]), verified=0)
+            # Originals drive beside failures alone.
+            moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
+            tests.append(MovingTest(listed, model, moving))
     return tests
 
 

@@ -258,6 +258,15 @@ class CharacteristicSet:
         """The original vehicle in the encounters of settings, shape (N, n)."""
         return np.where(self.of_vehicle, self.original, settings)
 
+    def with_printed_encounters(self, settings: FloatArray) -> FloatArray:
+        """Settings, shape (N, n), whose encounters are rounded as they are printed."""
+        rounded = settings.copy()
+        for column in np.flatnonzero(~self.of_vehicle):
+            item = self.members[column]
+            values = np.round(settings[:, column], item.digits)
+            rounded[:, column] = np.clip(values, item.lower, item.upper)
+        return rounded
+
     @cached_property
     def original(self) -> FloatArray:
         return self._column("original")

@@ -57,7 +57,7 @@ def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study
     corners = box.corners(0, 0)
     assert own.robustness(corners, "").min() >= 0
     (test,) = moving_tests(own, own.unsafe)
-    assert test.axes == ("speed",)
+    assert test.model.characteristics.scenario.names == ("speed",)
     rng = default_rng(1)
     worst = corners[np.argsort(own.robustness(corners, ""))[:64]]
     judges = [lambda rows: test.robustness(rows, "")]

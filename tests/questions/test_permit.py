@@ -303,7 +303,8 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     study = load_study("wear", encounters="ranges")
 
     def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
-        columns = self.model.evaluator.characteristics.columns(self.as_printed(settings))
+        members = self.model.characteristics
+        columns = members.columns(members.with_printed_encounters(settings))
         speed, location = columns["speed"], columns["impact_location"]
         fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
         return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)

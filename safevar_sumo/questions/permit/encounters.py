@@ -124,17 +124,7 @@ class EncounterRange(NamedTuple):
         settings[:, others] = lower + points * (upper - lower)
         if self.column is not None:
             settings[:, self.column] = value
-        return self.as_printed(settings)[:, count:]
-
-    def as_printed(self, settings: FloatArray) -> FloatArray:
-        """Settings with the encounters' values rounded as they are printed."""
-        members = self.model.characteristics
-        rounded = settings.copy()
-        for column in range(self.number_of_characteristics, len(members)):
-            item = members.members[column]
-            values = np.round(settings[:, column], item.digits)
-            rounded[:, column] = np.clip(values, item.lower, item.upper)
-        return rounded
+        return members.with_printed_encounters(settings)[:, count:]
 
     def at_worst_phases(
         self, settings: FloatArray, left: FloatArray, is_open: BoolArray, stage: str
@@ -155,7 +145,7 @@ class EncounterRange(NamedTuple):
         SimulationError
             If one cannot be simulated: then no car may be called safe.
         """
-        rows = self.as_printed(settings)
+        rows = self.model.characteristics.with_printed_encounters(settings)
         evaluations = self.model.evaluate(rows, stage)
         if evaluations.failed.any():
             reason = evaluations.reason(int(np.argmax(evaluations.failed)))

@@ -251,6 +251,6 @@ class SpeedSearch:
         failing = list[int]()
         for car, found in zip(boxes, results, strict=True):
             self.attacked += found.simulated
-            settings = encounters.as_printed(found.settings)
+            settings = encounters.model.characteristics.with_printed_encounters(found.settings)
             failing += [car] if self._note(car, encounters, settings, found.robustness) else []
         return failing

@@ -206,7 +206,9 @@ def _move_between(ends: Sequence[_Ends], test: MovingTest) -> bool:
     """Move ends before what fails between a test's points at the ends themselves; whether one has
     moved.
     """
-    vehicles = [_settings_within(each, test.original[np.newaxis], 2) for each in ends]
+    vehicles = [
+        _settings_within(each, test.base.characteristics.original_settings, 2) for each in ends
+    ]
     rng = Stream.TESTS_BETWEEN.generator(test.model.evaluator.seed)
     settings = [test.spread(rows, rng) for rows in vehicles]
     robustness = test.robustness(np.concatenate(settings), ALONE_STAGE)

@@ -218,7 +218,7 @@ class Validator:
             starts = test.spread(known_between, rng)
             judges = [lambda rows, test=test: test.robustness(rows, VALIDATION_STAGE)]
             found = falsify(test.box(box), judges, [starts], budget, rng)
-            self._worst.append((test, test.at_printed_places(found.settings)))
+            self._worst.append((test, test.as_printed(found.settings)))
             validation = validation.with_search(found, between=found.simulated)
             failing = [*found.failures.values()]
             if failing:
