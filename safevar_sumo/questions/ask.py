@@ -17,6 +17,7 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
+from msgspec.structs import replace as replace_in
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, unknown_name, warn
@@ -36,7 +37,7 @@ from safevar_sumo.questions.options import (
     flag_of,
     options_of,
 )
-from safevar_sumo.questions.subject import Results, part_of, study_in, study_or_case
+from safevar_sumo.questions.subject import Results, part_of, study_in, study_or_case, with_own_set
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
@@ -63,8 +64,8 @@ setting collides, else half of the original's safety degree; of a rated study, a
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
-    "Rough answer (--quick: the study's own parameter set alone, and a short search; it proves"
-    " nothing):"
+    "Rough answer (--quick: an eighth of the search, with the study's own parameter set alone; it"
+    " proves nothing):"
 )
 """The beginning of such an answer."""
 
@@ -236,13 +237,18 @@ class Question:
         from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
 
         # Simulations by the criterion that is asked for.
+        if values.get(QUICK):
+            subjects = [
+                with_own_set(one) if isinstance(one, Case) else replace_in(one, spread={})
+                for one in subjects
+            ]
         study = study_in(subjects[0])
         with (
             open_progress(progress) as show,
             open_evaluator(study, pool, jobs, show, cluster) as evaluator,
         ):
             account = evaluator.account
-            evaluator.limit(simulations, questions)
+            evaluator.limit(simulations, questions, quick=bool(values.get(QUICK)))
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)

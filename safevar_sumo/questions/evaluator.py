@@ -37,6 +37,7 @@ from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
+    QUICK,
     Account,
     print_price_of_list,
     seconds_of_simulation,
@@ -172,10 +173,11 @@ class Evaluator:
         account = self.account
         return None if account.most is None else int(account.left) // self._each
 
-    def limit(self, simulations: int | None, questions: int) -> None:
+    def limit(self, simulations: int | None, questions: int, *, quick: bool = False) -> None:
         """Let the question do so many simulations, with those that check a simulator's class; it is
-        one of so many that share the time.
+        one of so many that share the time. A quick one searches less.
         """
+        self.account.effort = QUICK if quick else 1.0
         self.account.asked = self.account.most = simulations
         self.account.questions = questions
         self.account.is_question = True
@@ -183,11 +185,16 @@ class Evaluator:
         self._pool.spare = spare(simulations or 0, 0) if limits else None
         self._pool.checked = 0
 
+    def scaled(self, number: float) -> int:
+        """A usual number of simulations, or of rounds, by how much is searched."""
+        return int(number * self.account.effort)
+
     def at_most(self, number: int, part: int = 1) -> int:
-        """A number of settings; where few simulations are allowed, at most this part of those that
-        may follow, and at least 1.
+        """A usual number of settings, by how much is searched; where few simulations are allowed,
+        at most this part of those that may follow. It is at least 1.
         """
-        return number if self.left is None else max(min(number, self.left // part), 1)
+        number = self.scaled(number)
+        return max(number if self.left is None else min(number, self.left // part), 1)
 
     @property
     def _each(self) -> int:

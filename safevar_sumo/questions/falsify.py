@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray, IntArray
 
 LEAST_SIMULATIONS = 1000
@@ -61,9 +62,9 @@ class Falsification(NamedTuple):
         }
 
 
-def budget_of(*, quick: bool) -> int:
-    """Simulations that search for a counterexample to a claim, few for a rough answer."""
-    return LEAST_SIMULATIONS if quick else USUAL_BUDGET
+def budget_of(evaluator: Evaluator) -> int:
+    """Simulations that search for a counterexample to a claim, by how much is searched."""
+    return evaluator.scaled(USUAL_BUDGET)
 
 
 def falsify(

@@ -31,6 +31,10 @@ BATCH = 512
 """Vehicles that are simulated side by side to know how long one of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples answers."""
+QUICK = 1 / 8
+"""How much a quick answer searches, as a share of what is usual."""
+MOST_EFFORT = 8.0
+"""Largest such share where more simulations are allowed than are usual."""
 DIGITS = 2
 """Digits of a number of simulations that is derived from a time."""
 
@@ -53,6 +57,8 @@ class Account:
         The largest number of simulations; None if there is none.
     spent, least
         Simulations so far; the least number for an answer.
+    effort
+        How much is searched, as a share of what is usual.
     measure, undefined, judged
         The metric of the question's criterion, if it has one; the numbers of settings without a
         collision that have no such value, and of all.
@@ -65,6 +71,7 @@ class Account:
     most: int | None = None
     spent: int = 0
     least: int = 0
+    effort: float = 1.0
     measure: str = ""
     undefined: int = 0
     judged: int = 0
@@ -115,6 +122,9 @@ class Account:
         self.most = self.asked
         if self.asked is not None and self.asked >= expected + parts:
             self.most = None
+            # Half of what is more than usual: some searches take longer than they are expected to.
+            more = self.asked / (2 * (expected + parts))
+            self.effort = min(max(self.effort, more), MOST_EFFORT)
         if seconds is None:
             return
         longest = LONGEST / self.questions

@@ -34,7 +34,6 @@ class Stream(IntEnum):
     EXTENSION = 10  # falsification of joint limits of which one is extended
     SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
     VALIDATION = 15  # further falsifications of joint limits that passed one
-    ORDERS_OF_CUTS = 16  # orders in which counterexamples are cut off a box
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
     PERMIT = 18  # falsification of the speed up to which a car may drive
 

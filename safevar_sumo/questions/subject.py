@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.records import JsonObject
@@ -184,6 +186,11 @@ def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
 def study_in(subject: Subject) -> Study:
     """The study itself, or the study of the results."""
     return subject if isinstance(subject, Study) else subject.study
+
+
+def with_own_set(case: Case) -> Case:
+    """Results whose study has its own parameter set of the vehicle model alone."""
+    return replace(case, study=replace_in(case.study, spread={}))
 
 
 def case_at(case: Case, point: str) -> Case:

@@ -26,7 +26,7 @@ from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.options import CRITERION, Cluster, Jobs, PointName, Simulations
-from safevar_sumo.questions.subject import Results, case_at, changes_since
+from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import player_files, template_environment
 from safevar_sumo.report.budget import REPLAYS, SPEED, divided
@@ -104,7 +104,8 @@ def report(
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
-        Rough answers: the study's own parameter set alone, and a short search. No line to sign.
+        Rough answers: an eighth of the search, with the study's own parameter set alone. No line to
+        sign.
     simulations
         At most so many simulations for all answers and replays, which share them.
 
@@ -135,7 +136,7 @@ def report(
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
-    at_point = cases if point is None else [case_at(case, point) for case in cases]
+    at_point = _simulated(cases, point, quick=quick)
     key = f"report {paths} {point} {ask} {unsafe} {quick}"
     with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
@@ -177,6 +178,14 @@ def report(
         stack.close()  # this process simulates the replays
         write_whole(out, make_page(studies, shared, parts))
     return out
+
+
+def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list[Case]:
+    """Results as the page simulates them: at a point, and with the study's own parameter set alone
+    if it is quick.
+    """
+    at_point = cases if point is None else [case_at(case, point) for case in cases]
+    return [with_own_set(case) if quick else case for case in at_point]
 
 
 def _cost(text: str) -> int:

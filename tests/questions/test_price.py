@@ -151,6 +151,13 @@ def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
         account.spend(1)
 
 
+def test_many_more_simulations_search_more_and_not_roughly() -> None:
+    for asked, effort in ((120, 1.0), (1000, 5.0), (10**9, 8.0)):
+        account = Account(Phases(show_no_progress), asked=asked)
+        account.open(100, None)
+        assert (account.most, account.effort) == (None, effort)
+
+
 def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
     """They are the limits of the others, or a vehicle within them is unsafe."""
     pool = InlinePool()

@@ -79,7 +79,11 @@ def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
 
 
 @pytest.mark.slow
-def test_a_rough_page_has_no_line_to_sign(slippery: Path, tmp_path: Path) -> None:
+def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
+    slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not even in its part about trust, and in questions that have no `--quick`."""
+    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
     page = report(slippery, out=tmp_path / "page.html", quick=True, jobs=1).read_text()
     assert "Do not use this sheet: its limits are rough" in page
     assert "Rough answer (--quick" in page
@@ -101,4 +105,4 @@ def test_on_a_terminal_the_rough_answer_comes_first(
 def test_rough_means_the_same_everywhere() -> None:
     for command in ("permit", "tolerance", "repair", "explain", "report"):
         said = " ".join(run(command, "--help").stdout.split())
-        assert "the study's own parameter set alone, and a short search." in said
+        assert "an eighth of the search, with the study's own parameter set alone." in said

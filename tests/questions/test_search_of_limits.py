@@ -17,7 +17,7 @@ from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.search import BoxSearch
-from safevar_sumo.questions.tolerance.together import _keeps_its_margin, broken_specification
+from safevar_sumo.questions.tolerance.specified import _keeps_its_margin, broken_specification
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import region_of
 from tests.in_process import InlinePool
@@ -48,16 +48,12 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
         assert one.simulated == other.simulated
 
 
-def test_a_box_is_cut_where_it_loses_least_whatever_the_order_of_its_failures() -> None:
-    """Each failure alone would move in its cheapest limit; both are cut off at once by one limit of
-    the first.
-    """
-    study = made_up_study(2)
-    region = region_of(study)
-    search = BoxSearch(model_of(study), [0, 1], {}, np.array([[9.0, 9.5], [9.5, 8.0]]))
-    whole = Box(region, np.array([0.0, 0.0]), np.array([10.0, 10.0]))
+def test_a_cut_keeps_off_failures_by_its_clearance() -> None:
+    """Each failure moves in the limit that loses least."""
+    search = BoxSearch(model_of(made_up_study(2)), [0, 1], {}, np.array([[9.0, 9.5], [9.5, 8.0]]))
+    whole = search.box(search.domain)
     cut = Extension(search).cut(whole, 0.8)
-    assert cut.upper.tolist() == pytest.approx([8.9, 10], abs=0.1)
+    assert cut.upper.tolist() == pytest.approx([9.3, 9.3], abs=0.1)
     assert not cut.holds(search.unsafe_settings).any()
     assert Extension(search).cut(whole, 4.8).upper[0] < cut.upper[0] - 0.2, "it keeps off by more"
 

@@ -22,7 +22,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.tables import reader_columns, tabulate
-from safevar_sumo.questions.tolerance import search
+from safevar_sumo.questions.tolerance import together
 from safevar_sumo.questions.tolerance.alone import AloneLimit
 from safevar_sumo.questions.tolerance.rows import LIMITS, uncertainty_rows
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan, scan
@@ -111,7 +111,7 @@ def test_what_cannot_be_simulated_is_neither_safe_nor_unsafe() -> None:
 
 
 def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "MAX_ATTEMPTS", 0)
+    monkeypatch.setattr(together, "MAX_BOXES", 1)
     answer = answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",))
     assert answer.verdict.startswith(
         "The specified limits hold with all other characteristics as in the original. No joint"

@@ -66,9 +66,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
-LIMIT, QUICK_LIMIT = 40_000, 4_000
-"""Approximate number of simulations for the minimal causes of all failures, and in a rough answer;
-if all would take more, a random sample is analysed.
+LIMIT = 40_000
+"""Approximate number of simulations for the minimal causes of all failures; if all would take more,
+a random sample is analysed.
 """
 STUDY_LIMIT, OF_SAMPLE = 12_000, 600
 """The same for failures that were sampled over the domain of a study, and the least number of
@@ -135,13 +135,13 @@ def explain(
         Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
         checked again; 0 leaves this out.
     quick
-        A rough answer: the study's own parameter set alone, and a short search. It has causes of
-        few failures.
+        A rough answer: an eighth of the search, with the study's own parameter set alone. It has
+        causes of few failures.
     """
     study, of_study = evaluator.study, of_study or isinstance(subject, Study)
     subject = study if of_study else subject
-    limit = _plan(subject, evaluator, quick, 0 if quick else fits)
-    fits = 0 if quick or evaluator.left is not None else fits
+    limit = _plan(subject, evaluator, fits)
+    fits = 0 if evaluator.left is not None else fits
 
     # The failures.
     if evaluator.left is not None:
@@ -198,15 +198,15 @@ def explain(
     )
 
 
-def _plan(subject: Subject, evaluator: Evaluator, quick: bool, fits: int) -> int:
+def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
     """Plan the phases; returns the number of simulations for minimal causes of failures."""
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
-        limit = max(QUICK_LIMIT if quick else STUDY_LIMIT, OF_SAMPLE * points)
+        limit = evaluator.scaled(max(STUDY_LIMIT, OF_SAMPLE * points))
         planned = planned_over_sets(subject, TO_EXPLAIN, SAMPLED_SETTINGS, fits)
         planned[COMBINATIONS] = MAX_SETTINGS
     else:
-        limit = QUICK_LIMIT if quick else LIMIT
+        limit = evaluator.scaled(LIMIT)
         planned = {TO_EXPLAIN: float(len(subject.solutions))}
     evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
     return limit

@@ -18,7 +18,7 @@ from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import budget_of
+from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.options import CARS_FILE, Fits, LimitTexts, Margin, Range, ValueTexts
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
@@ -101,8 +101,8 @@ def permit(
     fits
         Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
     quick
-        A rough answer: the study's own parameter set alone, and a short search. The grid alone is
-        driven, no car may drive without a limit, and no repair is named.
+        A rough answer: an eighth of the search, with the study's own parameter set alone. The grid
+        alone is driven, no car may drive without a limit, and no repair is named.
     out
         A file for the list of cars, in the order of the input and with all its columns as they are
         given, beside those of the answer; `assumed` names the values that were not measured.
@@ -119,9 +119,10 @@ def permit(
     criterion = keeping_distance(
         evaluator, evaluator.checked(unsafe or Unsafe()), margin, is_stated=unsafe is not None
     )
-    models = models_of(evaluator, criterion, 0 if quick else fits, with_unsafe_originals=True)
+    models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
-    budget = 0 if quick else budget_of(quick=not limits)
+    budget = budget_of(evaluator) if limits else evaluator.scaled(LEAST_SIMULATIONS)
+    budget = 0 if quick else budget
     search = PermitSearch(models, span, values, budget)
     asked = [Cars.one(setting) for setting in fleet.settings]
     if limits:

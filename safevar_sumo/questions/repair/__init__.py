@@ -108,7 +108,8 @@ def repair(
         A repair for the points of the study's tests alone: nothing is simulated between the values
         of a matrix.
     quick
-        A rough answer: the study's own parameter set alone, and a short search. Not with `out`.
+        A rough answer: an eighth of the search, with the study's own parameter set alone. Not with
+        `out`.
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
@@ -131,9 +132,9 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    budget = budget_of(quick=quick)
+    budget = budget_of(evaluator)
     evaluator.begin({ROUNDS_STAGE: USUAL_ROUNDS * budget})
-    models = models_of(evaluator, unsafe_today, 0 if quick else fits, with_unsafe_originals=True)
+    models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
             evaluator=model.evaluator,
@@ -178,7 +179,8 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
     shape (L, n).
     """
     promise = problem.promise
-    points = sobol_points(SOBOL_VEHICLES, len(promise.lower), problem.study.search.seed)
+    number = problem.evaluator.scaled(SOBOL_VEHICLES)
+    points = sobol_points(number, len(promise.lower), problem.study.search.seed)
     settings = [
         promise.region.characteristics.original[np.newaxis],
         promise.at(np.round(points)),

@@ -60,7 +60,8 @@ def find_failures(
         vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
         start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
         start[:, : vehicles.shape[1]] = vehicles
-        found = falsify(problem.promise, [judge], [start], LEAST_SIMULATIONS, rng)
+        budget = own.evaluator.scaled(LEAST_SIMULATIONS)
+        found = falsify(problem.promise, [judge], [start], budget, rng)
         if found.failures:
             failures = {row: found.failures[0]}
     return {row: np.unique(settings, axis=0) for row, settings in failures.items()}
@@ -85,7 +86,8 @@ def prove_change(
         )
 
     rng = Stream.REPAIRED_BOUND.generator(seed, number)
-    proof, unsafe = prove(lambda count: own.draw(count, rng), judge, MAX_UNSAFE_SHARE, attempt)
+    share = MAX_UNSAFE_SHARE / own.evaluator.account.effort
+    proof, unsafe = prove(lambda count: own.draw(count, rng), judge, share, attempt)
     failures = {0: unsafe} if len(unsafe) else {}
     if failures or len(problems) == 1:
         return proof, failures

@@ -89,18 +89,16 @@ def tolerance(
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.
     quick
-        A rough answer: the study's own parameter set alone, and a short search. No limit is called
-        kept, and with limits the exit code is 3.
+        A rough answer: an eighth of the search, with the study's own parameter set alone. No limit
+        is called kept, and with limits the exit code is 3.
     """
     whole = evaluator
     if up_to is not None:
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
-    budget = budget_of(quick=quick)
-    fits = 0 if quick else fits
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
     smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
-    phases = phases_of(evaluator, len(columns), budget, fits)
+    phases = phases_of(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
     evaluator.begin(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
     specified = specified_limits(study, limits, columns)
@@ -121,7 +119,7 @@ def tolerance(
         criterion=unsafe,
         margin=margin,
         fits=fits,
-        budget=budget,
+        budget=budget_of(evaluator),
         is_quick=quick,
         at_tests=at_tests,
         up_to=up_to,

@@ -154,7 +154,9 @@ class AloneSearch:
         these are ranges.
         """
         if self.ends and len(model.characteristics.scenario):
-            share = max(round(FALSIFICATION_SHARE * budget), LEAST_SIMULATIONS)
+            share = max(
+                round(FALSIFICATION_SHARE * budget), model.evaluator.scaled(LEAST_SIMULATIONS)
+            )
             _falsify_alone(self.ends, model, share)
 
     def meet(self, models: Sequence[Model], failures: FloatArray) -> None:

@@ -12,7 +12,8 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch, Step
+from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
+from safevar_sumo.questions.tolerance.sides import Step
 from safevar_sumo.records import FloatArray
 
 LEAST_MOVE = 1 / 50
@@ -20,8 +21,6 @@ LEAST_MOVE = 1 / 50
 """
 STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
-ORDERS = 31
-"""Number of random orders in which failures are cut off."""
 SLAB_SIMULATIONS = 512
 """Number of simulations that falsify the room beyond a limit."""
 SLAB_CORNERS = 512
@@ -97,48 +96,28 @@ class Extension:
         return bool(found)
 
     def cut(self, box: Box, clearance: float, avoided: Sequence[FloatArray] = ()) -> Box:
-        """The largest box within a box without its known failures that was found: they are cut off
-        in several orders, first those that leave the least choice of a limit to move in. Limits
-        keep off failures by a `clearance` above 0, as a share of a move. No box holds settings
-        that are `avoided`, either, each of shape (K, n).
+        """A box within a box without its known failures, as large as it may be: the failure that
+        costs most is cut off first, by the limit that loses least. Limits keep off failures by a
+        `clearance` above 0, as a share of a move. No box holds settings that are `avoided`, either,
+        each of shape (K, n).
         """
         search = self.search
         sides = search.sides_of(box)
         failures = search.extents(np.concatenate([search.unsafe_inside(sides), *avoided]))
-        failures = failures[(failures <= sides).all(axis=(1, 2))]
-        if not len(failures):
+        if not (failures <= sides).all(axis=(1, 2)).any():
             return box
-        choices = np.count_nonzero(search.is_free & (failures > 0), axis=(1, 2))
-        if not choices.all():
-            return search.printed(search.fixed)
-        rng = Stream.ORDERS_OF_CUTS.generator(search.seed)
-        orders = [
-            np.argsort(choices, kind="stable"),
-            *(rng.permutation(len(failures)) for _ in range(ORDERS)),
-        ]
-        cuts = [
-            self._cut_off(sides, failures[order], clearance)
-            for order in orders[: len(failures) * ORDERS]
-        ]
-        return search.printed(max(cuts, key=search.log_volume))
-
-    def _cut_off(self, sides: FloatArray, failures: FloatArray, clearance: float) -> FloatArray:
-        """Sides without failures, given by their extents, shape (K, 2, n), which are cut off in
-        turn: each by that side which loses the least volume, by a `clearance` more than it needs
-        to, as a share of a move.
-        """
-        search = self.search
-        sides = sides.copy()
-        while len(failures):
-            ends = np.maximum(failures[0] - clearance * LEAST_MOVE * search.width, 0.0)
-            is_choice = search.is_free & (failures[0] > 0)
-            lengths = sides.sum(axis=0)
-            robustness = np.maximum(lengths - sides + ends, 1e-9 * search.width + 1e-300)
-            kept = np.where(is_choice, robustness / np.maximum(lengths, 1e-300), -np.inf)
-            place = np.unravel_index(np.argmax(kept), kept.shape)
-            sides[place] = ends[place]
-            failures = failures[(failures <= sides).all(axis=(1, 2))]
-        return sides
+        while len(failures := failures[(failures <= sides).all(axis=(1, 2))]):
+            is_choice = search.is_free & (failures > 0)
+            if not is_choice.any(axis=(1, 2)).all():
+                return search.printed(search.fixed)
+            # Where each limit would end, and which share of its length would stay.
+            ends = np.maximum(failures - clearance * LEAST_MOVE * search.width, 0.0)
+            lengths = np.maximum(sides.sum(axis=0), 1e-300)
+            kept = np.where(is_choice, (lengths - sides + ends) / lengths, -np.inf)
+            hardest = np.argmin(kept.max(axis=(1, 2)))
+            place = np.unravel_index(np.argmax(kept[hardest]), sides.shape)
+            sides[place] = ends[hardest][place]
+        return search.printed(sides)
 
     def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
         """For each limit that could move out further, a known failure that it then meets."""

@@ -15,6 +15,7 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import MAX_CORNERS, Box
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import Model, Models, models_of
 from safevar_sumo.questions.reach import nearest_limits
@@ -129,7 +130,7 @@ class FoundLimits(NamedTuple):
         return all(one.safe is not None for one in self.scans)
 
 
-def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None) -> NamedValues:
+def phases_of(evaluator: Evaluator, columns: int, fits: int | None) -> NamedValues:
     """The phases of progress, each with the number of settings that it usually simulates."""
     study = evaluator.study
     points = len(evaluator.system.points)
@@ -137,8 +138,9 @@ def phases_of(evaluator: Evaluator, columns: int, budget: int, fits: int | None)
     if study.is_rated:
         return phases
     sets = len(other_sets(study, fits))
+    budget = budget_of(evaluator)
     own = USUAL_BOXES * budget / points
-    of_set = VALUES * columns + 2 * budget_of_set(budget) + min(2**columns, MAX_CORNERS)
+    of_set = VALUES * columns + 2 * budget_of_set(evaluator, budget) + min(2**columns, MAX_CORNERS)
     phases |= {OWN_SET_STAGE: own, OTHER_SETS_STAGE: sets * of_set}
     if there := usual_settings(evaluator, budget, 1 + sets):
         phases[RANGES_STAGE] = SLOWNESS * there
@@ -247,7 +249,7 @@ def answer_limits(asked: Asked) -> Answer:
     nearest = []
     if rows.broken and together is not None:
         nearest = nearest_limits(models, asked.limits)
-    in_ranges = rows_in_ranges(asked, together) if found.is_safe else []
+    in_ranges = [] if asked.is_quick or not found.is_safe else rows_in_ranges(asked, together)
     refusal = demand = ""
     if not found.is_safe:
         breach = asked.unsafe.breach_in_words(asked.original)

@@ -14,9 +14,9 @@ from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.tolerance.sides import BoxGeometry, Step
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
-from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 SHRINKING = (8, 8, 8)
 """Number of parts into which each round divides the sizes between a safe and an unsafe box."""
@@ -46,118 +46,7 @@ UNDONE_AT_ONCE = 4
 """Number of changes of a setting of which all combinations are undone in one batch, in search of
 its causes.
 """
-RETREAT = 0.05
-"""By this share of what is left, a box keeps off known failures more after each attack that teaches
-no new corner: where the response is not monotone, the next one would lie beside them.
-"""
-ROUNDING = 1e-9
-"""Rounding errors of a setting, as a share of the domain."""
 SEARCH_STAGE = "search of the limits together"
-Step = Sequence[int]
-"""A side of a box, below or above, and the column of its characteristic."""
-
-
-class BoxGeometry:
-    """Boxes that are given by their sides: the extents below and above the original, shape (2, n),
-    in the units of the characteristics.
-
-    Attributes
-    ----------
-    width
-        Widths of the domains; 0 for a characteristic that does not vary.
-    domain
-        The extents of the domains.
-    limits
-        The values of the sides that are at limits, NaN for the free ones.
-    is_free
-        Which sides may move; the others are at their limits.
-    longest
-        The longest that each side may be: a free one to the end of its domain, or to that of an
-        outer box within which it stays, a fixed one to its limit.
-    fixed
-        The box whose free sides are 0.
-    """
-
-    def __init__(
-        self, region: FeasibleRegion, columns: Sequence[int], limits: Mapping[str, Limit]
-    ) -> None:
-        members = region.characteristics
-        self.region = region
-        self.original = members.original
-        is_varied = np.isin(range(len(members)), columns)
-        self.domain = (
-            np.stack([self.original - members.lower, members.upper - self.original]) * is_varied
-        )
-        self.width = self.domain.sum(axis=0)
-        self.limits = np.full_like(self.domain, np.nan)
-        for name, limit in limits.items():
-            self.limits[:, members.names.index(name)] = limit.at_least, limit.at_most  # None is NaN
-        self.is_free = (self.domain > 0) & np.isnan(self.limits)
-        self.longest = np.where(
-            np.isnan(self.limits), self.domain, np.abs(self.limits - self.original)
-        )
-        self.fixed = np.where(self.is_free, 0.0, self.longest)
-
-    def stay_within(self, outer: Box) -> None:
-        """Let no free side be longer than that of an outer box of vehicles."""
-        shorter = np.minimum(self.longest, self.sides_of(outer))
-        self.longest = np.where(self.is_free, shorter, self.longest)
-
-    @property
-    def characteristics(self) -> CharacteristicSet:
-        return self.region.characteristics
-
-    def box(self, sides: FloatArray) -> Box:
-        return Box(self.region, self.original - sides[0], self.original + sides[1])
-
-    def sides_of(self, box: Box) -> FloatArray:
-        """The sides of a box."""
-        return np.stack([self.original - box.lower, box.upper - self.original])
-
-    def printed(self, sides: FloatArray) -> Box:
-        """A box as it is printed: limits and ends of domains exactly, all others rounded
-        inwards.
-        """
-        box = self.box(sides)
-        members = self.characteristics
-        ends = np.array(
-            [
-                [
-                    item.rounded(end, upwards=upwards)
-                    for item, end in zip(members, ends, strict=True)
-                ]
-                for ends, upwards in ((box.lower, True), (box.upper, False))
-            ]
-        )
-        ends = np.where(sides >= self.domain, np.stack([members.lower, members.upper]), ends)
-        ends = np.where(self.domain > 0, ends, self.original)
-        lower, upper = np.where(np.isnan(self.limits), ends, self.limits)
-        return Box(self.region, lower, upper)
-
-    def extents(self, settings: FloatArray) -> FloatArray:
-        """The sides that a box needs to hold each of K settings, shape (K, 2, n); below 0 where it
-        needs none.
-        """
-        change = settings - self.original
-        return np.asarray(np.stack([-change, change], axis=1) - ROUNDING * self.width)
-
-    def wider(self, sides: FloatArray, steps: Sequence[Step], share: float) -> FloatArray:
-        """A box with some sides moved outwards by a share of the domain, up to their longest."""
-        wider = sides.copy()
-        for side, column in steps:
-            wider[side, column] = min(
-                sides[side, column] + share * self.width[column], self.longest[side, column]
-            )
-        return wider
-
-    def log_volume(self, boxes: FloatArray) -> FloatArray:
-        """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
-        shares = np.divide(
-            boxes.sum(axis=-2), self.width, out=np.ones_like(boxes[..., 0, :]), where=self.width > 0
-        )
-        return np.asarray(
-            np.sum(np.log(np.maximum(shares, 1e-9)), axis=-1)
-        )  # finite for a width of 0, too
 
 
 class BoxSearch(BoxGeometry):
@@ -173,8 +62,6 @@ class BoxSearch(BoxGeometry):
         Corners that were unsafe in some box: for each characteristic -1, the lower end of the box,
         0, the original, or 1, the upper end; for each parameter of the scenario its place between
         original and end.
-    gap
-        The share of the way to a known failure by which a box keeps off it.
     batch
         Number of settings that are simulated at once.
     """
@@ -190,9 +77,10 @@ class BoxSearch(BoxGeometry):
         self.models = [model]
         self.unsafe_settings = unsafe_settings
         self.corners = list[FloatArray]()
-        self.gap = 0.0
         self.search_count = 0
         self.seed = model.evaluator.seed
+        self._attempts = model.evaluator.scaled(MAX_ATTEMPTS)
+        self._points = model.evaluator.scaled(SEARCH_POINTS)
         self.batch = max(BATCH // len(model.numbers_of_points), LEAST_BATCH)
 
     def join(self, model: Model) -> None:
@@ -228,19 +116,14 @@ class BoxSearch(BoxGeometry):
         is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
         return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
 
-    def needs(self, settings: FloatArray) -> FloatArray:
-        """The sides that a box must not reach together, because of K unsafe settings, shape (K, 2,
-        n).
-        """
-        extents = self.extents(settings)
-        return np.where(self.is_free & (extents > 0), (1 - self.gap) * extents, extents)
+    def unsafe_inside(self, sides: FloatArray) -> FloatArray:
+        """The known unsafe settings that a box holds."""
+        extents = self.extents(self.unsafe_settings)
+        return np.asarray(self.unsafe_settings[(extents <= sides).all(axis=(1, 2))])
 
-    def unsafe_inside(self, sides: FloatArray, needs: FloatArray | None = None) -> FloatArray:
-        """The known unsafe settings that a box holds, or, by what they need of a box, that it must
-        not.
-        """
-        needs = self.extents(self.unsafe_settings) if needs is None else needs
-        return np.asarray(self.unsafe_settings[(needs <= sides).all(axis=(1, 2))])
+    def holds_failure(self, box: Box) -> bool:
+        """Whether a box holds a known unsafe setting."""
+        return len(self.unsafe_inside(self.sides_of(box))) > 0
 
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one
@@ -287,7 +170,7 @@ class BoxSearch(BoxGeometry):
         known = self.unsafe_inside(sides)
         if len(known):
             return known
-        points = self.points(sides, SEARCH_POINTS)
+        points = self.points(sides, self._points)
         return points[self.are_unsafe(points)]
 
     def learn(self, settings: FloatArray, model: Model | None = None) -> FloatArray:
@@ -296,15 +179,12 @@ class BoxSearch(BoxGeometry):
 
         One by one, as many changes of a setting as possible are undone while it stays unsafe; the
         directions of the remaining changes are the corner. All combinations of the next few are
-        simulated at once. Without a new corner, boxes keep off all failures more.
+        simulated at once.
         """
         number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
         causes = self._causes(settings[:: len(settings) // number][:number], model)
         known = {corner.tobytes(): corner for corner in [*self.corners, *self._corners_of(causes)]}
-        is_new = len(known) > len(self.corners)
         self.corners = list(known.values())
-        if not is_new:
-            self.gap += RETREAT * (1 - self.gap)
         self._keep_causes(causes)
         return causes
 
@@ -384,7 +264,7 @@ class BoxSearch(BoxGeometry):
         failure.
         """
         boxes = rows.reshape(-1, *self.domain.shape)
-        needs = self.needs(self.unsafe_settings)
+        needs = self.extents(self.unsafe_settings)
         holds_failure = [(needs <= box).all(axis=(1, 2)).any() for box in boxes]
         return np.asarray(~self.are_safe(boxes) | holds_failure)
 
@@ -423,7 +303,7 @@ class BoxSearch(BoxGeometry):
 
     def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
         """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
-        needs = self.needs(self.unsafe_settings)
+        needs = self.extents(self.unsafe_settings)
         needs = needs[(needs <= boxes.max(axis=0, initial=0.0)).all(axis=(1, 2))]
         columns = np.ascontiguousarray(
             needs.reshape(-1, self.domain.size).T
@@ -450,7 +330,7 @@ class BoxSearch(BoxGeometry):
 
         def is_open(box: FloatArray, step: Step) -> bool:
             side, column = step
-            known = self.unsafe_inside(box, self.needs(self.unsafe_settings))
+            known = self.unsafe_inside(box)
             return not (self.extents(known)[:, side, column] > sides[side, column]).any()
 
         boxes = [(self.wider(sides, group, WIDENING), group) for group in groups]
@@ -468,18 +348,18 @@ class BoxSearch(BoxGeometry):
         settings[:, column] = self.box(sides).end(side, column)
         return settings
 
-    def best(self, start: FloatArray) -> FloatArray | None:
+    def best(self, start: FloatArray) -> FloatArray:
         """The largest box within `start` in which no search finds anything unsafe, moved out as far
-        as it can be; None if every search finds something.
+        as it can be, or the last of `MAX_ATTEMPTS` boxes.
         """
         sides = start
-        for _ in range(MAX_ATTEMPTS):
+        for _ in range(self._attempts):
             sides = self.largest(sides, start)
             found = self.failures_in(sides)
             if not len(found):
                 sides = self.widened(sides)
                 found = self.failures_in(sides)
             if not len(found):
-                return sides
+                break
             self.learn(found)
-        return None
+        return sides

@@ -4,25 +4,22 @@ which each other set in turn cuts.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.questions.between import MovingTest
-from safevar_sumo.questions.box import MAX_CORNERS, Box, Proof
+from safevar_sumo.questions.box import Box, Proof
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.sampling import Interval, Stream
+from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tolerance.extension import Extension
 from safevar_sumo.questions.tolerance.scans import OneAtATimeScan
 from safevar_sumo.questions.tolerance.search import BoxSearch
-from safevar_sumo.questions.tolerance.validation import (
-    KNOWN_BETWEEN,
-    Failures,
-    Validation,
-    Validator,
-)
+from safevar_sumo.questions.tolerance.specified import broken_specification
+from safevar_sumo.questions.tolerance.validation import Validation, Validator
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject
 from safevar_sumo.study import Limit
 
@@ -48,10 +45,6 @@ that moves, though never less than `LEAST_SIMULATIONS`.
 CONFIRMATIONS, CONFIRMATIONS_OF_SET = 3, 1
 """Number of further falsifications of the box that is to be printed with the study's own parameter
 set, and with another one.
-"""
-SPECIFICATION_POINTS = 256
-"""Number of Sobol points, and of corners, at which specified limits are tested, all others as in
-the original.
 """
 
 
@@ -133,50 +126,6 @@ class LimitsTogether(NamedTuple):
             "least_attacked": self.least[0] if passed else None,
             "boxes": int(self.box is not None),
         }
-
-
-def broken_specification(
-    specified: Box, models: Sequence[Model], tests: Mapping[int, Sequence[MovingTest]]
-) -> dict[int, tuple[Model, FloatArray]]:
-    """The worst setting of specified limits in each parameter set in which they are unsafe, and the
-    model at the points where it is: those of the study, or between those of its `tests`.
-    """
-    stage = "specified limits with each parameter set"
-    seed = models[0].evaluator.seed
-    corners = specified.corners(seed, 0)[:MAX_CORNERS]
-    settings = np.concatenate([corners, specified.spread_and_corners(SPECIFICATION_POINTS, seed)])
-    settings = np.unique(settings, axis=0)
-    broken = dict[int, tuple[Model, FloatArray]]()
-    for model in models:
-        if _keeps_its_margin(specified, model):
-            continue
-        robustness = model.robustness(settings, stage)
-        if robustness.min() < 0:
-            broken[model.fit] = model, settings[np.argmin(robustness)]
-            continue
-        worst = settings[np.argsort(robustness, kind="stable")[:KNOWN_BETWEEN]]
-        rng = Stream.SPECIFIED_BETWEEN.generator(seed, model.fit)
-        for test in tests[model.fit]:
-            between = test.spread(worst, rng)
-            robustness = test.robustness(between, stage)
-            if robustness.min() < 0:
-                at_encounter, vehicles = test.failures(between[[np.argmin(robustness)]])
-                broken[model.fit] = at_encounter, vehicles[0]
-                break
-    return broken
-
-
-def _keeps_its_margin(specified: Box, model: Model) -> bool:
-    """Whether specified limits are the original vehicle, in a study whose encounters count where
-    that keeps a margin, and nothing but less than it would be unsafe: then no encounter that counts
-    can break them.
-    """
-    members = model.characteristics
-    is_original = (specified.lower == members.original) & (specified.upper == members.original)
-    if not len(members.scenario) or not is_original[members.of_vehicle].all():
-        return False
-    margin = model.evaluator.study.scenario.margin
-    return model.unsafe.is_collision and margin is not None and model.unsafe.keep <= margin
 
 
 class JointSearch:
@@ -264,40 +213,53 @@ class JointSearch:
             # Without joint limits there are none here: no free side has any room.
             search.stay_within(self._outer.box or self._outer.specified)
             search.know(*(row[np.newaxis] for row in self._outer.beyond.values()))
-        boxes = _Boxes(search, _start_of(search, self._columns, scans))
+        start = _start_of(search, self._columns, scans)
+        extension = Extension(search)
+        evaluator = self.own.evaluator
         validator = self._validator(self.own, self._budget)
         self._validators = [validator]
+        passed: Validation | None = None
+        growths = most_growths = evaluator.scaled(MAX_GROWTHS)
+        retreat, failed = RETREAT / evaluator.account.effort, 0
+        outer = search.printed(start)
         for number in range(1, MAX_BOXES + 1):
-            self.own.evaluator.phases.begin_round(number, MAX_BOXES)
-            box = boxes.next(number)
-            if box is None:
+            evaluator.phases.begin_round(number, MAX_BOXES)
+            if number <= max(evaluator.scaled(EXPLORED), 1) and growths == most_growths:
+                outer = search.printed(search.best(start))
+            box = extension.cut(outer, CLEARANCE + retreat * failed)
+            if search.holds_failure(box):  # of the specified limits, which do not move
                 break
-            is_over = number == MAX_BOXES or self.own.evaluator.simulated > MAX_SIMULATIONS
+            is_over = number == MAX_BOXES or evaluator.simulated > evaluator.scaled(MAX_SIMULATIONS)
             # A box that is no larger than the one that passed ends the search, if that one passes
             # all other tests.
-            passed = boxes.passed
-            is_last = passed is not None and (is_over or boxes.is_no_larger(box))
-            if passed and is_last:
-                validation = validator.complete(passed, number, CONFIRMATIONS)
+            if passed and (is_over or search.is_no_larger(box, passed.box)):
+                validation = validator.complete(passed, number, evaluator.scaled(CONFIRMATIONS))
                 if not validation.failures:
                     validation = validator.prove(validation, number)
+                if not validation.failures:
+                    nothing = nothing._replace(
+                        box=validation.box, proof=validation.proof, validations={0: validation}
+                    )
+                    break
             else:
                 validation = validator.validate(box, number)
-            if validation.failures:
-                boxes.refuse(validation)
-                if is_over and boxes.passed is None:
-                    break
-            elif is_last:
-                nothing = nothing._replace(
-                    box=validation.box, proof=validation.proof, validations={0: validation}
-                )
+            if not validation.failures:
+                # The limits of a box that passed move out as far as they can go.
+                passed, outer, failed = validation, box, 0
+                if growths and not is_over:
+                    growths -= 1
+                    outer = extension.of(box)
+                continue
+            _learn(search, validation)
+            failed += 1
+            if passed and search.holds_failure(passed.box):
+                passed = None
+            if is_over and not passed:
                 break
-            else:
-                boxes.accept(validation, may_grow=not is_over)
         self.found = nothing._replace(boxes=number)
         self._note(search.models)
         # At the worst phases of encounters the own set cuts it, too.
-        if self.own.in_phases is not None:
+        if self.own.in_phases is not None and evaluator.account.effort >= 1:
             self.cut(self.own, _nothing(self.own))
 
     def cut(self, model: Model, unsafe_settings: FloatArray) -> None:
@@ -309,7 +271,8 @@ class JointSearch:
             return
         search = self._search
         search.know(unsafe_settings)
-        validator = self._validator(model, budget_of_set(self._budget), with_phases=True)
+        budget = budget_of_set(model.evaluator, self._budget)
+        validator = self._validator(model, budget, with_phases=True)
         extension = Extension(search)
         met = list[Model]()
         avoided = list[FloatArray]()
@@ -329,7 +292,8 @@ class JointSearch:
                 )
                 break
             met += [failures.model for failures in validation.failures]
-            for failures, causes in _learn(search, validation):
+            causes_of_each = _learn(search, validation)
+            for failures, causes in zip(validation.failures, causes_of_each, strict=True):
                 nearest = search.approach(causes, failures.model)
                 # Windows of phases are narrow and deep: one limit moves until they close.
                 if failures.model.at_worst_phase:
@@ -365,7 +329,7 @@ class JointSearch:
         return validation._replace(failures=proved.failures), proved.proof
 
     def _validator(self, model: Model, budget: int, *, with_phases: bool = False) -> Validator:
-        budgets = budget, budget_of_set(budget) if model.fit == 0 else budget
+        budgets = budget, budget_of_set(model.evaluator, budget) if model.fit == 0 else budget
         return Validator(model, self._tests[model.fit], budgets, with_phases=with_phases)
 
     def _note(self, models: Sequence[Model]) -> None:
@@ -382,82 +346,25 @@ class JointSearch:
         )
 
 
-def budget_of_set(budget: int) -> int:
+def budget_of_set(evaluator: Evaluator, budget: int) -> int:
     """Number of simulations of a falsification with another parameter set, or in a test that
     moves.
     """
-    return max(round(OTHER_SHARE * budget), LEAST_SIMULATIONS)
+    return max(round(OTHER_SHARE * budget), evaluator.scaled(LEAST_SIMULATIONS))
 
 
 def _nothing(model: Model) -> FloatArray:
     return np.zeros((0, len(model.characteristics)))
 
 
-def _learn(search: BoxSearch, validation: Validation) -> Iterator[tuple[Failures, FloatArray]]:
+def _learn(search: BoxSearch, validation: Validation) -> list[FloatArray]:
     """Take failures, and the models in which they are, into a search; the causes of each."""
+    causes = list[FloatArray]()
     for failures in validation.failures:
         search.join(failures.model)
         search.know(failures.settings)
-        yield failures, search.learn(failures.settings, failures.model)
-
-
-class _Boxes:
-    """The boxes that are validated: at first the largest that a search finds, then each one without
-    the failures that were found in the one before, and from a box that passed on larger ones.
-
-    Attributes
-    ----------
-    passed
-        The validation of the largest box that passed.
-    """
-
-    def __init__(self, search: BoxSearch, start: FloatArray) -> None:
-        self.search = search
-        self.extension = Extension(search)
-        self.passed: Validation | None = None
-        self._start = start
-        self._outer: Box | None = None
-        self._growths = MAX_GROWTHS
-        self._failed = 0
-        """The box from which failures are cut off; how often limits may still move out; number of
-        boxes since one passed.
-        """
-
-    def next(self, number: int) -> Box | None:
-        """The next box; None if no search finds one."""
-        is_explored = self._growths == MAX_GROWTHS and number <= EXPLORED
-        if self._outer is None or is_explored:
-            sides = self.search.best(self._start)
-            if sides is None:
-                return None
-            self._outer = self.search.printed(sides)
-        return self.extension.cut(self._outer, CLEARANCE + RETREAT * self._failed)
-
-    def is_no_larger(self, box: Box) -> bool:
-        """Whether a box is no larger than the one that passed."""
-        assert self.passed is not None
-        search = self.search
-        sides = np.stack([search.sides_of(box), search.sides_of(self.passed.box)])
-        volumes = search.log_volume(sides)
-        return bool(volumes[0] <= volumes[1])
-
-    def refuse(self, validation: Validation) -> None:
-        """Take failures, and the models in which they are, into the search."""
-        search = self.search
-        for _ in _learn(search, validation):
-            pass
-        if self.passed and len(search.unsafe_inside(search.sides_of(self.passed.box))):
-            self.passed = None
-        self._failed += 1
-
-    def accept(self, validation: Validation, *, may_grow: bool) -> None:
-        """Take a box that passed; its limits move out as far as they can go."""
-        self.passed = validation
-        self._outer = validation.box
-        self._failed = 0
-        if self._growths and may_grow:
-            self._growths -= 1
-            self._outer = self.extension.of(validation.box)
+        causes.append(search.learn(failures.settings, failures.model))
+    return causes
 
 
 def _start_of(

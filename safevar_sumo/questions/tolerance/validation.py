@@ -133,11 +133,12 @@ class Validator:
         """
         box = validation.box
         corners = self._corners(box, attempt)
+        most = self.model.evaluator.scaled(MAX_CORNERS)
         rngs = [
             Stream.VALIDATION.generator(self.seed, attempt, number, self.model.fit)
             for number in range(confirmations)
         ]
-        validation, robustness = self._test(validation, corners[:MAX_CORNERS])
+        validation, robustness = self._test(validation, corners[:most])
         worst = corners[np.argsort(robustness, kind="stable")]
         self._worst = []
         # Further searches for counterexamples.
@@ -184,8 +185,9 @@ class Validator:
             return Judgement(model.robustness_by(evaluations) < 0, failed, ~evaluations.infeasible)
 
         rng = Stream.CONFIDENCE_BOUND.generator(self.seed, attempt)
+        share = MAX_UNSAFE_SHARE / model.evaluator.account.effort
         proof, unsafe = prove(
-            lambda number: validation.box.draw(number, rng), judge, MAX_UNSAFE_SHARE, self._proofs
+            lambda number: validation.box.draw(number, rng), judge, share, self._proofs
         )
         return validation._replace(proof=proof, failures=self._failures(unsafe))
 
