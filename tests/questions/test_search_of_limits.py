@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from numpy.random import default_rng
@@ -49,13 +51,30 @@ def test_attacks_side_by_side_find_what_each_finds_alone() -> None:
 
 
 def test_a_cut_keeps_off_failures_by_its_clearance() -> None:
-    """Each failure moves in the limit that loses least."""
+    """Each failure alone would move in its cheapest limit; both are cut off at once by one limit of
+    the first.
+    """
     search = BoxSearch(model_of(made_up_study(2)), [0, 1], {}, np.array([[9.0, 9.5], [9.5, 8.0]]))
     whole = search.box(search.domain)
     cut = Extension(search).cut(whole, 0.8)
-    assert cut.upper.tolist() == pytest.approx([9.3, 9.3], abs=0.1)
+    assert cut.upper.tolist() == pytest.approx([8.9, 10], abs=0.1)
     assert not cut.holds(search.unsafe_settings).any()
     assert Extension(search).cut(whole, 4.8).upper[0] < cut.upper[0] - 0.2, "it keeps off by more"
+
+
+def test_no_box_without_failures_is_larger_than_the_cut() -> None:
+    """Of all that move one limit in for each failure."""
+    failures = default_rng(1).uniform(0, 10, (7, 2))
+    search = BoxSearch(model_of(made_up_study(2)), [0, 1], {}, failures)
+    cut = Extension(search).cut(search.box(search.domain), 1e-6)
+    volumes = []
+    for columns in product((0, 1), repeat=7):
+        sides = search.domain.copy()
+        for failure, column in zip(search.extents(failures), columns, strict=True):
+            side = np.argmax(failure[:, column])
+            sides[side, column] = min(sides[side, column], failure[side, column])
+        volumes.append(search.log_volume(sides))
+    assert search.log_volume(search.sides_of(cut)) == pytest.approx(max(volumes), abs=0.02)
 
 
 @pytest.mark.slow

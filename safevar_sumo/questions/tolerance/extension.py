@@ -5,6 +5,8 @@ failure.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from heapq import heappop, heappush
+from itertools import count
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.tolerance.search import SEARCH_STAGE, BoxSearch
+from safevar_sumo.questions.tolerance.search import LEAST_GAIN, SEARCH_STAGE, BoxSearch
 from safevar_sumo.questions.tolerance.sides import Step
 from safevar_sumo.records import FloatArray
 
@@ -21,6 +23,8 @@ LEAST_MOVE = 1 / 50
 """
 STRIDES = (1, 2, 4, 8)
 """Numbers of such moves that are tried at once, until one is too far."""
+MAX_DIVES = 300
+"""Number of boxes without failures that a branch and bound compares at most."""
 SLAB_SIMULATIONS = 512
 """Number of simulations that falsify the room beyond a limit."""
 SLAB_CORNERS = 512
@@ -96,28 +100,55 @@ class Extension:
         return bool(found)
 
     def cut(self, box: Box, clearance: float, avoided: Sequence[FloatArray] = ()) -> Box:
-        """A box within a box without its known failures, as large as it may be: the failure that
-        costs most is cut off first, by the limit that loses least. Limits keep off failures by a
+        """The largest box within a box without its known failures. Limits keep off failures by a
         `clearance` above 0, as a share of a move. No box holds settings that are `avoided`, either,
         each of shape (K, n).
         """
         search = self.search
         sides = search.sides_of(box)
         failures = search.extents(np.concatenate([search.unsafe_inside(sides), *avoided]))
-        if not (failures <= sides).all(axis=(1, 2)).any():
+        failures = failures[(failures <= sides).all(axis=(1, 2))]
+        if not len(failures):
             return box
-        while len(failures := failures[(failures <= sides).all(axis=(1, 2))]):
-            is_choice = search.is_free & (failures > 0)
-            if not is_choice.any(axis=(1, 2)).all():
-                return search.printed(search.fixed)
-            # Where each limit would end, and which share of its length would stay.
-            ends = np.maximum(failures - clearance * LEAST_MOVE * search.width, 0.0)
-            lengths = np.maximum(sides.sum(axis=0), 1e-300)
-            kept = np.where(is_choice, (lengths - sides + ends) / lengths, -np.inf)
-            hardest = np.argmin(kept.max(axis=(1, 2)))
-            place = np.unravel_index(np.argmax(kept[hardest]), sides.shape)
-            sides[place] = ends[hardest][place]
-        return search.printed(sides)
+        if not (search.is_free & (failures > 0)).any(axis=(1, 2)).all():
+            return search.printed(search.fixed)
+        return search.printed(self._without(sides, failures, clearance))
+
+    def _without(self, sides: FloatArray, failures: FloatArray, clearance: float) -> FloatArray:
+        """The largest sides within some sides without failures, given by their extents, shape
+        (K, 2, n): by branch and bound, exact unless it ends after `MAX_DIVES`. Each failure is cut
+        off by one limit, by a `clearance` more than it needs to.
+        """
+        search = self.search
+        ends = np.maximum(failures - clearance * LEAST_MOVE * search.width, 0.0)
+        is_choice = search.is_free & (failures > 0)
+        places = np.arange(sides.size).reshape(sides.shape)
+        numbers = count()
+        waiting = [(-np.inf, next(numbers), sides)]
+        best, least = sides, np.inf
+        for _ in range(MAX_DIVES):
+            # What waits is no smaller than what is left of it without failures.
+            if not waiting or waiting[0][0] >= least - LEAST_GAIN:
+                break
+            sides = heappop(waiting)[-1]
+            while len(inside := np.flatnonzero((failures <= sides).all(axis=(1, 2)))):
+                lengths = np.maximum(sides.sum(axis=0), 1e-300)
+                kept = (lengths - sides + ends[inside]) / lengths
+                kept = np.where(is_choice[inside], kept, -np.inf)
+                # The failure that costs most is cut off first, by the limit that loses least; its
+                # other limits wait.
+                hardest = np.argmin(kept.max(axis=(1, 2)))
+                failure = inside[hardest]
+                order = np.argsort(-kept[hardest], axis=None, kind="stable")
+                sides, *others = (
+                    np.where(places == place, ends[failure], sides)
+                    for place in order[: np.count_nonzero(is_choice[failure])]
+                )
+                for other in others:
+                    heappush(waiting, (-float(search.log_volume(other)), next(numbers), other))
+            if search.log_volume(sides) > -least:
+                best, least = sides, -float(search.log_volume(sides))
+        return best
 
     def beyond(self, box: Box) -> dict[tuple[int, int], FloatArray]:
         """For each limit that could move out further, a known failure that it then meets."""
