@@ -68,7 +68,7 @@ class MovingTest(NamedTuple):
         """Settings in encounters as they are printed."""
         return self.model.characteristics.with_printed_encounters(settings)
 
-    def failures(self, settings: FloatArray) -> tuple[Model, FloatArray]:
+    def as_tests(self, settings: FloatArray) -> tuple[Model, FloatArray]:
         """The vehicles of unsafe settings, the worst first, shape (K, n), and the model at their
         first encounters alone, as tests of a matrix; settings in other encounters are left out.
         """
@@ -89,11 +89,12 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
     for test, points in points_of_tests(study, assemble(study).points):
         axes = moving_axes(study, test, points)
         lists = study.lists_of(test)
+        # An axis with one value does not move.
         domains = {name: axes[name] for name in axes if len(lists[name]) > 1}
         if test and domains:
             listed = replace_in(test, over={**lists})
             evaluator = model.evaluator.for_study(in_ranges(study, [(listed, domains)]), verified=0)
-            # Originals drive beside failures alone.
+            # The original is simulated only where a vehicle fails.
             moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
             tests.append(MovingTest(listed, model, moving))
     return tests
@@ -130,7 +131,7 @@ def _point_key(study: Study, point: MatrixTest) -> tuple[Any, ...]:
     return (point.name, *((name, *at) for name, at in study.lists_of(point).items()), *weather)
 
 
-def with_encounters(study: Study, system: System, changes: Collection[str]) -> tuple[Study, System]:
+def with_set_axes(study: Study, system: System, changes: Collection[str]) -> tuple[Study, System]:
     """A study and its system; if axes of its matrix, or the phase, are among the names of what a
     user sets, settings have values of these, in the tests that have all of the axes.
 

@@ -121,7 +121,7 @@ class Evaluator:
         original vehicle is not safe, where encounters are ranges.
         """
         if ignore_constraints:
-            return self._evaluate_shown(settings, stage, self._verified)
+            return self._simulate_shown(settings, stage, self._verified)
         return self._evaluate_feasible(settings, stage, self._verified, EVERYTHING)
 
     def _evaluate_feasible(
@@ -131,13 +131,13 @@ class Evaluator:
         n = len(self.characteristics)
         is_feasible = self.region.feasible(rows[:, :n])
         if is_feasible.all():
-            return self._evaluate_shown(rows, stage, verified, selection)
+            return self._simulate_shown(rows, stage, verified, selection)
         infeasible = rows[~is_feasible]
         changes = self.characteristics.change_objectives(infeasible[:, :n])
         not_simulated = Evaluations.undefined(infeasible, Outcome.INFEASIBLE, METRICS, **changes)
         if not is_feasible.any():
             return not_simulated
-        simulated = self._evaluate_shown(rows[is_feasible], stage, verified, selection)
+        simulated = self._simulate_shown(rows[is_feasible], stage, verified, selection)
         both = Evaluations.concatenate([simulated, not_simulated])
         rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
@@ -208,10 +208,10 @@ class Evaluator:
         vehicle is not safe count, too. Settings that violate a constraint are not simulated, but
         for results at each point.
         """
-        evaluate = self._evaluate_shown if selection.each else self._evaluate_feasible
+        evaluate = self._simulate_shown if selection.each else self._evaluate_feasible
         return evaluate(rows, stage, 0, selection)
 
-    def _evaluate_shown(
+    def _simulate_shown(
         self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
     ) -> Evaluations:
         """Evaluate settings while progress is shown."""

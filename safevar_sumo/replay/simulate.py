@@ -15,7 +15,7 @@ from safevar_sumo.api.simulation import Simulation, simulate_with_original
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.between import with_encounters
+from safevar_sumo.questions.between import with_set_axes
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import studies_of_sets
@@ -128,7 +128,7 @@ def show_simulation(
     changes = set
     with about("set"):
         names = [change.partition("=")[0].strip() for change in changes]
-        study, system = with_encounters(target.study, system, names)
+        study, system = with_set_axes(target.study, system, names)
         target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:

@@ -113,8 +113,10 @@ class _Declared:
             weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
         )
         self._weather = msgspec.structs.asdict(table)
-        time_limit = convert_table(tables.get("search"), SearchTable, "search").time_limit
-        self._lookup = Lookup(places, time_limit=time_limit)
+        self._lookup = Lookup(places)
+        if "search" in tables:  # one without it is refused when all of it is read
+            limit = convert_table(tables["search"], SearchTable, "search").time_limit
+            self._lookup = Lookup(places, time_limit=limit)
 
     def completed(self, key: str, name: str, axis: Any, test: Parameters) -> Any:
         """An axis with all keys of its range; as it is if it lists what cannot be moved.

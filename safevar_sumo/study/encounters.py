@@ -220,9 +220,9 @@ class Encounters(Table, frozen=True, kw_only=True):
     the worst of them decides (`safevar_sumo.sumo.encounters.worst_points`).
 
     Which encounters count: listed ones always; with ranges a setting counts where the original
-    vehicle keeps the `margin` in all tests that it meets, and `all_count` gives the encounters
-    without a margin, which all count. So do those of `permit`, phases of listed encounters, and
-    what lies between them, unless the original is unsafe there (`Model.new_car`).
+    vehicle keeps the `margin` in all tests that it meets. Without a margin (`all_count`) all count:
+    in `permit`, and at other phases of listed encounters. Between listed ones an encounter counts
+    unless the original is unsafe there (`Model.new_car`).
     """
 
     scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]

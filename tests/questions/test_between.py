@@ -63,7 +63,7 @@ def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study
     judges = [lambda rows: test.robustness(rows, "")]
     found = falsify(test.box(box), judges, [test.spread(worst, rng)], 2000, rng)
     (failing,) = found.failures.values()
-    there, vehicles = test.failures(failing)
+    there, vehicles = test.as_tests(failing)
     assert there.are_unsafe(vehicles, "").all(), "as points of a matrix"
     speeds = [dict(point.parameters)["speed"] for point in there.evaluator.system.points]
     assert all(50 < speed < 60 and speed == round(speed, 2) for speed in speeds)

@@ -218,7 +218,7 @@ def _move_between(ends: Sequence[_Ends], test: MovingTest) -> bool:
     has_moved = False
     for each, rows, fails in zip(ends, settings, is_unsafe, strict=True):
         if fails.any():
-            model, failures = test.failures(rows[fails])
+            model, failures = test.as_tests(rows[fails])
             has_moved |= _move([each], model, [failures])
     return has_moved
 

@@ -46,7 +46,7 @@ def broken_specification(
             between = test.spread(worst, rng)
             robustness = test.robustness(between, stage)
             if robustness.min() < 0:
-                at_encounter, vehicles = test.failures(between[[np.argmin(robustness)]])
+                at_encounter, vehicles = test.as_tests(between[[np.argmin(robustness)]])
                 broken[model.fit] = at_encounter, vehicles[0]
                 break
     return broken

@@ -161,7 +161,7 @@ class Validator:
             left = model.robustness(settings, VALIDATION_STAGE)
             worst = settings[np.argsort(left, kind="stable")[:PHASE_FAILURES]]
             if left.min() < 0 and test is not None:
-                model, worst = test.failures(worst[: np.count_nonzero(left < 0)])
+                model, worst = test.as_tests(worst[: np.count_nonzero(left < 0)])
                 failures = Failures(model._replace(at_worst_phase=True), worst)
                 validation = validation._replace(failures=(*validation.failures, failures))
             elif left.min() < 0:
@@ -225,7 +225,7 @@ class Validator:
             failing = [*found.failures.values()]
             if failing:
                 # What failed is a test of its own from now on.
-                model, vehicles = test.failures(failing[0])
+                model, vehicles = test.as_tests(failing[0])
                 matrix = model.evaluator.study.matrix
                 assert matrix is not None
                 self.model = meeting(self.model, matrix.tests)
