@@ -23,6 +23,12 @@ DOUBLE = {
 """Names that may still have several meanings."""
 
 
+def test_every_folder_with_code_is_installed() -> None:
+    listed = (ROOT / "setup.cfg").read_text(encoding="utf-8").split()
+    for file in (ROOT / "safevar_sumo").rglob("__init__.py"):
+        assert ".".join(file.parent.relative_to(ROOT).parts) in listed
+
+
 def public_names_in(source: str) -> Iterator[str]:
     """The functions, classes and types that a module defines."""
     for node in ast.parse(source).body:
