@@ -69,6 +69,18 @@ class MetricBound(NamedTuple):
     limit: float
 
     def __str__(self) -> str:
+        return f"points={self.limit!r}" if self.is_of_lost_points else self.in_words
+
+    @property
+    def is_of_lost_points(self) -> bool:
+        """Whether at most some points of a rating are unsafe: `points=35`."""
+        return (self.measure, self.comparison) == (RATING_POINTS.name, "<=")
+
+    @property
+    def in_words(self) -> str:
+        """`drac > 6`, `at most 35 points`."""
+        if self.is_of_lost_points:
+            return f"at most {self.limit:g} points"
         return f"{self.measure} {self.comparison} {self.limit:.12g}"
 
     @property
@@ -79,15 +91,13 @@ class MetricBound(NamedTuple):
 @dataclass(frozen=True)
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
-    `below`, a safety degree below this limit [m, or -m/s]; with `points`, at most that many points
-    of a rating; with a `bound`, a metric of the study beyond a limit, or a collision (points of a
-    rating are of no run: these alone).
+    `below`, a safety degree below this limit [m, or -m/s]; with a `bound`, a metric of the study
+    beyond a limit, or a collision (points of a rating are of no run: these alone).
 
     `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
     """
 
     below: float | None = None
-    points: float | None = None
     keep: float = 0.0
     contact: float = 0.0
     bound: MetricBound | None = None
@@ -95,27 +105,23 @@ class Unsafe:
     """Whether `below` is half of the original's safety degree, the default if nothing collides."""
 
     def __str__(self) -> str:
-        if self.points is not None:
-            return f"points={self.points!r}"
         if self.bound is not None:
             return str(self.bound)
         return "collision" if self.below is None else f"below={self.below!r}"
 
     @property
     def measure(self) -> str:
-        """The column that decides: points of a rating, a metric, or the safety degree."""
-        if self.points is not None:
-            return RATING_POINTS.name
+        """The column that decides: a metric, or the safety degree."""
         return self.bound.measure if self.bound is not None else F_SAFE.name
 
     @property
     def is_collision(self) -> bool:
         """Whether a collision alone, or less distance than `keep`, is unsafe."""
-        return self.below is None and self.points is None and self.bound is None
+        return self.below is None and self.bound is None
 
     @property
     def is_of_points(self) -> bool:
-        """Whether points of a rating decide, by `points` or by a bound."""
+        """Whether a bound on points of a rating decides."""
         return self.measure == RATING_POINTS.name
 
     @property
@@ -145,10 +151,8 @@ class Unsafe:
         """The criterion in words, rounded: `collision, or clearance below 0.3 m`, `safety degree
         below 1.4 m, half of the original's`, `drac > 6, or a collision`.
         """
-        if self.points is not None:
-            return f"at most {self.points:g} points"
         if self.bound is not None:
-            return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
+            return f"{self.bound.in_words}{'' if self._stands_alone else ', or a collision'}"
         if self.below is None:
             where = ", from bumper to bumper" if self.contact else ""
             clearance = f"collision, or clearance below {self.keep:g} m{where}"
@@ -188,11 +192,9 @@ class Unsafe:
 
     @property
     def in_words(self) -> str:
-        """What an unsafe vehicle does: `collides`, `has drac > 6`."""
-        if self.points is not None:
-            return f"earns at most {self.points:g} points"
+        """What an unsafe vehicle does: `collides`, `has drac > 6`, `earns at most 35 points`."""
         if self.bound is not None:
-            return f"has {self.bound}"
+            return f"{'earns' if self.bound.is_of_lost_points else 'has'} {self.bound.in_words}"
         return "collides" if self.below is None else f"has a safety degree below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
@@ -220,8 +222,6 @@ class Unsafe:
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
-        if self.points is not None:
-            return column(RATING_POINTS.name) <= self.points
         if self.below is not None:
             return column(F_SAFE.name) < self.below
         collides = outcome == COLLISION
@@ -281,17 +281,15 @@ class Unsafe:
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
 
-        # In the unit of the criterion: points, a metric, or a safety degree.
-        if self.points is not None:
-            return (
-                f"earns {vehicle.column(RATING_POINTS.name)[0]:.6g} points, at most {self.points:g}"
-            )
+        # In the unit of the criterion: a metric, or a safety degree.
         if self.is_of_impacts and vehicle.collided[0]:
             columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
             return f"has an {impact_in_words(*columns)}"
         if self.bound is not None:
             measure, comparison, limit = self.bound
             value = float(vehicle.column(measure)[0])
+            if self.bound.is_of_lost_points:
+                return f"earns {value:.6g} points, at most {limit:g}"
             if COMPARISONS[comparison](value, limit):
                 return (
                     f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
@@ -340,8 +338,8 @@ class Unsafe:
         if math.isfinite(limit):
             if (quantity, comparison) in (("below", "="), (SAFETY_DEGREE, "<")):
                 return cls(below=limit)
-            if (quantity, comparison) in (("points", "="), (RATING_POINTS.name, "<=")):
-                return cls(points=limit)
+            if (quantity, comparison) == ("points", "="):
+                quantity, comparison = RATING_POINTS.name, "<="
             if comparison in COMPARISONS:
                 return cls(bound=MetricBound(quantity, comparison, limit))
         raise InputError("unsafe", repr(criterion), CRITERIA)
@@ -365,7 +363,8 @@ class Unsafe:
         points = original.get(RATING_POINTS.name)
         safety_degree = original.get(SAFETY_DEGREE) or 0.0
         if points is not None:
-            return cls(points=round(points - POINT_LOSS, POINT_DECIMALS))
+            most = round(points - POINT_LOSS, POINT_DECIMALS)
+            return cls(bound=MetricBound(RATING_POINTS.name, "<=", most))
         if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
         return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"), is_half=True)
@@ -383,13 +382,10 @@ class Unsafe:
         unsafe = cls.default(
             {name: float(values[0]) for name, values in original.metrics.items()}, outcomes
         )
-        if unsafe.points is not None and unsafe.points < 0:
-            raise InputError(
-                "unsafe",
-                f"the original vehicle earns {unsafe.points + POINT_LOSS:g} points and has none to"
-                " lose",
-                CRITERIA,
-            )
+        if unsafe.bound is not None and unsafe.bound.limit < 0:
+            earned = f"{unsafe.bound.limit + POINT_LOSS:g} points"
+            problem = f"the original vehicle earns {earned} and has none to lose"
+            raise InputError("unsafe", problem, CRITERIA)
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError(
                 "unsafe",

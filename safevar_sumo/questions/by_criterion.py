@@ -45,7 +45,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)
-    if allows and not unsafe.is_of_impacts:
+    if allows and not (unsafe.is_of_impacts or unsafe.is_of_points):
         problem = f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact"
         raise InputError("unsafe", problem, "a bound on impact_excess, or collision")
 

@@ -47,7 +47,6 @@ from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
-from safevar_sumo.sumo.measuring import check_criterion
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.terminal import Progress, show_no_progress
@@ -425,15 +424,14 @@ class Evaluator:
         `checked` raises.
         """
         self.checked(unsafe)
-        if unsafe.bound:
+        if unsafe.bound and not unsafe.is_of_points:
             self.account.measure = unsafe.bound.measure
             self.check_measured(unsafe.bound.measure)
 
     def checked(self, unsafe: Unsafe) -> Unsafe:
-        """A criterion; raises what `check_criterion` raises, and an InputError if nobody is on the
-        road, from whom it is a distance.
+        """A criterion; raises an InputError if nobody is on the road, from whom it is a
+        distance.
         """
-        check_criterion(unsafe, self.study)
         if unsafe.measure == F_SAFE.name:
             self.check_measured()
         return unsafe

@@ -88,8 +88,8 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     # The one of its own criterion.
     if (bound := own_criterion(study).bound) is not None:
         known = OPTIONAL_METRICS | named.computed
-        problem = f"{CRITERION_KEY} = {study.unsafe.criterion!r}: there is no such metric"
-        check_name("", problem, bound.measure, known)
+        problem = f"{study.unsafe.criterion!r}: there is no metric {bound.measure!r}"
+        check_name("", f"{CRITERION_KEY} = {problem}", bound.measure, known)
         named.computed.setdefault(bound.measure, known[bound.measure])
 
     # Objectives, each once.
@@ -116,23 +116,12 @@ def own_criterion(study: Study) -> Unsafe:
     Raises
     ------
     InputError
-        If it is no criterion, and what `check_criterion` raises.
+        If it is no criterion.
     """
     try:
-        criterion = Unsafe.parse(study.unsafe.criterion or COLLISION)
-        check_criterion(criterion, study)
+        return Unsafe.parse(study.unsafe.criterion or COLLISION)
     except InputError as error:
         raise InputError("", f"{CRITERION_KEY} = {error.problem}", error.legal) from None
-    return criterion
-
-
-def check_criterion(criterion: Unsafe, study: Study) -> None:
-    """Refuse a criterion about points of a study that is not rated."""
-    if criterion.points is not None and not study.is_rated:
-        problem = (
-            f"'points={criterion.points:g}': study {study.name!r} is not rated and has no points"
-        )
-        raise InputError("unsafe", problem, "collision or below=X")
 
 
 class _Named:

@@ -186,8 +186,12 @@ def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none
         criterion = Unsafe.parse(text)
         assert criterion.of(runs).tolist() == expected, text
         assert "collision" in criterion.description or "drac" not in text
-        if criterion.points is None:
-            assert (criterion.robustness(runs) < 0).tolist() == expected, text
+        assert (criterion.robustness(runs) < 0).tolist() == expected, text
+        if criterion.is_of_points:
+            left = columns["rating_points"] - np.float64(35)
+            assert criterion.robustness(runs) == pytest.approx(left, abs=1e-8), (
+                "in points, not metres"
+            )
 
 
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
@@ -276,7 +280,7 @@ def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_mu
         True,
         True,
     ]
-    assert Unsafe.default_among(changed, earning(1.5)).points == 0.5
+    assert Unsafe.default_among(changed, earning(1.5)) == Unsafe.parse("points=0.5")
     with pytest.raises(InputError, match=r"earns 0\.5 points and has none to lose"):
         Unsafe.default_among(changed, earning(0.5))
 

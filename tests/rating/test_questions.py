@@ -59,10 +59,10 @@ def test_what_is_shipped_passes_the_check() -> None:
 def test_brakes_cost_points_one_by_one_and_the_first_loss_is_named() -> None:
     evaluator = Evaluator(STUDY, InlinePool(2))
     answer = tolerance.compute(
-        STUDY, evaluator, characteristics=("brakeTorque",), unsafe=Unsafe(points=4.0)
+        STUDY, evaluator, characteristics=("brakeTorque",), unsafe=Unsafe.parse("points=4")
     )
     column = list(evaluator.characteristics.names).index("brakeTorque")
-    (alone,) = scan(evaluator, [column], Unsafe(points=4.0))
+    (alone,) = scan(evaluator, [column], Unsafe.parse("points=4"))
     points = alone.profile.set_index("value")["rating_points"]
     assert points[1.0] == points.max() > points[0.5]
     first = alone.first_loss()
@@ -87,9 +87,8 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
     case = case_of(STUDY, original, evaluations)
     points = float(original.column("rating_points")[0])
     assert points > evaluations.column("rating_points")[1]
-    answer = explain.compute(
-        case, evaluator, solution=("nsga2:0:0",), unsafe=Unsafe(points=points - 1e-3)
-    )
+    unsafe = Unsafe.parse(f"points={points - 1e-3!r}")
+    answer = explain.compute(case, evaluator, solution=("nsga2:0:0",), unsafe=unsafe)
     (failure,) = answer.tables["solutions"].to_dict("records")
     assert failure["points"]
     assert all(name.startswith(("CCRs", "CPNA")) for name in failure["points"])
@@ -98,7 +97,7 @@ def test_explain_names_the_cells_of_a_worse_colour_and_a_study_the_points_kept()
         None
     ] * 3
     results = SimpleNamespace(case=case, study=case.study, directory="results")
-    verdict, _ = _verdict(results, replace(case, stated=Unsafe(points=points - 1e-3)), None)
+    verdict, _ = _verdict(results, replace(case, stated=unsafe), None)
     assert "With 1 change, the fewest that were found, the vehicle earns " in verdict
     assert "brakeTorque 1 -> 0." in verdict
 

@@ -240,7 +240,7 @@ def _default_criterion(
         if default == Unsafe():
             return default
         defaults.append(default)
-    return next((default for default in defaults if default.points is None), defaults[0])
+    return next((default for default in defaults if not default.is_of_points), defaults[0])
 
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
