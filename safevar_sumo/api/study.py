@@ -50,7 +50,7 @@ from safevar_sumo.questions.words import (
     demanded_in_words,
     encounter_in_words,
     number_of,
-    question_command,
+    replay_command,
 )
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.scenarios.declared import read_study
@@ -379,7 +379,7 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     return (
         f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
         f" {case.unsafe.breach_in_words(found)}{where}{listed}. It is simulated by"
-        f" {question_command('simulate', str(results.directory))}{options}.",
+        f" {replay_command(str(results.directory))}{options}.",
         [(item.name, item.unit, item.original, values[item.name]) for item in changed],
     )
 

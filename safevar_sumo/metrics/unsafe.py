@@ -160,6 +160,11 @@ class Unsafe:
         share = ", half of the original's" if self.is_half else ""
         return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
 
+    @property
+    def verbs(self) -> tuple[str, str]:
+        """What an unsafe vehicle does, and what several do, in short."""
+        return ("collides", "collide") if self.is_collision else ("is unsafe", "are unsafe")
+
     def number_in_words(self, number: float) -> str:
         """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
         collision)`.
@@ -168,7 +173,7 @@ class Unsafe:
             (f"{number:,}" if number == int(number) else f"{number:,.1f}") if number else "none"
         )
         if self.is_collision and not self.keep:
-            return f"{counted} {'collide' if number > 1 else 'collides'}"
+            return f"{counted} {self.verbs[number > 1]}"
         return f"{counted} {'are' if number > 1 else 'is'} unsafe ({self.description})"
 
     @property

@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues, Outcome
-from safevar_sumo.results import FailedSetting, failure_lines, folders_of, load_runs
+from safevar_sumo.results import failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
 from safevar_sumo.vehicles import CharacteristicSet
@@ -71,7 +71,7 @@ class Case:
     evaluations: pd.DataFrame
     finished_runs: tuple[tuple[str, int], ...]
     has_runs: bool = True
-    failures: tuple[FailedSetting, ...] = ()
+    failures: tuple[tuple[str, str], ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
     titles: Mapping[str, str] = field(default_factory=dict)
     stop_by_themselves: Collection[str] = ("safe_fuzzer",)

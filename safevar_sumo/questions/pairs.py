@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns
-from safevar_sumo.records import BoolArray, Evaluations
+from safevar_sumo.records import Evaluations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,15 +41,13 @@ ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 
 def table_of_pairs(
-    solutions: Sequence[str] | pd.Series[str],
-    a: Evaluations,
-    b: Evaluations,
-    in_a: BoolArray,
-    in_b: BoolArray,
+    solutions: pd.Series[str], runs: Sequence[Evaluations], criteria: Sequence[Unsafe]
 ) -> pd.DataFrame:
-    """The frame with `SETTING_COLUMNS` of settings that were evaluated in two systems, and are
-    unsafe `in_a` and `in_b`.
+    """The frame with `SETTING_COLUMNS` of settings that were evaluated in A and in B, each
+    with its criterion.
     """
+    a, b = runs
+    in_a, in_b = (unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True))
     where = np.select(
         [in_a & ~in_b, in_b & ~in_a, in_a & in_b], [*UNSAFE_IN][:-1], [*UNSAFE_IN][-1]
     )

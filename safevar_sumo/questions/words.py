@@ -98,13 +98,12 @@ def encounter_in_words(
     return f" in an encounter with {join_phrases(phrases)}" if phrases else ""
 
 
-def question_command(question: str, subject: str, point: str = "") -> str:
-    """The command that asks a question about results or a study; `point` may name a point of the
+def replay_command(subject: str, point: str = "") -> str:
+    """The command that simulates a vehicle of results or a study; `point` may name a point of the
     study's matrix.
     """
-    return f"{PROGRAM_COMMAND} {question} {quote(subject)}" + (
-        f" --point {quote(point)}" if point else ""
-    )
+    where = f" --point {quote(point)}" if point else ""
+    return f"{PROGRAM_COMMAND} simulate {quote(subject)}{where}"
 
 
 def join_phrases(phrases: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import warn
 from safevar_sumo.questions.counterexamples import fewest_changes
-from safevar_sumo.questions.words import change_texts, question_command
+from safevar_sumo.questions.words import change_texts, replay_command
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.replay.animation import player_data
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
@@ -111,5 +111,5 @@ def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
         if answer.command:
             yield f"The answer {answer.question}", answer.command + flag
     for handle in study.choices:
-        simulate = f"{question_command('simulate', directory, study.point)} --solution {handle}"
+        simulate = f"{replay_command(directory, study.point)} --solution {handle}"
         yield f"The replay of {handle}", f"{simulate} --plot it.png --animate it.html{flag}"

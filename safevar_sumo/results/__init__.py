@@ -15,7 +15,6 @@ from safevar_sumo.results.journal import (
 )
 from safevar_sumo.results.load import (
     CHOICES as CHOICES,
-    FailedSetting as FailedSetting,
     SolutionId as SolutionId,
     choose_handle as choose_handle,
     failure_lines as failure_lines,

@@ -5,6 +5,7 @@ choice such as the most severe one.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -28,30 +29,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class FailedSetting(NamedTuple):
-    """A setting that could not be simulated: its algorithm, run, position in the run from 0, and
-    why.
+def failure_lines(failures: Sequence[tuple[str, str]]) -> list[str]:
+    """A line for each distinct reason of `StoredResults.failures`: the first failure with this
+    reason, and the number of further failures.
     """
-
-    algorithm: str
-    run: int
-    position: int
-    reason: str
-
-    def __str__(self) -> str:
-        return f"{self.algorithm}:{self.run}, evaluation {self.position}: {self.reason}"
-
-
-def failure_lines(failures: Sequence[FailedSetting]) -> list[str]:
-    """A line for each distinct reason: the first failure with this reason, and the number of
-    further failures.
-    """
-    failures_by_reason: dict[str, list[FailedSetting]] = {}
-    for failure in failures:
-        failures_by_reason.setdefault(failure.reason, []).append(failure)
+    firsts = {reason: place for place, reason in reversed(failures)}
+    counts = Counter(reason for _, reason in failures)
     return [
-        str(first) if not others else f"{first} (and {len(others)} more)"
-        for first, *others in failures_by_reason.values()
+        f"{firsts[reason]}: {reason}{f' (and {count - 1} more)' if count > 1 else ''}"
+        for reason, count in counts.items()
     ]
 
 
@@ -72,14 +58,15 @@ class StoredResults(NamedTuple):
     finished
         Algorithm and number of every finished run.
     failures
-        Every setting that could not be simulated.
+        The place of every setting that could not be simulated, with its position in the run from
+        0, and why.
     """
 
     manifest: JsonObject
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
     finished: tuple[tuple[str, int], ...] = ()
-    failures: tuple[FailedSetting, ...] = ()
+    failures: tuple[tuple[str, str], ...] = ()
 
 
 def load_runs(directory: str | Path) -> StoredResults:
@@ -112,7 +99,10 @@ def load_runs(directory: str | Path) -> StoredResults:
         all_positions += positions
         # The settings of a run that could not be simulated.
         rows = np.flatnonzero(evaluations.failed).tolist()
-        failures += [FailedSetting(*key, positions[row], evaluations.reason(row)) for row in rows]
+        failures += [
+            (f"{key[0]}:{key[1]}, evaluation {positions[row]}", evaluations.reason(row))
+            for row in rows
+        ]
         if budget in content.results:
             solutions_of_runs.append((key, content.take_positions(content.results[budget])))
 

@@ -247,8 +247,7 @@ def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsaf
     """The settings with their values in A, B's values where they differ, and `SETTING_COLUMNS`."""
     names = common.evaluators[0].characteristics.names
     frame, settings, runs = pairs
-    is_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
-    of_pairs = table_of_pairs(frame["solution"], *runs, *is_unsafe)
+    of_pairs = table_of_pairs(frame["solution"], runs, criteria)
     values = {name: settings[0][:, column] for column, name in enumerate(names)}
     moved = {
         f"b_{names[column]}": settings[1][:, column]

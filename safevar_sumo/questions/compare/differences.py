@@ -75,15 +75,22 @@ def summary_of(
     numbers: JsonObject, pairs: pd.DataFrame, quantity: str, titles: Sequence[str]
 ) -> pd.DataFrame:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
-    rows = [("original vehicle: safety degree", numbers["a_degree"], numbers["b_degree"])]
     both = numbers["both"]
-    counts = (numbers["only_a_unsafe"] + both, numbers["only_b_unsafe"] + both)
-    rows.append((f"unsafe of {numbers['settings']} changed vehicles", *counts))
-    rows.append((f"changed vehicles: mean {quantity}", *pairs[[*SIDES]].mean()))
-    braking = (numbers["a_needless_braking"], numbers["b_needless_braking"])
-    rows.append((f"needless braking in {numbers['benign_scenes']} benign scenes", *braking))
-    closer = (numbers["limits_grown"], numbers["limits_shrunk"])
-    rows.append(("characteristics whose limit alone is closer", *closer))
+    values: JsonObject = {
+        "original vehicle: safety degree": [numbers[f"{side}_degree"] for side in SIDES],
+        f"unsafe of {numbers['settings']} changed vehicles": [
+            numbers[f"only_{side}_unsafe"] + both for side in SIDES
+        ],
+        f"changed vehicles: mean {quantity}": pairs[[*SIDES]].mean(),
+        f"needless braking in {numbers['benign_scenes']} benign scenes": [
+            numbers[f"{side}_needless_braking"] for side in SIDES
+        ],
+        "characteristics whose limit alone is closer": [
+            numbers["limits_grown"],
+            numbers["limits_shrunk"],
+        ],
+    }
+    rows = [(what, *of_sides) for what, of_sides in values.items()]
     heads = zip(SIDES, titles, strict=True)
     columns = SUMMARY_COLUMNS | {
         side: SUMMARY_COLUMNS[side]._replace(head=title) for side, title in heads
@@ -284,10 +291,9 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """In how many of A's benign scenes the original vehicles of A and B brake, None without any;
     and the number of these scenes.
     """
-    systems = [side.system for side in (a, b)]
     # What a study searches in its scenario, these scenes do not have.
     systems = [
-        replace(system, characteristics=system.characteristics.vehicle) for system in systems
+        replace(side.system, characteristics=side.characteristics.vehicle) for side in (a, b)
     ]
     scenes = benign_scenes(a.study, systems[0])
     brakes = [needless_braking(system, scenes) for system in systems]

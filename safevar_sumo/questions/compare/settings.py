@@ -50,22 +50,21 @@ class Pairs(NamedTuple):
         Where each comes from: `source`, `solution`, `algorithm` and `run` of solutions, `line` of
         drawn settings.
     settings
-        Their values in A and in B, each of shape (M, n).
+        Their values in A and in B, shape (2, M, n).
     runs
         Their evaluations in A and in B.
     """
 
     frame: pd.DataFrame
-    settings: tuple[FloatArray, FloatArray]
-    runs: tuple[Evaluations, Evaluations]
+    settings: FloatArray
+    runs: Sequence[Evaluations]
 
     @classmethod
     def joined(cls, groups: Sequence[Pairs]) -> Pairs:
         """All pairs of some groups, in their order."""
         frames, settings, runs = zip(*groups, strict=True)
-        a, b = (np.concatenate(values) for values in zip(*settings, strict=True))
-        in_a, in_b = (Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True))
-        return cls(pd.concat(frames, ignore_index=True), (a, b), (in_a, in_b))
+        joined = [Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True)]
+        return cls(pd.concat(frames, ignore_index=True), np.concatenate(settings, axis=1), joined)
 
     @property
     def are_valid(self) -> BoolArray:
@@ -79,13 +78,8 @@ class Pairs(NamedTuple):
 
     def take(self, rows: BoolArray) -> Pairs:
         """Some of the pairs, in their order."""
-        a, b = self.settings
-        in_a, in_b = self.runs
-        return Pairs(
-            self.frame[rows].reset_index(drop=True),
-            (a[rows], b[rows]),
-            (in_a.take(rows), in_b.take(rows)),
-        )
+        frame = self.frame[rows].reset_index(drop=True)
+        return Pairs(frame, self.settings[:, rows], [run.take(rows) for run in self.runs])
 
 
 class CommonDomain(NamedTuple):
@@ -158,21 +152,22 @@ class CommonDomain(NamedTuple):
         """B's settings as A's."""
         return np.where(self.shift == 0, settings, settings - self.shift)
 
-    def holds(self, settings: Sequence[FloatArray]) -> BoolArray:
-        """Which settings are in both domains, shape (M,)."""
-        values = np.stack(settings, axis=1)  # shape (M, 2, n)
+    def holds(self, settings: FloatArray) -> BoolArray:
+        """Which settings, shape (2, M, n), are in both domains, shape (M,)."""
+        values = settings.swapaxes(0, 1)
         return np.asarray(((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2)))
 
-    def in_both(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def in_both(self, settings: FloatArray) -> FloatArray:
         """A's settings, and the same in B; what rounding moves out of B's domain is put onto its
         end.
         """
-        return settings, np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
+        in_b = np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
+        return np.stack([settings, in_b])
 
-    def evaluate(self, settings: tuple[FloatArray, FloatArray]) -> tuple[Evaluations, Evaluations]:
-        """Evaluate settings in both systems."""
-        in_a, in_b = self.evaluators
-        return in_a.evaluate(settings[0], BOTH_STAGE), in_b.evaluate(settings[1], BOTH_STAGE)
+    def evaluate(self, settings: FloatArray) -> list[Evaluations]:
+        """Evaluate settings, shape (2, M, n), in both systems."""
+        pairs = zip(self.evaluators, settings, strict=True)
+        return [side.evaluate(own, BOTH_STAGE) for side, own in pairs]
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
@@ -233,14 +228,15 @@ def pairs_of(
         if not isinstance(case, Case):
             continue
         own = case.solutions[names].to_numpy(float)
-        settings = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
+        both = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
+        settings = np.stack(both)
         is_inside = common.holds(settings)
         kept = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
         frame = case.solutions[kept].assign(
             source=side, solution=list(map(str, handles_of(case.solutions)))
         )
         outside += int(np.count_nonzero(~is_inside))
-        inside = settings[0][is_inside], settings[1][is_inside]
+        inside = settings[:, is_inside]
         groups.append(Pairs(frame[is_inside], inside, common.evaluate(inside)))
     groups.append(_draw_on_lines(common, criteria, samples))
     return Pairs.joined(groups), outside
@@ -273,10 +269,8 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
         runs = common.evaluate(settings)
         frame = pd.DataFrame({"source": SAMPLE, "solution": "", LINE: lines})
         rounds.append(Pairs(frame, settings, runs))
-        failures = np.sum(
-            [unsafe.of(evaluations) for unsafe, evaluations in zip(criteria, runs, strict=True)],
-            axis=0,
-        )
+        are_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
+        failures = np.sum(are_unsafe, axis=0)
         step /= 2
         shares[lines] += np.choose(failures, [step, np.where(lines % 2, step, -step), -step])
     return Pairs.joined(rounds)

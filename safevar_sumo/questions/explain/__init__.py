@@ -42,7 +42,6 @@ from safevar_sumo.questions.explain.tables import (
     DISTINCT_COLUMNS,
     SOLUTION_COLUMNS,
     causes_table,
-    distinct_table,
     failures_frame,
     statistics_tables,
 )
@@ -176,8 +175,7 @@ def explain(
     tables = {
         **(smallest_tables(smallest) if of_study else {"causes": causes_table(*of_failures)}),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
-        **statistics_tables(needed, len(sample), verdicts, collisions),
-        "distinct_causes": distinct_table(distinct),
+        **statistics_tables(needed, len(sample), verdicts, collisions, distinct),
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),

@@ -24,10 +24,7 @@ MIN_ROBUST_SHARE = 0.8
 
 
 def draw_neighbours(
-    characteristics: CharacteristicSet,
-    settings: FloatArray,
-    seed: int,
-    count: int = NEIGHBOUR_COUNT,
+    characteristics: CharacteristicSet, settings: FloatArray, seed: int, count: int
 ) -> FloatArray:
     """The neighbours of M settings, shape (M, n), `count` of each, those of one setting after those
     of another.
@@ -44,12 +41,11 @@ def draw_neighbours(
 def robust_shares(
     evaluator: Evaluator,
     settings: FloatArray,
-    step: float,
     unsafe: Unsafe,
     factors: Sequence[float] = STEP_FACTORS,
 ) -> FloatArray:
     """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of
-    `factors` times the study's time step (`step` seconds); shape (M, factors).
+    `factors` times the study's time step; shape (M, factors).
 
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
@@ -61,6 +57,7 @@ def robust_shares(
         return np.full((len(settings), len(factors)), np.nan)
     neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.seed, count)
     shares = []
+    step = evaluator.system.step
     if evaluator.system.mover.has_own_step:
         factors = (1.0,)
 

@@ -22,7 +22,7 @@ from safevar_sumo.questions.explain.robustness import robustness_in_words
 from safevar_sumo.questions.explain.tables import sureness
 from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate
 from safevar_sumo.questions.words import EXACT, join_phrases, number_of, percentage
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import JsonObject
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -101,9 +101,7 @@ class Smallest(NamedTuple):
     def sentences(self, evaluator: Evaluator, unsafe: Unsafe) -> Iterator[str]:
         """The verdict: what collides, where it begins, how sure it is, and what was simulated."""
         members = evaluator.characteristics
-        verbs = "is unsafe", "are unsafe"
-        if str(unsafe) == Outcome.COLLISION:
-            verbs = "collides", "collide"
+        verbs = unsafe.verbs
         sizes = [size for size, number in self.at_ends.existing.items() if number]
         fewest = self.at_ends.size or max(sizes, default=0)
         yield from self._of_sizes(members, verbs, [size for size in sizes if size <= fewest])

@@ -158,9 +158,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "unsafe_neighbours": (
-            robust_shares(evaluator, settings, evaluator.system.step, unsafe, factors).mean(axis=1)
-        ),
+        "unsafe_neighbours": (robust_shares(evaluator, settings, unsafe, factors).mean(axis=1)),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
         "avoided_by": [avoided_by(next(assessed)) if flag else None for flag in is_assessed],
@@ -273,7 +271,7 @@ def sureness(
     robust = np.full(len(causes), np.nan)
     if causes and not evaluator.study.is_rated:
         settings = settings_of(evaluator.characteristics, causes)
-        robust = robust_shares(evaluator, settings, evaluator.system.step, unsafe).mean(axis=1)
+        robust = robust_shares(evaluator, settings, unsafe).mean(axis=1)
     if not (sets and causes and evaluator.study.spread):
         return robust, [None] * len(causes), None
     studies = studies_of_sets(evaluator.study)[:sets]
@@ -287,9 +285,13 @@ def sureness(
 
 
 def statistics_tables(
-    needed: pd.DataFrame, failures: int, verdicts: pd.DataFrame, collisions: int
+    needed: pd.DataFrame,
+    failures: int,
+    verdicts: pd.DataFrame,
+    collisions: int,
+    distinct: pd.DataFrame,
 ) -> Frames:
-    """The tables of characteristics and of drivers."""
+    """The tables of characteristics, of drivers and of distinct causes."""
     return {
         "characteristics": tabulate(
             f"Characteristics changed, and necessary, in {number_of(failures, 'failure')}",
@@ -301,11 +303,9 @@ def statistics_tables(
             DRIVER_COLUMNS,
             drivers_frame(verdicts, collisions),
         ),
+        "distinct_causes": tabulate(
+            f"The most frequent of {number_of(len(distinct), 'distinct cause')}",
+            DISTINCT_COLUMNS,
+            distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT),
+        ),
     }
-
-
-def distinct_table(distinct: pd.DataFrame) -> pd.DataFrame:
-    rows = distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT)
-    return tabulate(
-        f"The most frequent of {number_of(len(distinct), 'distinct cause')}", DISTINCT_COLUMNS, rows
-    )

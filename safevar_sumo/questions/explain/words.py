@@ -24,7 +24,7 @@ from safevar_sumo.questions.words import (
     number_of,
     share_in_words,
 )
-from safevar_sumo.records import NamedValues, Outcome
+from safevar_sumo.records import NamedValues
 from safevar_sumo.study import Study
 
 BEYOND = 256
@@ -71,8 +71,7 @@ def verdict_on_failures(
     ]
     encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
     where = " in an encounter in which the original vehicle is safe" if encounter else ""
-    verb = "collides" if str(unsafe) == Outcome.COLLISION else "is unsafe"
-    yield f"With {join_phrases(values)} the vehicle {verb}{where}."
+    yield f"With {join_phrases(values)} the vehicle {unsafe.verbs[0]}{where}."
     yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
     yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
     yield robustness_in_words(leading["robust_share"])
@@ -98,9 +97,9 @@ def _beyond_in_words(
     vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
     runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
     share = share_in_words(unsafe.number(runs) / number)
-    verbs = "collide" if str(unsafe) == Outcome.COLLISION else "are unsafe"
     whose = "these values" if len(cause) > 1 else "this value"
-    return f"Of {number} vehicles beyond {whose}, all else as in the original, {share} {verbs}."
+    number_of_them = f"Of {number} vehicles beyond {whose}, all else as in the original,"
+    return f"{number_of_them} {share} {unsafe.verbs[1]}."
 
 
 def others_in_words(

@@ -26,7 +26,7 @@ from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
-from safevar_sumo.questions.permit.search import REPAIR_STAGE, Permit, PermitSearch, Repaired
+from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
@@ -168,10 +168,8 @@ def _drive(
     """
     members = evaluator.characteristics.vehicle
     # Repairs of cars, not of limits.
-    repairs = [REPAIR_STAGE] if not is_rough and len(asked[0].vehicles) == 1 else []
-    # Tests are simulated alone, so that settings at all points of a matrix are fewer.
-    each = search.usual_simulations(1 + len(asked)) / len(evaluator.system.points)
-    phases = {**dict.fromkeys(search.stages(), each), **dict.fromkeys(repairs, 6 * each)}
+    has_repairs = not is_rough and len(asked[0].vehicles) == 1
+    phases = search.phases(1 + len(asked), with_repairs=has_repairs)
     evaluator.begin(phases, of_list=len(asked) > 1)
     above = [-np.inf, *[None] * len(asked)]
     new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
@@ -179,10 +177,10 @@ def _drive(
         study = evaluator.study
         words = failures_in_words([new_car.least.failure])[0].sentence
         problem = (
-            f"the new car is not safe at {search.values[0]:g}{unit_text(search.unit)}: {words}"
+            f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}"
         )
         raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
-    if not repairs:
+    if not has_repairs:
         return new_car, permits, [None] * len(permits)
     settings, measured = fleet.settings, fleet.measured
     return new_car, permits, search.repair_first(settings, measured, members.original, permits)

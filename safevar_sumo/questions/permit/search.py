@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit.encounters import EncounterRange, Span, encounters_of
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 
 REPAIR_STAGE = "cars with one part as new"
 USUAL_PLACES = 40
@@ -70,8 +70,8 @@ class PermitSearch:
 
     Attributes
     ----------
-    values
-        The values of the grid.
+    values, span
+        The values of the grid, and the parameter.
     attacked
         Number of simulations of the falsification so far.
     """
@@ -80,23 +80,19 @@ class PermitSearch:
         self.values = values
         self.attacked = 0
         self._models = models
-        self._span = span
+        self.span = span
         self._budget = budget
         self._ranges = dict[int, list[EncounterRange]]()
         self._models_in_order = [*models.members]
 
-    @property
-    def unit(self) -> str:
-        """The unit of the values."""
-        return self._span.unit
-
-    def stages(self) -> list[str]:
-        """The phases of progress."""
-        return [self._stage(model.fit) for model in self._models.members]
-
-    def usual_simulations(self, cars: int) -> float:
-        """The usual number of simulations of cars in a parameter set."""
-        return cars * (len(self.values) * USUAL_PLACES + self._budget)
+    def phases(self, cars: int, *, with_repairs: bool) -> NamedValues:
+        """The phases of progress, each with its usual number of settings."""
+        members = self._models.members
+        # Tests are simulated alone, so that settings at all points of a matrix are fewer.
+        points = len(members[0].evaluator.system.points)
+        each = cars * (len(self.values) * USUAL_PLACES + self._budget) / points
+        phases = {self._stage(model.fit): each for model in members}
+        return phases | ({REPAIR_STAGE: 6 * each} if with_repairs else {})
 
     def _stage(self, fit: int) -> str:
         return f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"
@@ -126,7 +122,7 @@ class PermitSearch:
             if not waiting:
                 break
             if model.fit not in self._ranges:
-                self._ranges[model.fit] = encounters_of(model, self._span)
+                self._ranges[model.fit] = encounters_of(model, self.span)
             name = stage or self._stage(model.fit)
             search = SpeedSearch(
                 self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name
