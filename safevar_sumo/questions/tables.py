@@ -80,7 +80,7 @@ class Wide(NamedTuple):
 def tabulate(
     title: str,
     columns: Mapping[str, Column | str],
-    rows: pd.DataFrame | Iterable[Sequence[Any]],
+    rows: pd.DataFrame | Iterable[Sequence[Any] | dict[str, Any]],
     *,
     wide: Wide | None = None,
     words: Mapping[str, str] | None = None,

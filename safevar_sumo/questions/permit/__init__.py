@@ -25,7 +25,7 @@ from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
-from safevar_sumo.questions.permit.rows import CARS, SETS, failures_in_words
+from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
 from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
@@ -175,7 +175,7 @@ def _drive(
     new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
     if new_car.up_to is None:
         study = evaluator.study
-        words = failures_in_words([new_car.least.failure])[0].sentence
+        words = failure_columns([new_car.least.failure])[0]["because"]
         problem = (
             f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}"
         )

@@ -23,15 +23,16 @@ from safevar_sumo.questions.permit.rows import (
     SETS,
     STOP,
     because,
-    failures_in_words,
+    failure_columns,
     set_rows,
     verdict_of,
 )
 from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
+from safevar_sumo.questions.tables import Column, Columns, tabulate
 from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.records import JsonObject
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.system import assemble
@@ -112,30 +113,35 @@ class PermitAnswer:
             listing=self._listing(cars, fleet),
         )
 
-    def _rows(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Rows:
+    def _rows(
+        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]
+    ) -> list[JsonObject]:
         """A row of `CARS` for each car, in the order of the list."""
         vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
-        words = failures_in_words([each.least.failure for each in permits], with_car=self.is_box)
+        columns = failure_columns([each.least.failure for each in permits], with_car=self.is_box)
         rows = []
         for name, permit, found, best, assumed in zip(
-            fleet.names, permits, words, repaired, assumed_cells(vehicle, fleet), strict=True
+            fleet.names, permits, columns, repaired, assumed_cells(vehicle, fleet), strict=True
         ):
             verdict = verdict_of(
                 permit.up_to, new_car, self.span.high, self.need, is_proven=not self.is_quick
             )
-            reason = because(permit, found, verdict, self.span, new_car, self.need)
-            after = (None, None) if best is None else (vehicle.names[best[0]], best[1].up_to)
-            least = permit.least
-            fit = None if least.failure is None else least.fit
-            rows.append(
-                (
-                    *(name, permit.up_to, new_car, self.span.unit, verdict, reason),
-                    *(found.test, found.encounter, found.outcome, found.phase, fit, *after),
-                    *(found.command, assumed),
-                )
-            )
+            words = found["because"]
+            row = {
+                "car": name,
+                "up_to": permit.up_to,
+                "new_car_up_to": new_car,
+                "unit": self.span.unit,
+                "verdict": verdict,
+                "because": because(permit, words, verdict, self.span, new_car, self.need),
+                "parameter_set": permit.least.fit if words else None,
+                "repair_first": None if best is None else vehicle.names[best[0]],
+                "up_to_after_repair": None if best is None else best[1].up_to,
+                "assumed": assumed,
+            }
+            rows.append(found | row)
         return rows
 
     def _sentences(

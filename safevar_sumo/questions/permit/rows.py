@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.counterexamples import failures_at, texts_of
+from safevar_sumo.questions.counterexamples import OF_ENCOUNTER, failures_at, texts_of
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.search import Permit
 from safevar_sumo.questions.permit.speeds import LimitingFailure
-from safevar_sumo.questions.tables import Column, Columns, Rows
+from safevar_sumo.questions.tables import Column, Columns
 from safevar_sumo.questions.words import change_texts, join_phrases
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import PHASE, unit_text
 
 PHASE_COLUMN = Column("-", "steps by which that encounter begins later", ".4f")
@@ -47,58 +47,47 @@ SETS: Columns = {
 }
 
 
-class FailureInWords(NamedTuple):
-    """A failure: its test, its encounter with its phase, what happens, a sentence without its end,
-    and the command that simulates it.
-    """
-
-    test: str | None = None
-    encounter: str | None = None
-    phase: float | None = None
-    outcome: str | None = None
-    sentence: str = ""
-    command: str | None = None
+NO_FAILURE: JsonObject = dict.fromkeys(("test", "encounter", "phase", "outcome", "simulate"))
+"""The columns that say how a car fails, where it does not."""
 
 
-def failures_in_words(
+def failure_columns(
     failures: Sequence[LimitingFailure | None], *, with_car: bool = False
-) -> list[FailureInWords]:
-    """Failures, simulated once more as they are printed; `with_car` names the car's values, too."""
-    found = [FailureInWords()] * len(failures)
-    of_range = dict[int, list[int]]()
+) -> list[JsonObject]:
+    """The columns of failures, simulated once more as they are printed, and each in a sentence
+    without its end, `because`; `with_car` names the car's values in it, too.
+    """
+    found = [{**NO_FAILURE, "because": ""}] * len(failures)
+    of_range = dict[int, dict[int, LimitingFailure]]()
     for number, failure in enumerate(failures):
         if failure is not None:
-            of_range.setdefault(id(failure.encounters), []).append(number)
-    for numbers in of_range.values():
-        known = [failure for number in numbers if (failure := failures[number]) is not None]
-        model = known[0].encounters.model
+            of_range.setdefault(id(failure.encounters), {})[number] = failure
+    for known in of_range.values():
+        settings = np.array([failure.setting for failure in known.values()])
+        encounters = next(iter(known.values())).encounters
+        model = encounters.model
         members = model.characteristics
-        point = model.evaluator.system.points[0]
-        rows = np.array([failure.setting for failure in known])
-        described = failures_at(model, rows)
-        for row, number in enumerate(numbers):
-            setting = rows[row]
-            words = described[row].words.partition(" (parameter set")[0]
+        described = failures_at(model, settings)
+        for row, number in enumerate(known):
+            failed = described[row]
+            words = failed.words.partition(" (parameter set")[0]
             if with_car:
-                values = dict(zip(members.vehicle.names, setting.tolist(), strict=False))
+                values = dict(zip(members.vehicle.names, settings[row].tolist(), strict=False))
                 changes = change_texts(members.vehicle, values, are_printed=True)
                 words = f"with {join_phrases(changes or ['no change'])}, {words}"
-            axes = {
-                name: value
-                for name, value in point.parameters
-                if name not in ("test", "weather") and name not in members.names
+            left_out = {*OF_ENCOUNTER, *members.names}
+            met = {name: value for name, value in failed.point.items() if name not in left_out}
+            met |= members.scenario.named(settings[row, ~members.of_vehicle])
+            phase = met.pop(PHASE, None)
+            texts = texts_of(model.evaluator.system.points[0], met)
+            found[number] = {
+                "test": encounters.test or None,
+                "encounter": ", ".join(f"{name} {text}" for name, text in texts.items()) or None,
+                "phase": phase,
+                "outcome": failed.breach,
+                "simulate": failed.command,
+                "because": words,
             }
-            numbers_of = {**axes, **members.scenario.named(setting[~members.of_vehicle])}
-            phase = numbers_of.pop(PHASE, None)
-            texts = [f"{name} {text}" for name, text in texts_of(point, numbers_of).items()]
-            found[number] = FailureInWords(
-                test=known[row].encounters.test or None,
-                encounter=", ".join(texts) or None,
-                phase=phase,
-                outcome=described[row].breach,
-                sentence=words,
-                command=described[row].command,
-            )
     return found
 
 
@@ -113,39 +102,32 @@ def verdict_of(
 
 
 def because(
-    permit: Permit,
-    words: FailureInWords,
-    verdict: str,
-    span: Span,
-    new_car: float,
-    need: float | None,
+    permit: Permit, words: str, verdict: str, span: Span, new_car: float, need: float | None
 ) -> str:
     """Why a car may drive no faster, in one sentence for a foreman."""
     unit = unit_text(span.unit)
     up_to = permit.up_to
     if up_to is None:
-        return f"Not even at {span.low:g}{unit}: {words.sentence}."
-    if not words.sentence:
+        return f"Not even at {span.low:g}{unit}: {words}."
+    if not words:
         name = span.name.replace("_", " ")
         return f"Safe {span.up_to(up_to)}, the greatest {name} that was driven."
-    sentence = words.sentence[:1].upper() + words.sentence[1:]
     if verdict != DRIVE:
-        return f"{sentence}."
+        return f"{words[:1].upper()}{words[1:]}."
     if need is not None and up_to >= need:
         return f"Safe {span.up_to(up_to)}, and {need:g}{unit} is needed."
-    return f"As fast as the new car, which is safe {span.up_to(new_car)}: {words.sentence}."
+    return f"As fast as the new car, which is safe {span.up_to(new_car)}: {words}."
 
 
-def set_rows(names: Sequence[str], permits: Sequence[Permit], *, with_car: bool) -> Rows:
+def set_rows(
+    names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
+) -> list[JsonObject]:
     """The rows of `SETS`."""
     reached = [
         (name, each) for name, permit in zip(names, permits, strict=True) for each in permit.reached
     ]
-    words = failures_in_words([each.failure for _, each in reached], with_car=with_car)
+    found = failure_columns([each.failure for _, each in reached], with_car=with_car)
     return [
-        (
-            *(name, each.fit, each.up_to, found.test, found.encounter, found.phase),
-            *(found.outcome, found.command),
-        )
-        for (name, each), found in zip(reached, words, strict=True)
+        {"car": name, **each._asdict(), **columns}
+        for (name, each), columns in zip(reached, found, strict=True)
     ]
