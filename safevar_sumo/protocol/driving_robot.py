@@ -126,7 +126,7 @@ class DrivingRobot:
         hold that speed; sensors and commands keep their history.
         """
         time = self._sample * self._step
-        if time - self._step >= self.profile_end:
+        if not self.profile_end or time - self._step >= self.profile_end:
             return state
         is_led = self._is_driving & (time - self._step < self._profile_until)
         profiles = [

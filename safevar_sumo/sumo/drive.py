@@ -69,10 +69,8 @@ def drive(
     # Vehicles, driving systems and what is noted of the runs, at the start.
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
-    nominal = system.nominal._replace(
-        length=float(world.vehicle_length(VUT)), width=float(world.vehicle_width)
-    )
-    memory = ads.start(n, nominal, step)
+    extent = {"length": float(world.vehicle_length(VUT)), "width": float(world.vehicle_width)}
+    memory = ads.start(n, system.nominal._replace(**extent), step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
     is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
@@ -99,8 +97,8 @@ def drive(
             active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
 
             # What the driving systems see, and what they command.
-            observation = perception.observe(time, speed, scene)
-            observation = observation._replace(throttle=state.throttle, brake=state.brake)
+            pedals = {"throttle": state.throttle, "brake": state.brake}
+            observation = perception.observe(time, speed, scene)._replace(**pedals)
             observation, state = vehicle.sense(prepared, state, observation)
             if listen is not None:
                 listen(observation)
@@ -115,8 +113,7 @@ def drive(
             # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
             state = vehicle.advance(prepared, state, command)
-            if robot.profile_end:
-                state = robot.lead(state)
+            state = robot.lead(state)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()

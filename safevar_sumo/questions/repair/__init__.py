@@ -35,7 +35,7 @@ from safevar_sumo.questions.repair.answer import REPAIRS, answer_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
 from safevar_sumo.questions.sampling import sobol_points
-from safevar_sumo.records import FloatArray, NamedValues
+from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, write_study
 
 ROUNDS_STAGE, USUAL_ROUNDS = "smallest change that survives", 8
@@ -114,17 +114,13 @@ def repair(
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
     if study.is_rated:
-        text = (
-            f"{study.name!r} is rated, and its repair would take a whole test matrix for every"
-            " vehicle and change"
-        )
-        raise InputError(
-            study.source, text, "the study without the rating, such as wear for euro_ncap_rating"
-        )
+        text = f"{study.name!r} is rated: a repair takes all its cells for each vehicle and change"
+        legal = "the study without the rating, such as wear for euro_ncap_rating"
+        raise InputError(study.source, text, legal)
+    if out is not None and quick:
+        legal = "--quick without --out, or --out without --quick"
+        raise InputError("quick", f"a rough repair is not written to {out}", legal)
     if out is not None:
-        if quick:
-            legal = "--quick without --out, or --out without --quick"
-            raise InputError("quick", f"a rough repair is not written to {out}", legal)
         _check_file(Path(out), study)
     criterion = evaluator.checked(unsafe or Unsafe())
     check_margin(criterion, margin)
@@ -149,24 +145,12 @@ def repair(
     problem = problems[0]
     between = [each for one in problems for each in ([] if at_tests else one.between(unsafe_today))]
     between += [each for one in problems for each in one.in_phases()]
-    first = _first_vehicles(problem, subject)
-    if not len(first):
-        kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
-        text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
-        raise InputError(study.source, text, "a smaller --margin, or narrower ranges of the axes")
-    robustness = problem.robustness_with(problem.today, first, "the driving system of today")
-    worst_first = np.argsort(robustness, kind="stable")
-    vehicles = first[worst_first]
-    # What no driving system survives needs another part, not a parameter; the rest is repaired.
-    is_repairable = robustness[worst_first] >= 0
-    is_unsafe = ~is_repairable
-    is_repairable[is_unsafe] = problem.repairable(vehicles[is_unsafe])
+    vehicles, is_repairable = _worst_first(problem, _first_vehicles(problem, subject))
     survivors = Survivors([], len(problems), ())
-    worst = vehicles[0]
     if is_repairable.any():
         with evaluator.phases.stage(ROUNDS_STAGE):
             survivors = find_survivors(problems, between, vehicles[is_repairable])
-        worst = vehicles[is_repairable][0]
+    worst = vehicles[np.argmax(is_repairable)]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
     answer = answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
     if out is not None and answer.numbers["repairs"]:
@@ -190,7 +174,26 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
         failures = subject.solutions[problem.unsafe.rows(subject.solutions)]
         settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
     rows = np.unique(np.concatenate(settings), axis=0)
-    return rows[problem.holds(rows)]
+    rows = rows[problem.holds(rows)]
+    if not len(rows):
+        kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
+        study = problem.study
+        text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
+        raise InputError(study.source, text, "a smaller --margin, or narrower ranges of the axes")
+    return rows
+
+
+def _worst_first(problem: RepairProblem, vehicles: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Vehicles, shape (L, n), those first that are least safe today, and which of them a driving
+    system can survive: the others need another part, not a parameter.
+    """
+    robustness = problem.robustness_with(problem.today, vehicles, "the driving system of today")
+    worst_first = np.argsort(robustness, kind="stable")
+    ordered = vehicles[worst_first]
+    is_repairable = robustness[worst_first] >= 0
+    is_unsafe = ~is_repairable
+    is_repairable[is_unsafe] = problem.repairable(ordered[is_unsafe])
+    return ordered, is_repairable
 
 
 def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[NamedValues]:
