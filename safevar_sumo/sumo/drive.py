@@ -69,8 +69,8 @@ def drive(
     # Vehicles, driving systems and what is noted of the runs, at the start.
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
-    extent = {"length": float(world.vehicle_length(VUT)), "width": float(world.vehicle_width)}
-    memory = ads.start(n, system.nominal._replace(**extent), step)
+    length, width = float(world.vehicle_length(VUT)), float(world.vehicle_width)
+    memory = ads.start(n, system.nominal._replace(length=length, width=width), step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
     is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
