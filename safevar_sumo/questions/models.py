@@ -21,7 +21,6 @@ from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 SEARCHED_MARGIN = 0.1
@@ -166,14 +165,17 @@ def limit_criterion(
 def keeping_distance(
     evaluator: Evaluator, criterion: Unsafe, margin: float | None, *, is_stated: bool
 ) -> Unsafe:
-    """A criterion of an evaluator's study, with the distance to keep from a collision; one that is
-    stated without a margin stands alone.
+    """A criterion of an evaluator's study, with the distance to keep from a collision: the margin
+    [m], else `SEARCHED_MARGIN` or that of the study; one that is stated without a margin stands
+    alone.
     """
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
     if not criterion.is_collision or (margin is None and is_stated):
         return criterion
-    return replace(criterion, keep=distance_to_keep(evaluator.study, margin))
+    study = evaluator.study
+    is_searched = margin is None and study.ranges
+    return replace(criterion, keep=SEARCHED_MARGIN if is_searched else margin_of(study, margin))
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:
@@ -184,11 +186,6 @@ def check_margin(criterion: Unsafe, margin: float | None) -> None:
             f"{margin:g} m beside {str(criterion)!r}",
             "a collision, from which a distance is kept",
         )
-
-
-def distance_to_keep(study: Study, margin: float | None) -> float:
-    """The stated distance [m]; without one `SEARCHED_MARGIN` or that of the study."""
-    return SEARCHED_MARGIN if margin is None and study.ranges else margin_of(study, margin)
 
 
 def models_of(

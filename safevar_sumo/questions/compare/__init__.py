@@ -47,7 +47,7 @@ from safevar_sumo.questions.compare.settings import (
     pairs_of,
 )
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import check_margin, distance_to_keep
+from safevar_sumo.questions.models import keeping_distance
 from safevar_sumo.questions.options import Count, LimitTexts, Margin
 from safevar_sumo.questions.pairs import (
     ENDS,
@@ -220,12 +220,13 @@ def _criteria(
     # The stated criterion, a distance to keep, or what results suggest.
     stated = Unsafe() if unsafe is None and margin is not None else unsafe
     criterion = stated or _default_criterion(subjects, evaluators, originals)
-    check_margin(criterion, margin)
-    if criterion.is_collision and (margin is not None or unsafe is None):
-        criterion = replace(
-            criterion, keep=max(distance_to_keep(side.study, margin) for side in evaluators)
-        )
-    return [replace(side.checked(criterion), contact=side.system.contact) for side in evaluators]
+    is_stated = unsafe is not None
+    of_sides = [
+        keeping_distance(side, side.checked(criterion), margin, is_stated=is_stated)
+        for side in evaluators
+    ]
+    keep = max(one.keep for one in of_sides)
+    return [replace(one, keep=keep) for one in of_sides]
 
 
 def _default_criterion(

@@ -8,7 +8,7 @@ Nothing is inferred from other combinations, as a further change may make a vehi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, product
+from itertools import combinations, product, takewhile
 from math import comb
 from typing import NamedTuple
 
@@ -58,12 +58,9 @@ class Enumeration(NamedTuple):
     @property
     def complete_up_to(self) -> int:
         """The largest size up to which all combinations were simulated."""
-        sizes = range(len(self.existing) + 1)
-        return max(size for size in sizes if self._is_complete(size))
-
-    def _is_complete(self, largest: int) -> bool:
-        sizes = range(1, largest + 1)
-        return all(self.simulated[size] == self.existing[size] for size in sizes)
+        sizes = range(1, len(self.existing) + 1)
+        whole = takewhile(lambda size: self.simulated[size] == self.existing[size], sizes)
+        return len([*whole])
 
     @property
     def size(self) -> int:

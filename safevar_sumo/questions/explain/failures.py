@@ -116,17 +116,17 @@ def gather_failures(
                 f"{subject.name!r} is a study and has no solutions",
                 "a results directory",
             )
-        candidates = _drawn_from(subject, evaluator)
+        settings, names, recorded = _drawn_from(subject, evaluator)
     else:
-        candidates = _solutions_of(subject, named)
+        settings, names, recorded = _solutions_of(subject, named)
 
     # All are simulated here, and judged by one criterion.
-    evaluations = evaluator.evaluate(candidates.settings, TO_EXPLAIN)
+    evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
     unsafe = criterion or Unsafe.default_among(evaluations, original)
-    names = candidates.names
+    is_other = (evaluations.outcome != recorded) & (recorded != UNKNOWN)
 
     # Settings without a valid encounter do not count.
-    left_out = otherwise = 0
+    left_out = 0
     over_sets = None
     if isinstance(subject, Study):
         left_out = int(evaluations.infeasible.sum())
@@ -134,29 +134,22 @@ def gather_failures(
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
         over_sets = SharesOverSets.of(evaluator, unsafe, evaluations.settings, fits=fits)
-    else:
-        recorded = candidates.recorded
-        otherwise = int(np.count_nonzero((evaluations.outcome != recorded) & (recorded != UNKNOWN)))
 
     # Named settings are explained whatever they do.
     rows = (
         list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
     )
-    counted = bool(named), otherwise, left_out, over_sets
+    counted = bool(named), int(is_other.sum()), left_out, over_sets
     return Population(original, evaluations, names, unsafe, rows, *counted)
 
 
-class _Candidates(NamedTuple):
-    """Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results,
-    shape (M,).
-    """
-
-    settings: FloatArray
-    names: list[str]
-    recorded: TextArray
+Candidates = tuple[FloatArray, list[str], TextArray]
+"""Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results, shape
+(M,).
+"""
 
 
-def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
+def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     """Settings drawn from a study's whole domain."""
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
@@ -166,19 +159,18 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> _Candidates:
     number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
     settings = evaluator.characteristics.filter(drawn)
-    return _Candidates(
-        settings, [f"drawn:{row}" for row in range(len(settings))], np.full(len(settings), UNKNOWN)
-    )
+    names = [f"drawn:{row}" for row in range(len(settings))]
+    return settings, names, np.full(len(settings), UNKNOWN)
 
 
-def _solutions_of(case: Case, named: Sequence[SolutionId]) -> _Candidates:
+def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
     """The distinct solutions of results, the named ones first."""
     table = case.solutions
     characteristics = list(case.characteristics.names)
     distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
     chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
     handles = handles_of(table)
-    return _Candidates(
+    return (
         table[characteristics].to_numpy(dtype=float)[chosen],
         [str(handles[row]) for row in chosen],
         table["outcome"].to_numpy(dtype=str)[chosen],

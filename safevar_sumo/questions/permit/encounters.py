@@ -82,15 +82,6 @@ class EncounterRange(NamedTuple):
     low: float
     high: float
 
-    @property
-    def number_of_characteristics(self) -> int:
-        return len(self.model.characteristics.vehicle)
-
-    @property
-    def has_phases(self) -> bool:
-        """Whether a setting ends with the phase of its encounter."""
-        return self.model.characteristics.names[-1] == PHASE
-
     def box(self, lower: FloatArray, upper: FloatArray, up_to: float) -> Box | None:
         """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
         None where there is nothing to search: no such encounter, or one vehicle in one.
@@ -112,7 +103,7 @@ class EncounterRange(NamedTuple):
         parameters): Sobol points and ends of all others.
         """
         members = self.model.characteristics
-        count = self.number_of_characteristics
+        count = len(members.vehicle)
         others = [
             at
             for at in range(count, len(members))
@@ -132,7 +123,7 @@ class EncounterRange(NamedTuple):
         """Settings, shape (M, n), those that are open at their worst phases, and what they leave;
         `left` is that at phase 0.
         """
-        if not self.has_phases:
+        if self.model.characteristics.names[-1] != PHASE:
             return settings, left
         judge = partial(self.robustness, stage=stage)
         return meet_worst_phases(self.model, judge, settings, left, is_open)
