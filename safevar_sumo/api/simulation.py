@@ -53,7 +53,7 @@ OBSERVATION_HEADS = {
 
 
 def trace_frame(
-    runs: SimulationRuns, observations: Sequence[Observation], row: int = 0
+    runs: SimulationRuns, observations: Sequence[Observation], row: int
 ) -> pd.DataFrame:
     """One row for each step of a simulation of one vehicle, until its end; it is in this row of the
     observations.

@@ -159,7 +159,7 @@ def studies_of_sets(study: Study) -> list[Study]:
     ]
 
 
-def other_sets(study: Study, fits: int | None = None) -> list[Study]:
+def other_sets(study: Study, fits: int | None) -> list[Study]:
     """The study with each of its first `fits` parameter sets but its own, by default with all."""
     return studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
 

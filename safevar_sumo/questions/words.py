@@ -29,7 +29,7 @@ EXACT = ".15g"
 """How values are printed with which a vehicle was simulated: all their digits."""
 
 
-def ending_in_words(outcome: str, safety_degree: float | None, contact: float = 0.0) -> str:
+def ending_in_words(outcome: str, safety_degree: float | None, contact: float) -> str:
     """How a run ended, such as `collides at 3.21 m/s` or `stops with a safety degree of 0.87 m`.
 
     The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.

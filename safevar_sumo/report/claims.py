@@ -248,7 +248,7 @@ class Packed:
         return with_speed(study, partial(self.answer, SPEED))
 
     def page(self) -> bytes:
-        return make_page([self.ask_speed()], parts=Parts(self._progress)).encode()
+        return make_page([self.ask_speed()], Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:
         """A study file with all that the study extends."""

@@ -145,7 +145,8 @@ def report(
         budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
-        parts = Parts(show, [*map(_cost, texts), *PAGE_COSTS * len(cases)])
+        costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
+        parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(
             text: str, chosen: slice, asked: tuple[Question, JsonObject] | None = None
@@ -176,7 +177,7 @@ def report(
             studies.append(with_speed(study, partial(next_answer, SPEED, chosen)))
         shared = [next_answer(text, slice(None)) for text in joint]
         stack.close()  # this process simulates the replays
-        write_whole(out, make_page(studies, shared, parts))
+        write_whole(out, make_page(studies, parts, shared))
     return out
 
 
@@ -186,11 +187,6 @@ def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list
     """
     at_point = cases if point is None else [case_at(case, point) for case in cases]
     return [with_own_set(case) if quick else case for case in at_point]
-
-
-def _cost(text: str) -> int:
-    """As many simulations as take as long as a question."""
-    return USUAL_COSTS.get(text.split()[0], LEAST_COST)
 
 
 def _budgets(
@@ -277,12 +273,9 @@ def usual_questions(case: Case, point: str | None = None) -> list[str]:
     return [*questions, *(["repair"] if can_repair else [])]
 
 
-def make_page(
-    studies: Sequence[ReportedStudy], shared: Sequence[Answer] = (), parts: Parts | None = None
-) -> str:
+def make_page(studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[Answer] = ()) -> str:
     """The page about studies, with answers about all of them."""
     # Commands that give the numbers of the page.
-    parts = parts or Parts(show_no_progress)
     of_studies = chain(*map(page_commands, studies))
     of_shared = [
         (f"The answer {answer.question}", answer.command) for answer in shared if answer.command

@@ -18,6 +18,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
+from safevar_sumo.questions.explain.failures import REASONS
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.words import counted_in_words, number_of
 from safevar_sumo.records import FloatArray, Outcome
@@ -29,8 +30,8 @@ from safevar_sumo.sumo.matrix import vehicle_remarks
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import VEHICLES
 
-FIRST_CHOICES = {"smallest": "smallest changes", "most_severe": "most severe"}
-"""Choices that select the solutions to replay, as the flags of `simulate` do, in words."""
+FIRST_CHOICES = ("smallest", "most_severe")
+"""Choices of `REASONS` that select the solutions to replay, as the flags of `simulate` do."""
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated, and no result contains them",
     Outcome.INVALID_TEST: (
@@ -137,10 +138,10 @@ class ReportedStudy:
         """
         solutions = self.case.solutions
         chosen = dict[str, list[str]]()
-        names = [] if solutions.empty else list(FIRST_CHOICES)
+        names = () if solutions.empty else FIRST_CHOICES
         for name in names if self.case.unsafe.rows(solutions).any() else names[-1:]:
             handle = choose_handle(solutions, self.case.unsafe, name)
-            chosen.setdefault(str(handle), []).append(FIRST_CHOICES[name])
+            chosen.setdefault(str(handle), []).append(REASONS[name])
         return {handle: ", ".join(reasons) for handle, reasons in chosen.items()}
 
     @cached_property

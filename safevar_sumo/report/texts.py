@@ -93,15 +93,22 @@ def answer_about(
         If the question is asked for and has no answer, or is about another number of results.
     """
     own = {name: value for name, value in values.items() if name != SIMULATIONS.name}
-    how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool, "questions": questions}
-    how |= {"jobs": jobs, "simulations": values.get(SIMULATIONS.name)}
     try:
         if len(question.others) + 1 != len(cases):
             expected = f"{len(question.others) + 1} results directories"
             problem = f"{question.name} cannot be asked about {len(cases)}"
             raise InputError("ask", problem, expected)
         command = question.command_line([*map(str, directories)], {"point": point}, own)
-        answer = question.answer(cases, own, **how, progress=progress)
+        answer = question.answer(
+            cases,
+            own,
+            pool=pool,
+            jobs=jobs,
+            simulations=values.get(SIMULATIONS.name),
+            progress=progress,
+            as_it_is_now=as_it_is_now,
+            questions=questions,
+        )
     except InputError as error:
         if is_asked:
             raise

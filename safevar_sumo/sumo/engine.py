@@ -135,9 +135,9 @@ def open_world(
 @contextmanager
 def open_varied_world(
     networks: Sequence[NetworkFiles],
-    step: float | None = None,
-    create: Callable[[Api, int], SumoWorld] = SumoWorld,
-    start: Start = open_in_process,
+    step: float | None,
+    create: Callable[[Api, int], SumoWorld],
+    start: Start,
 ) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
     with (

@@ -240,7 +240,7 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     return choices.causes[case.name]
 
 
-def opponents_of(case: Case, algorithm: str = "") -> tuple[str, list[str]]:
+def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
     """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results,
     and the others.
 
