@@ -29,6 +29,13 @@ class Reached(NamedTuple):
     up_to: float | None
     failure: LimitingFailure | None
 
+    @property
+    def order(self) -> float:
+        """What decides which of two values is greater: None, of a car that is not safe at all, is
+        the least.
+        """
+        return -np.inf if self.up_to is None else self.up_to
+
 
 class Permit(NamedTuple):
     """What is known of a car: how far it is safe in each parameter set."""
@@ -38,7 +45,7 @@ class Permit(NamedTuple):
     @property
     def least(self) -> Reached:
         """The parameter set that limits it most."""
-        return min(self.reached, key=lambda each: _order(each.up_to))
+        return min(self.reached, key=lambda each: each.order)
 
     @property
     def up_to(self) -> float | None:
@@ -52,17 +59,11 @@ class Permit(NamedTuple):
 
     @property
     def order(self) -> float:
-        """What decides which of two values is greater."""
-        return _order(self.up_to)
+        return self.least.order
 
 
 Repaired = tuple[int, Permit] | None
 """The column of the characteristic that raises a car's value most, and the car as it is then."""
-
-
-def _order(value: float | None) -> float:
-    """Values in their order; None, of a car that is not safe at all, is the least."""
-    return -np.inf if value is None else value
 
 
 class PermitSearch:
@@ -159,8 +160,7 @@ class PermitSearch:
         known = [permit.order for permit in permits]  # with the best repair so far
         for row, permit in enumerate(permits):
             worn = np.flatnonzero(measured[row] & (settings[row] != original))
-            is_limited = permit.up_to is None or permit.up_to < top
-            bounds.append(dict.fromkeys(worn.tolist() if is_limited else [], np.inf))
+            bounds.append(dict.fromkeys(worn.tolist() if permit.order < top else [], np.inf))
             failures.append(permit.limiting)
         while any(bounds):
             self._lower(bounds, failures, settings, original)
