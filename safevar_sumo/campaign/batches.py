@@ -40,7 +40,7 @@ from safevar_sumo.errors import InputError, UserCodeError, warn
 from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo import reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
@@ -290,7 +290,7 @@ class Batches(NamedTuple):
 def choose_batches(study: Study, selection: Selection) -> Batches:
     """Choose how settings of a study fill batches."""
     system = selection.of(system_of(study))
-    are_recorded = not reason_for_sumo(system)
+    are_recorded = not reason_against_scenes(system)
     have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
     size = settings_per_batch(system)
     return Batches(size, are_recorded and not have_turns, are_recorded)

@@ -47,7 +47,7 @@ from safevar_sumo.results import (
     read_manifest,
 )
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import reason_for_sumo, settings_per_batch
+from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress, show_no_progress
 
@@ -301,7 +301,7 @@ def choose_engine(system: System, name: str) -> tuple[System, str, str]:
     if name == SUMO:
         system.require("SUMO", f"the engine {name}")
         system = replace(system, in_sumo=True)
-    if reason := reason_for_sumo(system):
+    if reason := reason_against_scenes(system):
         return system, SUMO, reason
     return system, RECORDED, "nobody reacts to the vehicle under test"
 

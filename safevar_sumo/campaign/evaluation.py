@@ -224,9 +224,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
     # The settings, and values of the driving system's parameters.
     selection = task.selection
-    n = len(system.characteristics)
-    settings = rows[:, :n]
-    values = rows[:, n:]
+    settings, values = np.split(rows, [len(system.characteristics)], axis=1)
     if selection.each:
         return evaluate_matrix(system, settings, each=True)
     if not values.size:

@@ -26,7 +26,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
-from safevar_sumo.sumo import reason_for_sumo
+from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -47,6 +47,8 @@ SMALLER_BATCHES = 4
 """Number of batches into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
 """Approximate number of a study's test points that are simulated."""
+TRIED_VALUES = np.nan, 0.0, -1e6, 1e6
+"""Values that a quantity has at all samples, by which a metric that reads it is found."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
 """Largest budget, and largest population, of an algorithm's runs."""
 _Rows = IntArray
@@ -130,7 +132,7 @@ def try_simulations(
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
     system = _system(study)
-    if ":" in study.scenario.model and not reason_for_sumo(system):
+    if ":" in study.scenario.model and not reason_against_scenes(system):
         try:
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:
@@ -152,12 +154,18 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
         with user_errors(system.source):
             values = measure.of_runs(runs, system.metrics_table)
         for quantity in (name for name in QUANTITIES if name not in measure.quantities):
+            others = (runs.with_all(quantity, value) for value in TRIED_VALUES)
             try:
                 with user_errors(system.source):
-                    others = measure.of_runs(runs.without(quantity), system.metrics_table)
-            except UserCodeError:  # it reads the quantity all the same
-                others = np.full_like(values, np.inf)
-            if not np.array_equal(values, others, equal_nan=True):
+                    is_read = not all(
+                        np.array_equal(
+                            values, measure.of_runs(other, system.metrics_table), equal_nan=True
+                        )
+                        for other in others
+                    )
+            except UserCodeError:
+                is_read = True
+            if is_read:
                 got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
                 expected = f"needs = {(*measure.quantities, quantity)}"
                 yield Finding("contract", got, "", "the original vehicle", expected)

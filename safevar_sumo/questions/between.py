@@ -72,7 +72,7 @@ class MovingTest(NamedTuple):
         """The vehicles of unsafe settings, the worst first, shape (K, n), and the model at their
         first encounters alone, as tests of a matrix; settings in other encounters are left out.
         """
-        vehicles, places = self.model.evaluator.system.cut(self.as_printed(settings))
+        vehicles, places = self.model.evaluator.system.split(self.as_printed(settings))
         first = [*dict.fromkeys(map(tuple, places.tolist()))][:MOST_ENCOUNTERS]
         axes = self.model.characteristics.scenario.names
         tests = [at_values(self.test, dict(zip(axes, place, strict=True))) for place in first]

@@ -13,7 +13,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import PHASES
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, RANGES, Domain, Study, axis_of
 from safevar_sumo.study.encounters import Axes
-from safevar_sumo.sumo.batch import reason_for_sumo
+from safevar_sumo.sumo.batch import reason_against_scenes
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.system import System
 
@@ -43,7 +43,7 @@ def in_phases(study: Study, system: System) -> Study:
     the encounters of some point have none, as bodies do not move on tracks.
     """
     has_phases = system.rater is None and all(point.scenario.has_phase for point in system.points)
-    if not has_phases or reason_for_sumo(system) or PHASE in system.characteristics.names:
+    if not has_phases or reason_against_scenes(system) or PHASE in system.characteristics.names:
         return study
     base = study if study.ranges else study.listed().all_count
     over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
@@ -101,7 +101,7 @@ def _lengths_of_step(model: Model, settings: FloatArray) -> FloatArray:
     if not (unsafe.is_collision or (unsafe.below is not None and unsafe.below >= 0)):
         return np.full(len(settings), np.inf)
     system = model.evaluator.system
-    values = system.characteristics.scenario.columns(system.cut(settings)[1])
+    values = system.characteristics.scenario.columns(system.split(settings)[1])
     points = (encounter(system.points[number], values) for number in model.numbers_of_points)
     speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
     return np.asarray(system.step * np.maximum.reduce(speeds))

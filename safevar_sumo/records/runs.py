@@ -64,6 +64,8 @@ class Trace:
     - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its
       extent along the lane and `obstacle_width` its extent across it, 0 where the scenario does not
       state them [m].
+    - `gap` is measured from the front bumper to the obstacle, as in `Observation`: at most 0 once
+      the vehicle has reached or passed it, infinite without anybody.
     - `visible`: nothing hides the obstacle.
     """
 
@@ -213,14 +215,12 @@ class SimulationRuns:
         lacks = [self.lacks.get(name, none) for name in quantities]
         return np.asarray(np.any([none, *lacks], axis=0))
 
-    def without(self, quantity: str) -> SimulationRuns:
-        """The runs with NaN for a quantity, and with 0 where they did not have it; how hard a
-        collision is stays.
-        """
+    def with_all(self, quantity: str, value: float) -> SimulationRuns:
+        """The runs with one value of a quantity at all samples; how hard a collision is stays."""
 
         def changed(record: Trace | Encounter) -> dict[str, Any]:
             return {
-                name: np.where(np.isnan(getattr(record, name)), 0.0, np.nan)
+                name: np.full(np.shape(getattr(record, name)), value)
                 for name in QUANTITIES[quantity]
                 if hasattr(record, name)
             }

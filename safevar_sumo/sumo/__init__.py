@@ -1,6 +1,6 @@
 """Simulation of many settings of a study at once, in recorded scenes or in SUMO."""
 
-from safevar_sumo.sumo.batch import reason_for_sumo as reason_for_sumo
+from safevar_sumo.sumo.batch import reason_against_scenes as reason_against_scenes
 from safevar_sumo.sumo.matrix import (
     drive_and_score as drive_and_score,
     drive_worst as drive_worst,

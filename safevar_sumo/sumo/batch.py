@@ -35,7 +35,9 @@ from safevar_sumo.sumo.world import Api, SumoWorld
 OF_MOVERS: Mapping[str, Callable[[System, FloatArray], SimulationRuns]] = {
     OWN_SIMULATOR.kind: simulate_each
 }
-"""How movers other than SUMO simulate N settings, shape (N, n), at every point, by their kind."""
+"""How movers other than SUMO simulate N settings, shape (N, n), at the system's only point, by
+their kind: N runs in the order of the settings, where a repeated setting stands several times.
+"""
 
 
 @np.errstate(all="ignore")
@@ -63,11 +65,11 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
     return found if system.repeats == 1 else joined(found, system.repeats, system.criterion)
 
 
-def reason_for_sumo(system: System) -> str:
-    """Why SUMO must simulate a system, in a copy of the network for each vehicle; "" if recorded
-    scenes suffice.
+def reason_against_scenes(system: System) -> str:
+    """Why recorded scenes do not suffice, so that SUMO, in a copy of the network for each vehicle,
+    or another mover simulates a system; "" if they do.
     """
-    if reason := system.mover.lacks.get("recorded scenes"):
+    if reason := system.mover.reason_against("recorded scenes"):
         return reason
     if system.in_sumo:
         return "requested"
@@ -79,7 +81,7 @@ def reason_for_sumo(system: System) -> str:
     )
     if searched and any(type(scenario).layout is WorldScenario.layout for scenario in played):
         return f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
-    return system.scenes.reason_for_sumo(system.points)
+    return system.scenes.reason_against_scenes(system.points)
 
 
 def drive_all(
@@ -88,8 +90,9 @@ def drive_all(
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     The result holds the runs at the first point, then the runs at the second point, and so on.
-    Several points must have scenarios of tracks; SUMO simulates only one point at once. `listen` is
-    called with what the ADS observes at every sample.
+    Several points must have scenarios of tracks; SUMO and other movers simulate only one point at
+    once. `listen` is called with what the ADS observes at every sample. A study that repeats its
+    settings has all of them once, then all of them again.
 
     Raises
     ------
@@ -99,15 +102,15 @@ def drive_all(
         If a user's ADS fails, or takes longer than the time limit.
     """
     if simulate := OF_MOVERS.get(system.mover.kind):
-        return simulate(system, settings)
-    vehicles, encounters = system.cut(settings)
+        return simulate(system, np.tile(settings, (system.repeats, 1)))
+    vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario
     system.vehicle.compile()  # outside the time limit
     with user_errors(system.source), end_if_longer(system.time_limit):
-        plays = not reason_for_sumo(system)
-        traffic = traffic_of(system, encounters, 0.0 if plays else OVERTIME)
-        if not plays:  # in SUMO, among the other actors that it moves
+        reason = reason_against_scenes(system)
+        traffic = traffic_of(system, encounters, OVERTIME if reason else 0.0)
+        if reason:  # in SUMO, among the other actors that it moves
             with open_points_world(system, encounters, traffic) as sumo_world:
                 observer = observer_of(scenario, sumo_world, traffic)
                 runs = drive(on_road, vehicles, sumo_world, observer, listen)

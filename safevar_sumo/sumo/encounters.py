@@ -160,7 +160,7 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
     those that have one at their ends.
     """
     members = system.characteristics.scenario
-    encounters = np.clip(system.cut(settings)[1], members.lower, members.upper)
+    encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
     met = point.meets(members.columns(encounters)) if len(members) else True
     return np.broadcast_to(met, len(settings))
 

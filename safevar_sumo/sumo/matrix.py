@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import METRICS, RATING_POINTS, STOPPING_DISTANCE
+from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
 from safevar_sumo.protocol.rater import join_cells, rated_quantities
 from safevar_sumo.records import (
     Evaluations,
@@ -25,7 +25,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Point, TrackScenario
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
-from safevar_sumo.sumo.batch import drive_all, reason_for_sumo, score
+from safevar_sumo.sumo.batch import drive_all, reason_against_scenes, score
 from safevar_sumo.sumo.encounters import in_place_of_unmet, met_at, worst_points
 from safevar_sumo.sumo.network import number_of_lanes, open_network
 from safevar_sumo.sumo.system import System
@@ -124,17 +124,21 @@ def drive_and_score(
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
     matrix, row i holds the result of setting i at its worst point. Where an encounter counts by
     what the original vehicle does in it, row i also holds the safety degree of that, unless
-    `with_originals` is false.
+    `with_originals` is false. If a study skips settings on which user code fails, a batch that
+    fails is halved until these settings are alone.
     """
     # Large batches are cut; beside each setting drives the original in its encounter.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
-    size = max(1, batch_size(system) // (2 if takes_pairs else 1))
-    if len(settings) > size:
-        starts = range(0, len(settings), size)
-        batches = [settings[start : start + size] for start in starts]
+    size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
+
+    def in_batches(size: int) -> Evaluations:
+        batches = np.split(settings, range(size, len(settings), size))
         return Evaluations.concatenate(
             [drive_and_score(system, batch, with_originals=with_originals) for batch in batches]
         )
+
+    if len(settings) > size:
+        return in_batches(size)
 
     # The original meets the encounter of each variant, too.
     vehicles = settings
@@ -151,8 +155,10 @@ def drive_and_score(
     except UserCodeError as error:
         if not system.skips_failed:
             raise
+        if len(settings) > 1:
+            return in_batches((len(settings) + 1) // 2)
         reason = " ".join(f"{error.source}: {error.problem}".split())
-        metrics = dict.fromkeys((*METRICS, *system.measuring.measures))
+        metrics = system.measuring.measures
         changes = system.characteristics.change_objectives(vehicles)
         reasons = {row.tobytes(): reason for row in vehicles}
         found = Evaluations.undefined(
@@ -212,14 +218,15 @@ def evaluate_matrix(system: System, settings: FloatArray, *, each: bool = False)
 
 def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
-    if system.mover.at_once:  # each result is journaled at once
+    if system.mover.at_once:  # the results of a batch are journaled immediately
         return system.mover.at_once
-    if reason_for_sumo(system):
+    if reason_against_scenes(system):
         return MAX_COPIES
     if len(
         system.characteristics.scenario
     ):  # the original vehicle drives beside each; the points one after another
         return largest_batch(system) // 2
+    # Vehicles of a batch take each step together: fewer would cost as much.
     return max(largest_batch(system) // len(system.points), MAX_COPIES)
 
 
@@ -238,7 +245,7 @@ def batch_size(system: System) -> int:
     """
     if system.mover.at_once:
         return system.mover.at_once
-    if not reason_for_sumo(system):
+    if not reason_against_scenes(system):
         return largest_batch(system)
     lanes = max(
         number_of_lanes(open_network(network))
@@ -273,7 +280,7 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
-    if not reason_for_sumo(system) and (not searched or [*searched] == [PHASE]):
+    if not reason_against_scenes(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
         here = replace(system, points=points)

@@ -141,7 +141,7 @@ class Scenes:
                 self._recorded[scenario] = _scene_of(scenario, self.step)
         return self._recorded[scenario]
 
-    def reason_for_sumo(self, points: Sequence[Point]) -> str:
+    def reason_against_scenes(self, points: Sequence[Point]) -> str:
         """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; ""
         if scenes suffice.
         """

@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE
+from safevar_sumo.metrics import OPTIONAL_METRICS, UNSAFE_SHARE
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import (
     MARK,
@@ -46,15 +46,13 @@ _steps = WeakKeyDictionary[type, dict[str, float]]()
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     """Simulate N settings of n characteristics, shape (N, n), at the system's only point, one after
-    another, each within the time limit; and as often as the study repeats each, one round after
-    another.
+    another, each within the time limit.
     """
     (point,) = system.points
-    rows = np.tile(settings, (system.repeats, 1))
-    vehicles, encounters = system.cut(rows)
+    vehicles, encounters = system.split(settings)
     names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
     results = []
-    for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), rows, strict=True):
+    for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), settings, strict=True):
         command = f"{system.command} {system.characteristics.options(row)}"
         note_work(f"{REPRODUCED_BY}{command}")
         scenario: Any = encounter(point, dict(zip(searched, values, strict=True))).scenario
@@ -139,7 +137,7 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
     """
     code = UserCode(f"scenario.model = {type(scenario).__name__}", type(scenario))
     measures = system.measuring.measures
-    known = {*METRICS, *OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
+    known = {*OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
     for name in result:
         if name not in known:
             legal = f"names of metrics: {', '.join(sorted(known))}"

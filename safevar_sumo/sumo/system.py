@@ -107,9 +107,8 @@ class System:
         InputError
             About the study.
         """
-        if not self.mover.has(part):
-            kind, reason = self.mover.kind, self.mover.lacks[part]
-            problem = f"{question} needs {part}, and scenario.model is {kind}: {reason}"
+        if reason := self.mover.reason_against(part):
+            problem = f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}"
             raise InputError(self.source, problem, "a study with a vehicle and a driving system")
 
     @property
@@ -147,7 +146,7 @@ class System:
             scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
             return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
-    def cut(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def split(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of N settings, shape (N, n), the vehicles, shape (N, k), and the encounters that they
         meet: values of the n - k parameters that the study searches.
         """

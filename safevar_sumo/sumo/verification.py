@@ -45,7 +45,7 @@ def drive_again(
     trace = runs.trace
     n = len(runs.outcome)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
-    vehicles, encounters = system.cut(settings)
+    vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
     traffic = traffic_of(system, encounters, OVERTIME)

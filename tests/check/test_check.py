@@ -181,8 +181,8 @@ DEFECTS = {
         "metric",
         "contract",
         METRIC,
-        "trace.speed, axis=0)",
-        "np.minimum(trace.speed, trace.gap), axis=0)",
+        "jerk, 0.0)",
+        "jerk + (trace.gap[2:] < -0.01), 0.0)",
         "the metric jerk reads gap, which its needs do not state",
     ),
     "objective no number": planted(

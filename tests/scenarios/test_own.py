@@ -12,7 +12,7 @@ import numpy as np
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import reason_for_sumo
+from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run, verify_everywhere
@@ -124,7 +124,7 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     system = assemble(
         load_study("native", scenario={"model": "own:Mine", "over": search}, encounters="ranges")
     )
-    assert "by distance" in reason_for_sumo(system)
+    assert "by distance" in reason_against_scenes(system)
     settings = drawn(system, 3, 4)
     found = drive_and_score(system, settings)
     for row, setting in enumerate(settings):

@@ -24,7 +24,7 @@ from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import reason_for_sumo, recording, simulate_all_points
+from safevar_sumo.sumo import reason_against_scenes, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -71,7 +71,7 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
 
 
 def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: System) -> None:
-    assert reason_for_sumo(any_system) == ""
+    assert reason_against_scenes(any_system) == ""
     assert_same(any_system, drawn(any_system, 60, 5))
 
 
@@ -103,7 +103,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["pedestrian_crossing"](network="my_town")
-    assert "my_town" in Scenes().reason_for_sumo([Point(scenario, weather_of("clear"))])
+    assert "my_town" in Scenes().reason_against_scenes([Point(scenario, weather_of("clear"))])
 
 
 @pytest.fixture
