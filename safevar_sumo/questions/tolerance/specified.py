@@ -28,7 +28,8 @@ def broken_specification(
     stage = "specified limits with each parameter set"
     seed = models[0].evaluator.seed
     scaled = models[0].evaluator.scaled
-    corners = specified.corners(seed, 0)[: scaled(MAX_CORNERS)]
+    corners = specified.corners(seed, 0)[:MAX_CORNERS]
+    corners = corners[: max(scaled(len(corners)), 1)]
     points = scaled(SPECIFICATION_POINTS)
     settings = np.concatenate([corners, specified.spread_and_corners(points, seed)])
     settings = np.unique(settings, axis=0)

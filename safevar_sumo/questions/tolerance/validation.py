@@ -133,12 +133,11 @@ class Validator:
         """
         box = validation.box
         corners = self._corners(box, attempt)
-        most = self.model.evaluator.scaled(MAX_CORNERS)
         rngs = [
             Stream.VALIDATION.generator(self.seed, attempt, number, self.model.fit)
             for number in range(confirmations)
         ]
-        validation, robustness = self._test(validation, corners[:most])
+        validation, robustness = self._test(validation, corners[:MAX_CORNERS])
         worst = corners[np.argsort(robustness, kind="stable")]
         self._worst = []
         # Further searches for counterexamples.
@@ -192,10 +191,13 @@ class Validator:
         return validation._replace(proof=proof, failures=self._failures(unsafe))
 
     def _corners(self, box: Box, attempt: int) -> FloatArray:
-        """The corners of a box; the first `MAX_CORNERS` in random order."""
+        """The corners of a box, or some of them where less is searched; the first `MAX_CORNERS` in
+        random order.
+        """
         corners = box.corners(self.seed, attempt)
         rng = Stream.FIRST_CORNERS.generator(self.seed, attempt)
-        return np.concatenate([rng.permutation(corners[:MAX_CORNERS]), corners[MAX_CORNERS:]])
+        corners = np.concatenate([rng.permutation(corners[:MAX_CORNERS]), corners[MAX_CORNERS:]])
+        return corners[: max(self.model.evaluator.scaled(len(corners)), 1)]
 
     def _test(self, validation: Validation, corners: FloatArray) -> tuple[Validation, FloatArray]:
         """Test corners: what they leave, shape (M,)."""

@@ -188,10 +188,12 @@ def validation_in_words(together: LimitsTogether) -> str:
     """What joint limits were tested with: corner cases, simulations that search for a
     counterexample, and random vehicles.
     """
-    searched = len(together.members[0].evaluator.characteristics.scenario) > 0
+    evaluator = together.members[0].evaluator
+    searched = len(evaluator.characteristics.scenario) > 0
     met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
     falsification = _falsification_in_words(together)
-    return f"All corner cases{met}; {falsification}; {_sampled_in_words(together)}."
+    number = "All" if evaluator.account.effort >= 1 else "Some"
+    return f"{number} corner cases{met}; {falsification}; {_sampled_in_words(together)}."
 
 
 def _falsification_in_words(together: LimitsTogether) -> str:
