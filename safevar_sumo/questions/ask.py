@@ -64,8 +64,8 @@ setting collides, else half of the original's safety degree; of a rated study, a
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
-    "Rough answer (--quick: an eighth of the search, with the study's own parameter set alone; it"
-    " proves nothing):"
+    "Rough answer (--quick: at most an eighth of the search, with the study's own parameter set"
+    " alone; it proves nothing):"
 )
 """The beginning of such an answer."""
 

@@ -38,6 +38,7 @@ from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
     QUICK,
+    QUICK_SECONDS,
     Account,
     print_price_of_list,
     seconds_of_simulation,
@@ -176,7 +177,8 @@ class Evaluator:
         """Let the question do so many simulations, with those that check a simulator's class; it is
         one of so many that share the time. A quick one searches less.
         """
-        self.account.effort = QUICK if quick else 1.0
+        seconds = sum(float(np.max(point.scenario.duration)) for point in self.system.points)
+        self.account.effort = QUICK * min(QUICK_SECONDS / seconds, 1.0) if quick else 1.0
         self.account.asked = self.account.most = simulations
         self.account.questions = questions
         self.account.is_question = True

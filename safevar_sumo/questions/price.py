@@ -32,7 +32,11 @@ BATCH = 512
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples answers."""
 QUICK = 1 / 8
-"""How much a quick answer searches, as a share of what is usual."""
+"""How much a quick answer searches at most, as a share of what is usual."""
+QUICK_SECONDS = 200.0
+"""Seconds that a vehicle drives at all points up to which a quick answer searches so much: where it
+drives longer, each simulation costs more, and fewer are done.
+"""
 MOST_EFFORT = 8.0
 """Largest such share where more simulations are allowed than are usual."""
 DIGITS = 2

@@ -104,8 +104,8 @@ def report(
     fresh
         Simulate everything anew, instead of reading what earlier commands have simulated.
     quick
-        Rough answers: an eighth of the search, with the study's own parameter set alone. No line to
-        sign.
+        Rough answers: at most an eighth of the search, with the study's own parameter set alone. No
+        line to sign.
     simulations
         At most so many simulations for all answers and replays, which share them.
 

@@ -134,8 +134,8 @@ def explain(
         Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
         checked again; 0 leaves this out.
     quick
-        A rough answer: an eighth of the search, with the study's own parameter set alone. It has
-        causes of few failures.
+        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
+        It has causes of few failures.
     """
     study, of_study = evaluator.study, of_study or isinstance(subject, Study)
     subject = study if of_study else subject

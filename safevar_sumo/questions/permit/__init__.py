@@ -101,8 +101,8 @@ def permit(
     fits
         Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
     quick
-        A rough answer: an eighth of the search, with the study's own parameter set alone. The grid
-        alone is driven, no car may drive without a limit, and no repair is named.
+        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
+        The grid alone is driven, no car may drive without a limit, and no repair is named.
     out
         A file for the list of cars, in the order of the input and with all its columns as they are
         given, beside those of the answer; `assumed` names the values that were not measured.

@@ -108,8 +108,8 @@ def repair(
         A repair for the points of the study's tests alone: nothing is simulated between the values
         of a matrix.
     quick
-        A rough answer: an eighth of the search, with the study's own parameter set alone. Not with
-        `out`.
+        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
+        Not with `out`.
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")

@@ -89,8 +89,8 @@ def tolerance(
         Limits that hold at the points of the study's tests alone: nothing is simulated between the
         values of a matrix.
     quick
-        A rough answer: an eighth of the search, with the study's own parameter set alone. No limit
-        is called kept, and with limits the exit code is 3.
+        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
+        No limit is called kept, and with limits the exit code is 3.
     """
     whole = evaluator
     if up_to is not None:
