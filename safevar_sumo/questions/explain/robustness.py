@@ -16,7 +16,9 @@ NEIGHBOURS = "neighbours"
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
 LEAST_NEIGHBOURS = 8
-"""With fewer, where few simulations are allowed, the share is unknown."""
+"""Number of them in a rough answer. With fewer, where few simulations are allowed, the share is
+unknown.
+"""
 STEP_FACTORS: Sequence[float] = (1.0, 0.5, 2.0)
 """Factors by which the study's time step is multiplied; the step itself comes first."""
 MIN_ROBUST_SHARE = 0.8
@@ -50,7 +52,9 @@ def robust_shares(
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
     count = NEIGHBOUR_COUNT
-    if evaluator.left is not None:
+    if evaluator.account.effort < 1:
+        count, factors = LEAST_NEIGHBOURS, factors[:1]
+    elif evaluator.left is not None:
         count = min(count, evaluator.left // (6 * max(len(settings), 1)))
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
