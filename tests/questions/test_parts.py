@@ -33,7 +33,7 @@ def test_a_question_about_a_part_prints_commands_about_it(
 @pytest.mark.slow
 def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_simulated() -> None:
     part = {"characteristics": ("brakeTorque",), "point": "CPNCO"}
-    answer = sv.tolerance("wear", quick=True, pool=InlinePool(), **part)
+    answer = sv.tolerance("wear", fits=0, pool=InlinePool(), **part)
     (row,) = answer.tables["ranges"].to_dict("records")
     assert not row["kept"]
     typed = shlex.split(row["simulate"])[3:]

@@ -156,7 +156,8 @@ def test_a_vehicle_that_is_said_to_fail_fails_and_a_rough_answer_keeps_nothing(
     (in_tmp / "tiny.toml").write_text(TINY)
     study = load_study("tiny.toml")
     options = {**ROUGH, "characteristics": ("tireFric",)}
-    fails_at = tolerance(study, **options).tables["limits"]["fails_at"][0]
+    own_set = {**options, "quick": False, "fits": 0}
+    fails_at = tolerance(study, **own_set).tables["limits"]["fails_at"][0]
     system = assemble(study)
     setting = np.array([[fails_at[name] for name in system.characteristics.names]])
     assert drive_and_score(system, setting).f_safe[0] < SEARCHED_MARGIN

@@ -502,7 +502,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
 @pytest.mark.slow
 def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(wall: Path) -> None:
     """Failures are explained without reference drivers."""
-    found = json_of("explain", "wall.toml", "--quick")
+    found = json_of("explain", "wall.toml")
     assert found["numbers"]["collisions"] is None
     assert not found["tables"]["drivers"]["rows"]
     causes = found["tables"]["causes"]["rows"]
