@@ -177,8 +177,8 @@ class Evaluator:
         """Let the question do so many simulations, with those that check a simulator's class; it is
         one of so many that share the time. A quick one searches less.
         """
-        seconds = sum(float(np.max(point.scenario.duration)) for point in self.system.points)
-        self.account.effort = QUICK * min(QUICK_SECONDS / seconds, 1.0) if quick else 1.0
+        seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
+        self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK)) if quick else 1.0
         self.account.asked = self.account.most = simulations
         self.account.questions = questions
         self.account.is_question = True

@@ -31,11 +31,13 @@ BATCH = 512
 """Vehicles that are simulated side by side to know how long one of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples answers."""
-QUICK = 1 / 8
-"""How much a quick answer searches at most, as a share of what is usual."""
-QUICK_SECONDS = 200.0
-"""Seconds that a vehicle drives at all points up to which a quick answer searches so much: where it
-drives longer, each simulation costs more, and fewer are done.
+QUICK = 1 / 40, 1 / 8
+"""How much a quick answer searches, as a share of what is usual: at least so much that the box of
+joint limits, which is usually sought up to 40 times, is sought once; and at most.
+"""
+QUICK_SECONDS = 25.0
+"""This share times the seconds that a vehicle drives at all points: where it drives longer, each
+simulation costs more, and fewer are done.
 """
 MOST_EFFORT = 8.0
 """Largest such share where more simulations are allowed than are usual."""

@@ -44,6 +44,26 @@ def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
     assert answer.tables["causes"]["fits"].isna().all()
 
 
+MANY = """
+extends = "wear"
+name = "many"
+title = "Many test cases"
+[[matrix.tests]]
+name = "along"
+model = "along"
+over.speed = [20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 37, 38, 39, 40]
+over.impact_location = [25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 37, 38, 39, 40, 41, 42,
+  43, 44, 45, 46, 47, 48, 49, 50, 51, 52, 53, 54, 55, 56]
+"""
+
+
+@pytest.mark.slow
+def test_a_rough_answer_about_many_test_cases_searches_a_little(in_tmp: Path) -> None:
+    Path("many.toml").write_text(MANY)
+    answer = sv.tolerance("many.toml", quick=True, characteristics=("brakeTorque",))
+    assert answer.numbers["samples"]
+
+
 WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
 PROMISE = {"promise": ("brakeTorque >= 0.95",), "change": ("margin",)}
 

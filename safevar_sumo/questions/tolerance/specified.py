@@ -29,10 +29,9 @@ def broken_specification(
     seed = models[0].evaluator.seed
     scaled = models[0].evaluator.scaled
     corners = specified.corners(seed, 0)[:MAX_CORNERS]
-    corners = corners[: max(scaled(len(corners)), 1)]
-    points = scaled(SPECIFICATION_POINTS)
-    settings = np.concatenate([corners, specified.spread_and_corners(points, seed)])
-    settings = np.unique(settings, axis=0)
+    corners = corners[: scaled(len(corners))]
+    spread = specified.spread_and_corners(scaled(SPECIFICATION_POINTS), seed)
+    settings = np.unique(np.concatenate([corners, spread]), axis=0)
     broken = dict[int, tuple[Model, FloatArray]]()
     for model in models:
         if _keeps_its_margin(specified, model):
